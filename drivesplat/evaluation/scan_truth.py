@@ -81,7 +81,8 @@ class ScanTruth:
             np.where(returned, shades, 0.0).astype(np.float32),
         )  # fmt: skip
         objects = np.where(returned, numbers[instances], NO_OBJECT).astype(np.int16)
-        return replace(sensor, scan=scan, measured=ranges >= self.own_car_radius, objects=objects)
+        measured, blocked = ranges >= self.own_car_radius, np.zeros(ranges.shape, dtype=bool)
+        return replace(sensor, scan=scan, measured=measured, objects=objects, blocked=blocked)
 
     def met(self, found: TruthScan, instance: str) -> np.ndarray:
         """The rays (b, a) bool of a true scan that met an instance."""

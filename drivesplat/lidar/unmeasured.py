@@ -1,9 +1,10 @@
-"""Rays of scans that say nothing about the scene: those that meet the ego vehicle, and those of skipped sectors."""
+"""Rays of scans that say nothing about the scene: those that meet the ego vehicle, and those of skipped sectors. And
+rays that the ego vehicle blocks, where a dataset has removed its returns."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from drivesplat.scene.scan import Scan
 
@@ -11,6 +12,10 @@ AZIMUTH_BINS = 360
 """Cells of azimuth in which the ego vehicle's returns are counted."""
 MIN_SECTOR = np.radians(5.0)
 """Width of a sector without any return from which the sensor is taken to have skipped it."""
+
+MIN_SCANS, MIN_PATH = 10, 5.0
+"""Number of training scans, and metres that the sensor moves in a straight line between two of them, from which rays
+that never return are taken to be blocked by the vehicle: what stands in the scene would have come into their way."""
 
 
 def measured_rays(scans: Sequence[Scan], ego_radius: float) -> list[Bool[np.ndarray, "b a"]]:
@@ -33,6 +38,29 @@ def measured_rays(scans: Sequence[Scan], ego_radius: float) -> list[Bool[np.ndar
         ~close & ~(~scan.returned & _from_above(often, scan)[_cells(scan)]) & ~skipped(scan)
         for scan, close in zip(scans, near, strict=True)
     ]
+
+
+def blocked_rays(
+    scans: Sequence[Scan], poses: Sequence[Float[np.ndarray, "4 4"]], training: Sequence[bool]
+) -> list[Bool[np.ndarray, "b a"]]:
+    """The rays of the scans of one LiDAR that the vehicle blocks: those below the horizontal, of beams of which at
+    least half of the rays return, in a cell of one degree of azimuth that has no return in any scan of `training`.
+
+    None is, with under MIN_SCANS training scans, or where these lie within MIN_PATH metres. Returns of other scans have
+    no effect: what is blocked may be predicted for them.
+    """
+    chosen = [scan for scan, used in zip(scans, training, strict=True) if used]
+    places = np.array([pose[:3, 3] for pose, used in zip(poses, training, strict=True) if used]).reshape(-1, 3)
+    if len(chosen) < MIN_SCANS or np.linalg.norm(np.ptp(places, axis=0)) < MIN_PATH:
+        return [np.zeros(scan.returned.shape, dtype=bool) for scan in scans]
+    returns = np.zeros((max(scan.rays.shape[0] for scan in scans), AZIMUTH_BINS), dtype=np.int64)
+    rays = np.zeros_like(returns)
+    for scan in chosen:
+        np.add.at(rays, _cells(scan), 1)
+        np.add.at(returns, _cells(scan), scan.returned)
+    mostly = returns.sum(axis=1) >= 0.5 * rays.sum(axis=1)
+    empty = mostly[:, None] & (rays > 0) & (returns == 0)
+    return [empty[_cells(scan)] & (np.median(scan.rays.elevations, axis=1) < 0)[:, None] for scan in scans]
 
 
 def _from_above(cells: Bool[np.ndarray, "beams bins"], scan: Scan) -> Bool[np.ndarray, "b bins"]:

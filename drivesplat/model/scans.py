@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drivesplat.errors import ResultError
@@ -22,8 +22,8 @@ CHANNELS = 4
 @dataclass(frozen=True)
 class ScanView:
     """A revolution of a LiDAR at a `time` in seconds since the first image: the sensor's pose (metres) then, its rays
-    at their own times, its velocities (m/s, rad/s) in its own frame, and the standard deviations of a beam's footprint
-    in azimuth and elevation (radians)."""
+    at their own times, its velocities (m/s, rad/s) in its own frame, the standard deviations of a beam's footprint in
+    azimuth and elevation (radians), and the rays that the vehicle blocks (None: none), which do not return."""
 
     sensor_to_world: Float[Tensor, "4 4"]
     rays: RayGrid
@@ -31,6 +31,7 @@ class ScanView:
     angular: Float[Tensor, "3"]
     time: float
     beam_spread: tuple[float, float]
+    blocked: Bool[Tensor, "b a"] | None = None
 
     @property
     def world_to_sensor(self) -> Float[Tensor, "4 4"]:
@@ -60,18 +61,22 @@ def view_of_scan(recorded: RecordedScan, beam_spread: tuple[float, float], devic
     """A recorded scan as a view. `beam_spread` in radians."""
     arrays = recorded.sensor_to_world, recorded.linear, recorded.angular
     pose, linear, angular = (torch.from_numpy(array).float().to(device) for array in arrays)
-    return ScanView(pose, RayGrid.of(recorded.scan.rays, pose), linear, angular, recorded.seconds, beam_spread)
+    blocked = torch.from_numpy(recorded.blocked).to(device) if recorded.blocked.any() else None
+    rays = RayGrid.of(recorded.scan.rays, pose)
+    return ScanView(pose, rays, linear, angular, recorded.seconds, beam_spread, blocked)
 
 
 def scan_picture(gaussians: Gaussians, view: ScanView, before: Float[Tensor, "b a"] | None = None) -> ScanPicture:
-    """The scan of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets nothing is
-    not returned. Raises ResultError for Gaussians without echoes."""
+    """The scan of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets nothing, or
+    that the vehicle blocks, is not returned. Raises ResultError for Gaussians without echoes."""
     if gaussians.echoes is None:
         raise ResultError("the model was trained without LiDAR: train it with train.scans.share above 0")
     toward = torch.nn.functional.normalize(gaussians.means.detach() - view.sensor_to_world[:3, 3], dim=-1)
     logits = gaussians.echoes[:, 0] + torch.einsum("nd,ndc->nc", toward, gaussians.echoes[:, 1:])
     rendering = _rasterized(gaussians, view, torch.sigmoid(logits), before)
     intensity, returned = rendering.values.unbind(dim=-1)
+    if view.blocked is not None:
+        returned = torch.where(view.blocked, 0.0, returned)
     met = rendering.alpha.clamp(min=NOTHING)
     return ScanPicture(gaussians, rendering.range, returned, intensity / met, rendering.alpha, rendering.alpha_before)
 

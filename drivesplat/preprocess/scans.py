@@ -12,7 +12,7 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.lidar.objects_met import TrackedBoxes
 from drivesplat.lidar.scans import SensorPoses, mean_velocity, scan_of, sensor_poses
-from drivesplat.lidar.unmeasured import measured_rays
+from drivesplat.lidar.unmeasured import blocked_rays, measured_rays
 from drivesplat.readers.sweeps import read_returns, read_scan
 from drivesplat.scene.scan import Scan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan, ScanRecords
@@ -48,16 +48,24 @@ def scan_records(scene: Scene, job: ScansJob) -> ScanRecords:
     for name in dict.fromkeys(sweep.lidar for sweep in scene.sweeps):
         found = _found(scene, known.get(name, Lidar(name)), job)
         measured = measured_rays([item.scan for item in found], job.own_car_radius)
-        records += [_record(scene, item, rays, boxes) for item, rays in zip(found, measured, strict=True)]
+        in_training = [item.group == "train" for item in found]
+        blocked = blocked_rays(
+            [item.scan for item in found], [item.sweep.sensor_to_world for item in found], in_training
+        )
+        records += [
+            _record(scene, item, rays, hidden, boxes)
+            for item, rays, hidden in zip(found, measured, blocked, strict=True)
+        ]
     if not records:
         raise DatasetError(
             f"scene {scene.name} has no LiDAR sweep that gives a scan; leave out what needs scans (docs/lidar.md)"
         )
     rays = sum(record.scan.returned.size for record in records)
     log.info(
-        "%d scans with %d rays: %.1f %% return, %.1f %% say nothing",
+        "%d scans with %d rays: %.1f %% return, %.1f %% say nothing, %.1f %% are blocked by the vehicle",
         len(records), rays, 100.0 * sum(int(record.scan.returned.sum()) for record in records) / rays,
         100.0 * sum(int((~record.measured).sum()) for record in records) / rays,
+        100.0 * sum(int(record.blocked.sum()) for record in records) / rays,
     )  # fmt: skip
     return ScanRecords(records, [track.id for track in scene.tracks])
 
@@ -125,7 +133,9 @@ def firings(returns: LidarReturns, stated: int | None) -> int | None:
     return counted if abs(counted - stated) <= MAX_DEVIATION * stated else stated
 
 
-def _record(scene: Scene, found: FoundScan, measured: np.ndarray, boxes: TrackedBoxes) -> RecordedScan:
+def _record(
+    scene: Scene, found: FoundScan, measured: np.ndarray, blocked: np.ndarray, boxes: TrackedBoxes
+) -> RecordedScan:
     sweep, scan = found.sweep, found.scan
     offsets = scan.rays.offsets_s.astype(np.float64)
     linear, angular = mean_velocity(found.poses, float(offsets.min()), float(offsets.max()))
@@ -136,6 +146,7 @@ def _record(scene: Scene, found: FoundScan, measured: np.ndarray, boxes: Tracked
     return RecordedScan(
         sweep.lidar, sweep.timestamp, seconds, sweep.sample_index, sweep.is_key_frame, found.group,
         sweep.sensor_to_world, linear, angular, scan, np.ascontiguousarray(measured), objects,
+        np.ascontiguousarray(blocked),
     )  # fmt: skip
 
 

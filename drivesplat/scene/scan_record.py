@@ -27,7 +27,8 @@ class RecordedScan:
     `sensor_to_world` (metres) holds at the sweep's timestamp; `linear` (m/s) and `angular` (rad/s) are the sensor's
     mean velocities during the revolution, in its frame at that timestamp. `measured` is False for rays that say
     nothing: those that meet the ego vehicle, and those of a broken sector. `objects` are the indices into
-    `ScanRecords.tracks` of the boxes that returns lie in, at their rays' times, or NO_OBJECT.
+    `ScanRecords.tracks` of the boxes that returns lie in, at their rays' times, or NO_OBJECT. `blocked` are rays that
+    never return in training scans, wherever the sensor is: the vehicle is in their way.
     """
 
     lidar: str
@@ -42,6 +43,7 @@ class RecordedScan:
     scan: Scan
     measured: Bool[np.ndarray, "b a"]
     objects: Int16[np.ndarray, "b a"]
+    blocked: Bool[np.ndarray, "b a"]
 
     def points(self) -> np.ndarray:
         """The measured returns (n, 3) in world coordinates, metres, beam by beam."""

@@ -98,5 +98,5 @@ def recorded(
     return RecordedScan(
         "top", timestamp, timestamp * 1e-6, round(timestamp / KEY_FRAME_US), True, group, at(place), np.zeros(3),
         np.zeros(3), scan, np.ones(shape, dtype=bool) if measured is None else measured,
-        np.full(shape, NO_OBJECT, dtype=np.int16) if objects is None else objects,
+        np.full(shape, NO_OBJECT, dtype=np.int16) if objects is None else objects, np.zeros(shape, dtype=bool),
     )  # fmt: skip

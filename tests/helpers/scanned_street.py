@@ -62,7 +62,7 @@ def scan_records(scene: Scene) -> ScanRecords:
     scans = [
         RecordedScan(
             sweep.lidar, sweep.timestamp, scene.seconds(sweep.timestamp), sweep.sample_index, True, "train",
-            sweep.sensor_to_world, linear, np.zeros(3), scan, measured, nothing,
+            sweep.sensor_to_world, linear, np.zeros(3), scan, measured, nothing, ~measured & False,
         )
         for sweep in scene.sweeps
     ]  # fmt: skip

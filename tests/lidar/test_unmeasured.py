@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.scan_drives import BEAMS, STEPS, recorded, room
 
-from drivesplat.lidar.unmeasured import measured_rays, skipped
+from drivesplat.lidar.unmeasured import blocked_rays, measured_rays, skipped
 
 
 def scans(*ranges: np.ndarray) -> list:
@@ -59,3 +59,42 @@ def test_narrow_gaps_gaps_of_some_beams_and_empty_scans_were_not():
     some[:3, 20:60] = np.nan
     for ranges in (narrow, some, np.full_like(some, np.nan)):
         assert not skipped(recorded(ranges).scan).any()
+
+
+def poses(count: int, metres: float) -> list[np.ndarray]:
+    """Along x, evenly spaced over `metres`."""
+    places = np.tile(np.eye(4), (count, 1, 1))
+    places[:, 0, 3] = np.linspace(0.0, metres, count)
+    return list(places)
+
+
+def test_rays_that_never_return_below_the_horizontal_are_blocked():
+    """Cells of the lowest beam and of the highest one lack returns in all training scans; one cell in all but one. A
+    held-out scan that returns there changes nothing, and its ray is blocked, too."""
+    drives = [room() for _ in range(12)]
+    for ranges in drives:
+        ranges[0, 10:14] = ranges[0, 40] = ranges[len(BEAMS) - 1, 20:30] = np.nan
+    drives[3][0, 40] = 8.0
+    drives[11][0, 12] = 3.0
+    assert BEAMS[0] < 0 < BEAMS[-1]
+    found = blocked_rays(scans(*drives), poses(12, 20.0), [True] * 11 + [False])
+    assert len(found) == 12
+    for blocked in found:
+        assert np.argwhere(blocked).tolist() == [[0, step] for step in range(10, 14)]
+
+
+@pytest.mark.parametrize(
+    ("count", "metres"), [pytest.param(9, 20.0, id="few scans"), pytest.param(12, 4.0, id="a vehicle that stands")]
+)
+def test_without_motion_or_scans_nothing_is_blocked(count, metres):
+    drives = [room() for _ in range(count)]
+    for ranges in drives:
+        ranges[0, 10:14] = np.nan
+    assert not any(blocked.any() for blocked in blocked_rays(scans(*drives), poses(count, metres), [True] * count))
+
+
+def test_beams_that_mostly_do_not_return_are_not_blocked():
+    drives = [room() for _ in range(12)]
+    for ranges in drives:
+        ranges[0, : STEPS * 2 // 3] = np.nan
+    assert not any(blocked.any() for blocked in blocked_rays(scans(*drives), poses(12, 20.0), [True] * 12))

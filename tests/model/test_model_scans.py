@@ -1,5 +1,6 @@
 """LiDAR scans of a model: what its echoes give, seen along the rays of a sensor."""
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +36,19 @@ def recorded(angle: float = 0.4, beams: int = 5, firings: int = 40, seconds: flo
     scan = Scan(ScanRays(azimuths, elevations, empty), empty > 0, empty)
     none = np.full((beams, firings), -1, dtype=np.int16)
     return RecordedScan(
-        "TOP", 0, seconds, 0, True, "train", turned(angle), np.zeros(3), np.zeros(3), scan, empty == 0, none
+        "TOP",
+        0,
+        seconds,
+        0,
+        True,
+        "train",
+        turned(angle),
+        np.zeros(3),
+        np.zeros(3),
+        scan,
+        empty == 0,
+        none,
+        empty > 0,
     )
 
 
@@ -133,3 +146,15 @@ def test_a_model_trained_without_lidar_is_refused():
     assert gaussians.echoes is None, "images need no echoes"
     with pytest.raises(ResultError):
         scan_picture(gaussians, view())
+
+
+def test_rays_that_the_vehicle_blocks_do_not_return():
+    """Their ranges stay what the model says, and they have no gradient of a return."""
+    open_view, model = view(), walls()
+    blocked = torch.zeros_like(open_view.rays.azimuths, dtype=torch.bool)
+    blocked[1, 5:9] = True
+    free, found = model.scan(open_view), model.scan(dataclasses.replace(open_view, blocked=blocked))
+    assert (free.returned[1, 5:9] > 0).all() and not found.returned[blocked].any()
+    torch.testing.assert_close(found.returned[~blocked], free.returned[~blocked])
+    torch.testing.assert_close(found.range, free.range)
+    assert not found.rendered().returned[1, 5:9].any()

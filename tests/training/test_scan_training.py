@@ -53,7 +53,19 @@ def scan_of_a_wall(x: float = 0.0, intensity: float = 0.3) -> RecordedScan:
     scan = Scan(rays, returned, ranges * returned, values * returned)
     nothing = np.full(ranges.shape, -1, dtype=np.int16)
     return RecordedScan(
-        "TOP", 0, 0.0, 0, True, "train", pose, np.zeros(3), np.zeros(3), scan, np.ones_like(returned), nothing
+        "TOP",
+        0,
+        0.0,
+        0,
+        True,
+        "train",
+        pose,
+        np.zeros(3),
+        np.zeros(3),
+        scan,
+        np.ones_like(returned),
+        nothing,
+        np.zeros_like(returned),
     )
 
 
