@@ -11,6 +11,7 @@ from helpers.syntax_trees import source_of, tree_of
 LIBRARY = "drivesplat"
 MAX_PLACES, MAX_LOOSE_MODULES = 26, 2
 MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 8, 18
+MAX_LINES = 300
 
 Graph = dict[str, set[str]]
 """What each module or package imports."""
@@ -70,6 +71,11 @@ def test_few_places_are_directly_in_the_library():
     loose = {path.name for path in (REPOSITORY / LIBRARY).glob("*.py")}
     assert len(packages) + len(loose) <= MAX_PLACES
     assert len(loose) <= MAX_LOOSE_MODULES, loose
+
+
+def test_modules_are_short():
+    long = {name: lines for name in modules() if (lines := len(source_of(modules()[name]).splitlines())) > MAX_LINES}
+    assert not long, "a concept is missing: move it to a module of its own"
 
 
 def test_modules_import_in_no_circle_and_in_short_chains():

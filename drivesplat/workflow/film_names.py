@@ -7,6 +7,9 @@ from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
 
+EDITS, TRAJECTORIES = "edits", "trajectories"
+"""Kinds of folders of drives and of scans, and the folders of a method in which they lie."""
+
 
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
     """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""

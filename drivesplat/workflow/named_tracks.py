@@ -11,8 +11,7 @@ from drivesplat.errors import ResultError
 from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.track_references import EditReference, TrackReferences
-from drivesplat.workflow.film_names import scene_edits
-from drivesplat.workflow.stages import EDITS
+from drivesplat.workflow.film_names import EDITS, scene_edits
 
 RULES_OF_EDITS = ("edit", "quad", "drive_folder", "scan_folder")
 """Rules that render an edit; the last two also render trajectories, which name no tracks."""

@@ -8,15 +8,13 @@ from typing import Any
 from drivesplat.provenance.code_digest import code_digest
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
-from drivesplat.workflow.film_names import scene_edits
+from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, scene_edits
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.stages import (
-    EDITS,
     OF_ONE_SCENE,
     SCAN_BASELINES,
     SCANS,
     SIDE_BY_SIDE,
-    TRAJECTORIES,
     method_stages,
     scene_stages,
     stage_settings,

@@ -19,17 +19,13 @@ from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
-from drivesplat.workflow.film_names import no_such_edit, no_such_film, scene_edits
+from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.named_tracks import refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
-from drivesplat.workflow.stages import (
-    EDITS,
-    TRAJECTORIES,
-    idle_variants,
-)
+from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
 
 ABLATION_FILES = ("ablation.json", "ablation.csv")

@@ -4,7 +4,6 @@ A stage is a rule; its record holds everything but the inputs that determines it
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any
 
 from drivesplat.errors import ConfigError
@@ -14,7 +13,6 @@ from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
-from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
@@ -29,7 +27,9 @@ from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob,
 from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
-from drivesplat.workflow.film_names import no_such_edit, no_such_film, scene_edits
+from drivesplat.workflow import film_fields
+from drivesplat.workflow.film_names import no_such_edit, scene_edits
+from drivesplat.workflow.place import Place
 from drivesplat.workflow.without_cameras import (
     CAMERA_STAGES,
     LIDAR_METHOD_STAGES,
@@ -50,29 +50,10 @@ OF_ONE_SCENE = (
     "scan_folder",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
-EDITS, TRAJECTORIES = "edits", "trajectories"
-"""Kinds of folders of drives and of scans, and the folders of a method in which they lie."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
 """The stages of a scene's LiDAR scans, and of the figures that methods which render them have to beat."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space", SCANS)
 """Stages of a scene that only some methods train on."""
-
-
-@dataclass(frozen=True)
-class Place:
-    """The dataset, scene, method and film (trajectory or edit; of a folder of a drive or of scans with its kind,
-    'edits/…') of a job, empty where it has none, and the config that applies to it. `scene` is also empty for stages
-    that are not in OF_ONE_SCENE."""
-
-    config: Config
-    dataset_name: str
-    scene: str
-    method: str
-    film: str
-
-    @property
-    def dataset(self) -> DatasetSettings:
-        return self.config.datasets[self.dataset_name]
 
 
 def stage_settings(config: Config, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:
@@ -202,48 +183,6 @@ def _evaluation(at: Place) -> dict[str, Any]:
     }
 
 
-def _format(at: Place) -> dict[str, Any]:
-    """The fields of a `FilmFormat`."""
-    fields = ("fps", "width", "height", "horizontal_fov", "crf", "captions")
-    return {"camera": at.config.eval_camera, **{name: getattr(at.config.render, name) for name in fields}}
-
-
-def _film(at: Place) -> dict[str, Any]:
-    trajectories = at.config.render.trajectories
-    if at.film not in trajectories:
-        raise ConfigError(no_such_film(at.config, f"dataset {at.dataset_name}", at.film))
-    return {"trajectory": trajectories[at.film], **_format(at)}
-
-
-def _quad(at: Place) -> dict[str, Any]:
-    edits = scene_edits(at.config, at.scene)
-    if at.film not in edits:
-        raise ConfigError(no_such_edit(at.scene, at.film, edits))
-    return {"edit": edits[at.film], **_format(at)}
-
-
-def _edit(at: Place) -> dict[str, Any]:
-    return {**_quad(at), "frames": at.config.render.edited_frames}
-
-
-def _edit_or_trajectory(at: Place) -> dict[str, Any]:
-    kind, _, name = at.film.partition("/")
-    of_film = replace(at, film=name)
-    return {"edit": _quad(of_film)["edit"]} if kind == EDITS else {"trajectory": _film(of_film)["trajectory"]}
-
-
-def _drive(at: Place) -> dict[str, Any]:
-    return {**_edit_or_trajectory(at), "width": at.config.export.drive_width}
-
-
-def _scan_folder(at: Place) -> dict[str, Any]:
-    return {**_edit_or_trajectory(at), "formats": at.config.export.scan_formats}
-
-
-def _encoding(at: Place) -> dict[str, Any]:
-    return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
-
-
 def _viewer(at: Place) -> dict[str, Any]:
     """The edits of a method that can be edited, and the methods that have pages, too."""
     export, editable = at.config.export, at.config.all_methods[at.method].moving_parts
@@ -291,20 +230,20 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),
     "lidar_picture": (Settings, _nothing),
-    "lidar_film": (LidarFilmJob, _encoding),
+    "lidar_film": (LidarFilmJob, film_fields.encoding),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
     "evaluate_scans": (EvaluateScansJob, _nothing),
     "scene_metrics": (Settings, _nothing),
     "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
     "tracks": (TracksJob, _nothing),
-    "film": (FilmJob, _film),
-    "film_parts": (FilmFormat, _format),
-    "compare": (CompareJob, _encoding),
-    "edit": (EditJob, _edit),
-    "quad": (EditJob, _quad),
-    "drive_folder": (DriveJob, _drive),
-    "scan_folder": (ScanFolderJob, _scan_folder),
+    "film": (FilmJob, film_fields.film),
+    "film_parts": (FilmFormat, film_fields.film_format),
+    "compare": (CompareJob, film_fields.encoding),
+    "edit": (EditJob, film_fields.edited_film),
+    "quad": (EditJob, film_fields.quad),
+    "drive_folder": (DriveJob, film_fields.drive_folder),
+    "scan_folder": (ScanFolderJob, film_fields.scan_folder),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

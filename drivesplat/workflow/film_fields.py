@@ -1,0 +1,56 @@
+"""The fields of the records of stages that render trajectories and edits: films, drive folders and LiDAR scans."""
+
+from dataclasses import replace
+from typing import Any
+
+from drivesplat.errors import ConfigError
+from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
+from drivesplat.workflow.place import Place
+
+
+def film_format(at: Place) -> dict[str, Any]:
+    """Of a `FilmFormat`."""
+    fields = ("fps", "width", "height", "horizontal_fov", "crf", "captions")
+    return {"camera": at.config.eval_camera, **{name: getattr(at.config.render, name) for name in fields}}
+
+
+def film(at: Place) -> dict[str, Any]:
+    """Of a `FilmJob`. Raises ConfigError for an unknown trajectory."""
+    trajectories = at.config.render.trajectories
+    if at.film not in trajectories:
+        raise ConfigError(no_such_film(at.config, f"dataset {at.dataset_name}", at.film))
+    return {"trajectory": trajectories[at.film], **film_format(at)}
+
+
+def quad(at: Place) -> dict[str, Any]:
+    """Of an `EditJob` that writes no frames. Raises ConfigError for an unknown edit."""
+    edits = scene_edits(at.config, at.scene)
+    if at.film not in edits:
+        raise ConfigError(no_such_edit(at.scene, at.film, edits))
+    return {"edit": edits[at.film], **film_format(at)}
+
+
+def edited_film(at: Place) -> dict[str, Any]:
+    """Of an `EditJob`; raises as `quad`."""
+    return {**quad(at), "frames": at.config.render.edited_frames}
+
+
+def _edit_or_trajectory(at: Place) -> dict[str, Any]:
+    kind, _, name = at.film.partition("/")
+    of_film = replace(at, film=name)
+    return {"edit": quad(of_film)["edit"]} if kind == EDITS else {"trajectory": film(of_film)["trajectory"]}
+
+
+def drive_folder(at: Place) -> dict[str, Any]:
+    """Of a `DriveJob`; raises as `quad` or `film`."""
+    return {**_edit_or_trajectory(at), "width": at.config.export.drive_width}
+
+
+def scan_folder(at: Place) -> dict[str, Any]:
+    """Of a `ScanFolderJob`; raises as `quad` or `film`."""
+    return {**_edit_or_trajectory(at), "formats": at.config.export.scan_formats}
+
+
+def encoding(at: Place) -> dict[str, Any]:
+    """How films that combine others are encoded."""
+    return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
