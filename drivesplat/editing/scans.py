@@ -14,6 +14,7 @@ from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.editing.actors import recorded_and_edited, trained_actors
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.film import actor_placements, collisions
+from drivesplat.errors import ConfigError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.objects_met import TrackedBoxes
 from drivesplat.model.scans import ScanView, group_met, view_of_scan
@@ -115,12 +116,15 @@ def scan_drive(
     """The drive of `job`: the rays of `scans`, as long as the ego vehicle is on its recorded path.
 
     Warns where a sensor is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the
-    scene or the model has no actors; DatasetError as `recorded_ego`; ResultError as `trained_actors`.
+    scene, there is no camera or the model has no actors; DatasetError as `recorded_ego`; ResultError as
+    `trained_actors`.
     """
     if job.edit is None:
         trained = actors = trained_actors(model, scene, where)
         sensors = _beside(scene, scans, job)
     else:
+        if job.eval_camera is None:
+            raise ConfigError(f"{where}: scans of edits need images, and the scene has no camera")
         trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
         sensors = _carried(scene, scans, job.eval_camera, job.edit, where)
     boxes = TrackedBoxes.of_scene(scene, without={actor.id for actor in trained})

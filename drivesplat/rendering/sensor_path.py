@@ -19,11 +19,12 @@ MIN_TRAVEL = 1.0
 """Metres between two sweeps that show where ahead is, if nothing else says so."""
 
 
-def recorded_ego(scene: Scene, camera: str) -> EgoPoses:
-    """The ego poses by the images of a camera. In a scene without images, by its sweeps: their mounts, or the direction
-    of travel. Raises DatasetError where nothing shows where ahead is, or the scene has images but not of that camera.
+def recorded_ego(scene: Scene, camera: str | None) -> EgoPoses:
+    """The ego poses by the images of a camera. Without a camera or images, by the scene's sweeps: their mounts, or the
+    direction of travel. Raises DatasetError where nothing shows where ahead is, or the scene has images but not
+    of that camera.
     """
-    if not scene.frames:
+    if camera is None or not scene.frames:
         seconds, poses = _ego_of_sweeps(scene)
         return lambda times: smooth_poses(seconds * 1e6, poses, times * 1e6)
     frames = recorded_frames(scene, camera)

@@ -90,9 +90,9 @@ class DriveJob(Settings):
 
 class ScanFolderJob(Settings):
     """All settings that determine one folder of rendered scans: the `edit` of its drive, or the `trajectory` beside the
-    recorded one."""
+    recorded one. `eval_camera` is None where the scene has no camera, and then no edit."""
 
-    eval_camera: str
+    eval_camera: str | None
     formats: tuple[ScanFormat, ...]
     edit: Edit | None = None
     trajectory: TrajectorySettings | None = None

@@ -6,6 +6,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.place import Place
+from drivesplat.workflow.without_cameras import HOW, no_camera
 
 
 def film_format(at: Place) -> dict[str, Any]:
@@ -47,8 +48,11 @@ def drive_folder(at: Place) -> dict[str, Any]:
 
 
 def scan_folder(at: Place) -> dict[str, Any]:
-    """Of a `ScanFolderJob`; raises as `quad` or `film`."""
-    return {**_edit_or_trajectory(at), "formats": at.config.export.scan_formats}
+    """Of a `ScanFolderJob`; raises as `quad` or `film`, and ConfigError for an edit of a scene without cameras."""
+    camera = at.config.eval_camera if at.config.cameras else None
+    if camera is None and at.film.startswith(f"{EDITS}/"):
+        raise ConfigError(f"{no_camera(at.scene)}: scans of edits need images; {HOW}")
+    return {**_edit_or_trajectory(at), "eval_camera": camera, "formats": at.config.export.scan_formats}
 
 
 def encoding(at: Place) -> dict[str, Any]:

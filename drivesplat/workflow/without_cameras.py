@@ -70,8 +70,8 @@ def refuse_image_results(config: Config, scene: str, path: Sequence[str], films:
             f"{no_camera(scene)}, and method {name!r} renders images alone; those that render LiDAR: {able}"
         )
     shown = {*IMAGE_RESULTS_OF_METHODS, *(f"{film}{end}" for film in films for end in (".mp4", ".cameras.json"))}
-    film = rest[:1] == ["edits"] and rest[-1].endswith((".mp4", ".png"))
-    if name in IMAGE_RESULTS or (rest and (rest[0] in shown or film or rest[-1] == "drive.json")):
+    edit = rest[:1] == ["edits"] and rest[-1].endswith((".mp4", ".png", "scans.json"))
+    if name in IMAGE_RESULTS or (rest and (rest[0] in shown or edit or rest[-1] == "drive.json")):
         raise ConfigError(f"{no_camera(scene)}: {'/'.join(path)} needs images; {HOW}")
 
 

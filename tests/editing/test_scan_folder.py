@@ -272,6 +272,16 @@ def test_a_sensor_inside_a_vehicle_is_warned_of(scene, lidar_model, records, cap
     assert "here: the LiDAR is inside a vehicle between 0.0 and" in caplog.text
 
 
+def test_without_cameras_a_trajectory_moves_the_sensor_and_an_edit_is_refused(scene, lidar_model, records):
+    alone, some = replace(scene, frames=()), replace(records, scans=records.scans[1:3])
+    job = a_job(lateral=2.0).model_copy(update={"eval_camera": None})
+    for sensor, recorded in zip(driven(alone, lidar_model, some, job).sensors, some.scans, strict=True):
+        np.testing.assert_allclose(sensor.sensor_to_world, recorded.sensor_to_world @ LEFT, atol=1e-4)
+    job = a_job({"remove": {"track": AHEAD}}).model_copy(update={"eval_camera": None})
+    with pytest.raises(ConfigError, match=r"^here: scans of edits need images, and the scene has no camera$"):
+        driven(alone, lidar_model, some, job)
+
+
 def test_without_images_left_is_beside_the_direction_of_travel(scene, records):
     alone = replace(scene, frames=())
     seconds = np.array([0.3, 2.0])

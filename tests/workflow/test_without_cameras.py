@@ -90,6 +90,7 @@ def test_its_poses_are_not_refined_from_images_that_it_lacks():
         ("with_lidar/held_out_rendered.png", ": with_lidar/held_out_rendered.png needs images"),
         ("with_lidar/edits/away.mp4", ": with_lidar/edits/away.mp4 needs images"),
         ("with_lidar/quad/away.mp4", ": with_lidar/quad/away.mp4 needs images"),
+        ("with_lidar/edits/away/scans/scans.json", ": with_lidar/edits/away/scans/scans.json needs images"),
         ("with_lidar/trajectories/original/drive/drive.json", "drive.json needs images"),
         ("with_lidar/splat.ply", ": with_lidar/splat.ply needs images"),
         ("with_lidar/colmap/images.txt", "images.txt needs images"),
@@ -110,7 +111,8 @@ def test_a_result_that_needs_images_is_refused_by_name(target, words):
 def test_what_it_has_is_not_refused():
     made = plan()
     of_scene = ("scene.json", "parser.pkl", "actors.npz", "scans.npz", "scan_baselines.json", "metrics.json")
-    of_method = ("checkpoint.npz", "train.json", "eval.json", "lidar.png", "lidar.mp4")
+    scans = "trajectories/original/scans/scans.json"
+    of_method = ("checkpoint.npz", "train.json", "eval.json", "lidar.png", "lidar.mp4", scans)
     made.refuse_unknown([f"there/a2/{name}" for name in (*of_scene, *(f"with_lidar/{name}" for name in of_method))])
 
 
@@ -119,6 +121,16 @@ def test_stages_of_images_have_no_settings_there(stage):
     """Whoever asks for their results: also another workflow, whose targets are unknown."""
     with pytest.raises(ConfigError, match=rf"^scene a2 has no camera .*the stage {stage} needs images$"):
         stage_settings(load(settings()), stage, "a2", "with_lidar", "original")
+
+
+def test_scans_of_trajectories_take_no_camera_and_those_of_edits_are_refused():
+    config = load(settings(cameras=["CAM_FRONT"]))
+    of = ("with_lidar", "trajectories/original")
+    with_image, alone = (json.loads(stage_settings(config, "scan_folder", scene, *of)) for scene in ("a1", "a2"))
+    assert (with_image["eval_camera"], alone["eval_camera"]) == ("CAM_FRONT", None)
+    assert alone["trajectory"] == with_image["trajectory"]
+    with pytest.raises(ConfigError, match=r"^scene a2 has no camera .*: scans of edits need images; docs/lidar.md"):
+        stage_settings(config, "scan_folder", "a2", "with_lidar", "edits/away")
 
 
 def test_without_a_method_that_renders_lidar_it_is_refused_with_the_remedy():
