@@ -168,7 +168,7 @@ def truth_arrays(path: str | Path, name: str, *arrays: str) -> list[np.ndarray]:
     or does not hold them."""
     file = truth_image(path, name)
     try:
-        with np.load(file) as held:
+        with np.load(file, allow_pickle=False) as held:
             return [held[array] for array in arrays]
     except Exception as error:  # zip and numpy each fail in their own ways
         raise unreadable(file, RULE, f"not an archive of {', '.join(arrays)} ({error})", delete=path) from error

@@ -70,8 +70,8 @@ def test_every_size_of_scan_agrees(beams, firings):
 
 
 def test_moving_sensor_and_gaussians_agree():
-    scene = random_scan(6, n=80, rays=uneven_rays(6, 6, 90))
-    velocities = torch.randn(80, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) * 5.0
+    scene = random_scan(6, n=50, rays=uneven_rays(6, 4, 70))
+    velocities = torch.randn(50, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) * 5.0
     assert not disagreements(scene, MOTION)
     assert not disagreements(scene, replace(MOTION, velocities=velocities))
 
@@ -101,7 +101,7 @@ def test_any_number_of_channels_agrees(channels):
 @pytest.mark.parametrize("opacity", [0.02, 0.9])
 def test_lists_of_several_chunks_agree(opacity):
     """Of transparent Gaussians, where all chunks are seen, and of opaque ones, where rays end in the first."""
-    scene = random_scan(32, n=900, rays=even_rays(1, 40))
+    scene = random_scan(32, n=600, rays=even_rays(1, 32))
     scene.scales[:, :] = 2.0
     scene.opacities[:] = opacity
     assert not disagreements(scene)
