@@ -151,7 +151,7 @@ def _continue(
 
 def _inputs(task: Task) -> tuple[TrainingInputs, list[dict[str, Any]]]:
     files = task.files
-    return read_inputs(files.parser, files.masks, files.actors, files.lidar_depth, files.free_space, files.scans)
+    return read_inputs(files.parser, [files.masks], files.actors, files.lidar_depth, files.free_space, files.scans)
 
 
 def _profile_folder(task: Task) -> Path:

@@ -320,7 +320,7 @@ def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkey
     out = Path("results/speed/tiny")
     _, task = tasks_of(file, plan_run(file, out, Path()), out)
     timed = read_checkpoint(task.folder / "checkpoint.npz")
-    inputs, _ = read_inputs(task.files.parser, task.files.masks, (), (), ())
+    inputs, _ = read_inputs(task.files.parser, [task.files.masks], (), (), ())
     files = TrainingFiles(tmp_path / "again/checkpoint.npz", tmp_path / "again/train.json")
     run_training(inputs, task.train, task.device, files, timed.provenance, "again")
     again = read_checkpoint(files.checkpoint)

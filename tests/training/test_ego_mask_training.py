@@ -156,7 +156,7 @@ def prepared(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_a_body_that_was_found_reaches_the_training_of_its_camera(prepared, monkeypatch, tmp_path):
-    inputs, _ = read_inputs(str(prepared / "parser.pkl"), str(prepared / "masks/masks.json"), [], [], [])
+    inputs, _ = read_inputs(str(prepared / "parser.pkl"), [str(prepared / "masks/masks.json")], [], [], [])
     assert inputs.cameras_with_ego == {"CAM_BACK"}
     assert json.loads((prepared / "masks/masks.json").read_text())["own_car"] == {"CAM_BACK": "images"}
     job = job_of(sky="mask", iterations=3, checkpoint_every=10)
