@@ -24,26 +24,26 @@ image to that of the readout."""
 
 @dataclass(frozen=True)
 class RollingFeatures:
-    """The features of n images as recorded, in continuous pixels, and the images' shutters (None: global)."""
+    """Of the images with a rolling shutter, by their number: the features as recorded, in continuous pixels, and the
+    shutter."""
 
     images: RigImages
-    pixels: list[Float[np.ndarray, "_ 2"]]
-    shutters: list[Shutter | None]
+    recorded: dict[int, tuple[Float[np.ndarray, "_ 2"], Shutter]]
 
     @classmethod
     def of(cls, images: RigImages, start: pycolmap.Reconstruction) -> "RollingFeatures":
         """Those of a reconstruction whose features are as recorded. Velocities are those of the images' poses."""
-        numbers = range(1, len(images) + 1)
-        pixels = [np.array([f.xy for f in start.images[number].points2D]).reshape(-1, 2) for number in numbers]
-        return cls(images, pixels, shutters(images.scene, images.frames))
+        recorded = {
+            number: (np.array([f.xy for f in start.images[number].points2D]).reshape(-1, 2), shutter)
+            for number, shutter in enumerate(shutters(images.scene, images.frames), start=1)
+            if shutter is not None
+        }
+        return cls(images, recorded)
 
     def move_to_timestamp(self, reconstruction: pycolmap.Reconstruction) -> None:
         """Moves the features of a reconstruction of these images, in place."""
-        for number, (frame, pixels, shutter) in enumerate(
-            zip(self.images.frames, self.pixels, self.shutters, strict=True), start=1
-        ):
-            if shutter is None:
-                continue
+        for number, (pixels, shutter) in self.recorded.items():
+            frame = self.images.frames[number - 1]
             image, size = reconstruction.images[number], (frame.width, frame.height)
             world_to_camera, depths = image.cam_from_world().matrix(), np.full(len(pixels), FAR)
             for i, feature in enumerate(image.points2D):

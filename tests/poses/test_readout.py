@@ -104,12 +104,11 @@ def test_features_without_a_point_count_as_far_away(tmp_path, views):
     start = write_database(tmp_path / "features.db", images, views, job_of())
     rolling = RollingFeatures.of(images, start)
     rolling.move_to_timestamp(start)
-    frame, shutter = images.frames[4], rolling.shutters[4]
+    frame, (_, shutter) = images.frames[4], rolling.recorded[5]
     k = continuous_intrinsics(frame, SIZE)
     found = np.array([feature.xy for feature in start.images[5].points2D])
     expected = at_timestamp(views[4].pixels, np.full(len(found), 1e7), shutter, k, SIZE)
     np.testing.assert_allclose(found, expected, atol=0.02)
     assert np.abs(found - views[4].pixels).max() > 1.0
-    still = dataclasses.replace(rolling, shutters=[None] * len(images))
-    still.move_to_timestamp(start)
+    RollingFeatures.of(images_of(rolling_drive(None).scene), start).move_to_timestamp(start)
     np.testing.assert_array_equal(found, [feature.xy for feature in start.images[5].points2D])

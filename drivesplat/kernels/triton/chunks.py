@@ -123,6 +123,18 @@ def count_chunks(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.constex
     tl.store(firsts + tiles, found)
 
 
+@triton.jit
+@no_type_check
+def tile_of(chunk, firsts, tiles, steps):
+    """The last tile whose first chunk is not after this one."""
+    low, high = 0, tiles
+    for _ in range(steps):
+        middle = (low + high) // 2
+        behind = tl.load(firsts + middle) <= chunk
+        low, high = tl.where(behind, middle, low), tl.where(behind, high, middle)
+    return low
+
+
 @triton.jit(do_not_specialize=["tiles", "per_camera", "across", "steps"])
 @no_type_check
 def _split(
@@ -132,11 +144,7 @@ def _split(
     """Copies the Gaussians of a chunk. Chunks beyond the last one are empty and start at the end of all entries."""
     chunk = tl.program_id(0)
     is_one = chunk < tl.load(firsts + tiles)
-    low, high = 0, tiles
-    for _ in range(steps):  # finds the last tile whose first chunk is not after this one
-        middle = (low + high) // 2
-        behind = tl.load(firsts + middle) <= chunk
-        low, high = tl.where(behind, middle, low), tl.where(behind, high, middle)
+    low = tile_of(chunk, firsts, tiles, steps)
     start = tl.load(offsets + low) + (chunk - tl.load(firsts + low)) * LENGTH
     start = tl.where(is_one, start, tl.load(offsets + tiles))
     tl.store(starts + chunk, start)
@@ -157,7 +165,7 @@ def _split(
 
 @triton.jit
 @no_type_check
-def _add(total, value, inside):
+def add_nonzero(total, value, inside):
     """Adds values other than 0."""
     tl.atomic_add(total, value, mask=inside & (value != 0.0), sem="relaxed")
 
@@ -175,13 +183,13 @@ def _sum_copies(
     inside = is_one & (place < tl.load(starts + chunk + 1, mask=is_one, other=0))
     i = tl.load(ids + tl.load(order + place, mask=inside, other=0), mask=inside, other=0).to(tl.int64)
     for k in tl.static_range(2):
-        _add(v_means + 2 * i + k, tl.load(v_means_copies + 2 * place + k, mask=inside, other=0.0), inside)
+        add_nonzero(v_means + 2 * i + k, tl.load(v_means_copies + 2 * place + k, mask=inside, other=0.0), inside)
     for k in tl.static_range(3):
-        _add(v_conics + 3 * i + k, tl.load(v_conics_copies + 3 * place + k, mask=inside, other=0.0), inside)
+        add_nonzero(v_conics + 3 * i + k, tl.load(v_conics_copies + 3 * place + k, mask=inside, other=0.0), inside)
     for k in tl.static_range(CHANNELS):
         value = tl.load(v_values_copies + CHANNELS * place + k, mask=inside, other=0.0)
-        _add(v_values + CHANNELS * i + k, value, inside)
-    _add(v_opacities + i, tl.load(v_opacities_copies + place, mask=inside, other=0.0), inside)
+        add_nonzero(v_values + CHANNELS * i + k, value, inside)
+    add_nonzero(v_opacities + i, tl.load(v_opacities_copies + place, mask=inside, other=0.0), inside)
 
 
 @triton.jit

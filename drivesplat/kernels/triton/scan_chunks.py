@@ -13,7 +13,7 @@ from torch import Tensor
 
 from drivesplat.kernels.scan_borders import ON_GPU
 from drivesplat.kernels.scanned_gaussians import MIN_ALPHA, ScannedGaussians
-from drivesplat.kernels.triton.chunks import count_chunks
+from drivesplat.kernels.triton.chunks import count_chunks, tile_of
 from drivesplat.kernels.triton.tiles import TileLists
 from drivesplat.kernels.triton.vectors import around
 
@@ -108,11 +108,7 @@ def _copy(
 @no_type_check
 def chunk_of(chunk, offsets, firsts, tiles, steps):
     """The tile of a chunk, or -1, and the first entry of the chunk and the one after its last."""
-    low, high = 0, tiles
-    for _ in range(steps):  # finds the last tile whose first chunk is not after this one
-        middle = (low + high) // 2
-        behind = tl.load(firsts + middle) <= chunk
-        low, high = tl.where(behind, middle, low), tl.where(behind, high, middle)
+    low = tile_of(chunk, firsts, tiles, steps)
     start = tl.load(offsets + low) + (chunk - tl.load(firsts + low)) * LENGTH
     end = tl.minimum(start + LENGTH, tl.load(offsets + low + 1))
     return tl.where(chunk < tl.load(firsts + tiles), low, -1), start, end

@@ -5,6 +5,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
+from drivesplat.kernels.triton.chunks import add_nonzero
 from drivesplat.kernels.triton.scan_chunks import (
     CONIC_AA,
     CONIC_AE,
@@ -62,13 +63,6 @@ def remain(
         chunk += JOINED
 
 
-@triton.jit
-@no_type_check
-def _add(target, value, mask):
-    """Adds values other than 0."""
-    tl.atomic_add(target, value, mask=mask & (value != 0.0), sem="relaxed")
-
-
 @triton.jit(do_not_specialize=SIZES)
 @no_type_check
 def add_gradients(
@@ -106,7 +100,7 @@ def add_gradients(
             for k in tl.static_range(CHANNELS):
                 by_value = tl.load(v_out + CHANNELS * ray + k, mask=inside, other=0.0)[None, :]
                 value += field_of(entries, VALUES + k, capacity, at, end) * by_value
-                _add(v_values + CHANNELS * i + k, tl.sum(weight * by_value, 1), exists)
+                add_nonzero(v_values + CHANNELS * i + k, tl.sum(weight * by_value, 1), exists)
             seen = weight * value
             behind = rest[None, :] - tl.cumsum(seen, 0)
             v = raw * (reaches * value - behind / (1.0 - alpha))
@@ -119,15 +113,15 @@ def add_gradients(
             c, opacity = field_of(entries, CONIC_EE, capacity, at, end), field_of(entries, OPACITY, capacity, at, end)
             slope_a = field_of(entries, SLOPE_A, capacity, at, end)
             slope_e = field_of(entries, SLOPE_E, capacity, at, end)
-            _add(v_opacities + i, tl.sum(v, 1) / tl.maximum(tl.max(opacity, 1), NOTHING), exists)
-            _add(v_means2d + 2 * i, tl.max(a * m_a + b * m_e - slope_a * f, 1), exists)
-            _add(v_means2d + 2 * i + 1, tl.max(b * m_a + c * m_e - slope_e * f, 1), exists)
-            _add(v_conics + 3 * i, -0.5 * tl.sum(v * da * da, 1), exists)
-            _add(v_conics + 3 * i + 1, -tl.sum(v * da * de, 1), exists)
-            _add(v_conics + 3 * i + 2, -0.5 * tl.sum(v * de * de, 1), exists)
-            _add(v_ranges + i, tl.sum(of_range, 1), exists)
-            _add(v_slopes + 2 * i, tl.sum(unlimited * da, 1), exists)
-            _add(v_slopes + 2 * i + 1, tl.sum(unlimited * de, 1), exists)
+            add_nonzero(v_opacities + i, tl.sum(v, 1) / tl.maximum(tl.max(opacity, 1), NOTHING), exists)
+            add_nonzero(v_means2d + 2 * i, tl.max(a * m_a + b * m_e - slope_a * f, 1), exists)
+            add_nonzero(v_means2d + 2 * i + 1, tl.max(b * m_a + c * m_e - slope_e * f, 1), exists)
+            add_nonzero(v_conics + 3 * i, -0.5 * tl.sum(v * da * da, 1), exists)
+            add_nonzero(v_conics + 3 * i + 1, -tl.sum(v * da * de, 1), exists)
+            add_nonzero(v_conics + 3 * i + 2, -0.5 * tl.sum(v * de * de, 1), exists)
+            add_nonzero(v_ranges + i, tl.sum(of_range, 1), exists)
+            add_nonzero(v_slopes + 2 * i, tl.sum(unlimited * da, 1), exists)
+            add_nonzero(v_slopes + 2 * i + 1, tl.sum(unlimited * de, 1), exists)
             rest -= tl.sum(seen, 0)
             left = tl.min(after, 0)
             remaining = tl.max(left, 0)
