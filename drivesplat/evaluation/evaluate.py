@@ -13,6 +13,7 @@ import torch
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.drive_summary import summarize_drive
+from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, training_figures
 from drivesplat.evaluation.lpips_map import load_lpips
 from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
@@ -32,7 +33,7 @@ from drivesplat.scene.masks import MasksRecord, read_masks_record
 from drivesplat.scene.prepared_drive import PreparedDrive, read_prepared_drive
 from drivesplat.scene.regions import REGIONS, region_mask, region_masks
 from drivesplat.scene.scan_record import ScanRecords, read_scans
-from drivesplat.scene.splits import HELD_OUT_GROUPS, NEIGHBOURHOOD_HZ
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
@@ -106,7 +107,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     """Measures one method on the held-out images of a scene, and against truth if there is any."""
     model, device = open_model(inputs.checkpoint, device_settings)
     unavailable, lpips_map = load_lpips(inputs.lpips_record, device)
-    training, summary = inputs.recording.record, inputs.summary
+    training = inputs.recording.record
     with explain_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
         groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
@@ -125,12 +126,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
         "result": {
             **groups,
             **against_truth,
-            "gaussians": summary["gaussians"],
-            "train_seconds": summary["seconds"],
-            "train_iterations": summary["iterations"],
-            "peak_gpu_memory_gb": summary["peak_gpu_memory_gb"],
-            "device": summary["device"],
-            "random_seed": summary["random_seed"],
+            **training_figures(inputs.summary),
             "findings": findings(groups["interpolation"]),
             "shown": {"group": sample.group, "key_frame": inputs.recording.frame(sample.index).sample_index},
             **({"lpips_unavailable": unavailable} if unavailable else {}),
@@ -159,17 +155,10 @@ def truth_metrics(
 
 
 def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob) -> dict[str, Any]:
-    """The protocol of every figure. At NEIGHBOURHOOD_HZ and more, it also states the rate of key frames, the
-    neighbourhood, and the least time between a held-out and a training image."""
+    """The protocol of every figure, with `rate_figures` of the measured and the training images."""
     measured = [i for images in measured_images(record, job.eval_camera).values() for i in images]
     width, height = record.image_size(measured[0] if measured else 0)
-    holdout, rate = job.holdout.model_dump(), record.scene.key_frame_hz
-    if rate is None or rate < NEIGHBOURHOOD_HZ:
-        del holdout["neighbourhood_s"]
-        at_rate = {}
-    else:
-        apart = np.abs(np.subtract.outer(record.timestamps[measured], record.timestamps[record.train_images]))
-        at_rate = {"key_frame_hz": rate, "nearest_training_s": float(apart.min()) * 1e-6 if apart.size else None}
+    rate = record.scene.key_frame_hz
     return {
         "version": record.scene.version,
         "cameras": list(job.cameras),
@@ -177,7 +166,7 @@ def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob
         "width": width,
         "height": height,
         "sweeps": job.sweeps,
-        "holdout": holdout,
+        "holdout": holdout_figures(job.holdout, rate),
         "held_out_frames": record.held_out_frames,
         "train_images": len(record.train_images),
         "poses": record.scene.poses,
@@ -188,7 +177,7 @@ def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob
         "lidar_missing": record.seed.lidar_missing,
         "images_missing": record.scene.missing_images,
         "key_frame_range": record.scene.key_frame_range,
-        **at_rate,
+        **rate_figures(rate, record.timestamps[measured], record.timestamps[record.train_images]),
     }
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivesplat.evaluation.drive_summary import summarize_swept_drive
+from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, training_figures
 from drivesplat.evaluation.scan_evaluation import lidar_metrics
 from drivesplat.io.storage import Provenance
 from drivesplat.machine.device import explain_out_of_memory
@@ -11,7 +12,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_chec
 from drivesplat.scene.regions import REGIONS
 from drivesplat.scene.scan_record import ScanRecords, read_scans
 from drivesplat.scene.scene import Scene, read_scene
-from drivesplat.scene.splits import HELD_OUT_GROUPS, NEIGHBOURHOOD_HZ
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateScansJob
@@ -53,7 +54,7 @@ def evaluate_scans(
     with explain_out_of_memory(lambda: len(model)):
         lidar = lidar_metrics(model, inputs.scene, inputs.scans, spread, device)
     of_images = {"gap_db": None, **dict.fromkeys(REGIONS)}
-    record, summary = inputs.record, inputs.summary
+    record = inputs.record
     return {
         "schema": 1,
         "scene": record.scene.name,
@@ -63,12 +64,7 @@ def evaluate_scans(
         "result": {
             **{group: {**of_images, "lidar": lidar[group]} for group in HELD_OUT_GROUPS},
             "images_unavailable": UNAVAILABLE,
-            "gaussians": summary["gaussians"],
-            "train_seconds": summary["seconds"],
-            "train_iterations": summary["iterations"],
-            "peak_gpu_memory_gb": summary["peak_gpu_memory_gb"],
-            "device": summary["device"],
-            "random_seed": summary["random_seed"],
+            **training_figures(inputs.summary),
             "findings": {"static_above_22_db": None, "vehicle_below_18_db": None},
             "shown": None,
         },
@@ -76,12 +72,11 @@ def evaluate_scans(
 
 
 def scan_protocol(inputs: ScanEvaluationInputs, job: EvaluateScansJob) -> dict[str, Any]:
-    """The protocol of every figure, with the keys of a scene with cameras, and the number of training scans."""
-    record, holdout = inputs.record, job.holdout.model_dump()
-    rate = record.scene.key_frame_hz
-    dense = rate is not None and rate >= NEIGHBOURHOOD_HZ
-    if not dense:
-        del holdout["neighbourhood_s"]
+    """The protocol of every figure, with the keys of a scene with cameras, the number of training scans, and
+    `rate_figures` of scans."""
+    record, scans = inputs.record, inputs.scans
+    rate, training = record.scene.key_frame_hz, scans.of_group("train")
+    held_out = [scan for group in HELD_OUT_GROUPS for scan in scans.of_group(group)]
     return {
         "version": record.scene.version,
         "cameras": [],
@@ -89,19 +84,19 @@ def scan_protocol(inputs: ScanEvaluationInputs, job: EvaluateScansJob) -> dict[s
         "width": None,
         "height": None,
         "sweeps": False,
-        "holdout": holdout,
+        "holdout": holdout_figures(job.holdout, rate),
         "held_out_frames": record.held_out_frames,
         "train_images": 0,
-        "train_scans": len(inputs.scans.of_group("train")),
+        "train_scans": len(training),
         "poses": record.scene.poses,
         "regions": "boxes",
         "visibility": None,
         "own_car": None,
         "extra_points": None,
-        "lidar_missing": missing_sweeps(inputs.scene, inputs.scans),
+        "lidar_missing": missing_sweeps(inputs.scene, scans),
         "images_missing": 0,
         "key_frame_range": record.scene.key_frame_range,
-        **({"key_frame_hz": rate, "nearest_training_s": nearest_training_s(inputs.scans)} if dense else {}),
+        **rate_figures(rate, [scan.timestamp for scan in held_out], [scan.timestamp for scan in training]),
     }
 
 
@@ -109,10 +104,3 @@ def missing_sweeps(scene: Scene, scans: ScanRecords) -> int:
     """The number of sweeps at key frames that gave no scan."""
     known = {(scan.lidar, scan.timestamp) for scan in scans.scans}
     return sum((sweep.lidar, sweep.timestamp) not in known for sweep in scene.sweeps if sweep.is_key_frame)
-
-
-def nearest_training_s(scans: ScanRecords) -> float | None:
-    """The least time in seconds between a held-out and a training scan; None where either is missing."""
-    training = [scan.timestamp for scan in scans.of_group("train")]
-    held_out = [scan.timestamp for group in HELD_OUT_GROUPS for scan in scans.of_group(group)]
-    return min((abs(a - b) * 1e-6 for a in training for b in held_out), default=None)

@@ -16,7 +16,7 @@ from drivesplat.evaluation.evaluate_scans import (
     ScanEvaluationInputs,
     evaluate_scans,
     missing_sweeps,
-    nearest_training_s,
+    scan_protocol,
 )
 from drivesplat.evaluation.scene_metrics import side_by_side
 from drivesplat.evaluation.summary import sentences
@@ -26,7 +26,7 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.parser import training_record
 from drivesplat.preprocess.scans import scan_records
 from drivesplat.scene.regions import REGIONS
-from drivesplat.scene.scan_record import ScanRecords
+from drivesplat.scene.scan_record import RecordedScan, ScanRecords
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord
@@ -70,6 +70,7 @@ class Measured:
     record: TrainingRecord
     scans: ScanRecords
     actors: list[Any]
+    inputs: ScanEvaluationInputs
     eval: dict[str, Any]
 
 
@@ -85,7 +86,7 @@ def measured(tmp_path_factory) -> Measured:
     summary = json.loads(files.summary.read_text())
     given = ScanEvaluationInputs(read_checkpoint(files.checkpoint), summary, scene, record, scans)
     found = evaluate_scans(given, job("evaluate_scans", EvaluateScansJob), CPU)
-    return Measured(scene, record, scans, actors, found)
+    return Measured(scene, record, scans, actors, given, found)
 
 
 def test_its_record_has_no_image_and_the_splits_of_its_key_frames(measured):
@@ -131,9 +132,17 @@ def test_a_sweep_that_gave_no_scan_is_counted(measured):
     assert missing_sweeps(measured.scene, fewer) == 2
 
 
-def test_the_time_to_the_nearest_training_scan_is_that_of_a_held_out_one(measured):
-    assert nearest_training_s(measured.scans) == pytest.approx(0.5)
-    assert nearest_training_s(dataclasses.replace(measured.scans, scans=measured.scans.of_group("train"))) is None
+def test_at_5_hz_its_protocol_states_the_neighbourhood_and_the_time_to_the_nearest_training_scan(measured):
+    record = dataclasses.replace(measured.record, scene=dataclasses.replace(measured.record.scene, key_frame_hz=5.0))
+
+    def stated(scans: list[RecordedScan]) -> dict[str, Any]:
+        known = dataclasses.replace(measured.inputs, record=record, scans=ScanRecords(scans, measured.scans.tracks))
+        return scan_protocol(known, job("evaluate_scans", EvaluateScansJob))
+
+    made = stated(measured.scans.scans)
+    assert made["holdout"]["neighbourhood_s"] == 0.25 and made["key_frame_hz"] == 5.0
+    assert made["nearest_training_s"] == pytest.approx(0.5)
+    assert stated(measured.scans.of_group("train"))["nearest_training_s"] is None
 
 
 def test_its_summary_speaks_of_lidar(measured, tmp_path):
