@@ -9,7 +9,7 @@ from torch import Tensor
 from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import active_fraction
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.road import Road, road_loss, road_of
@@ -33,21 +33,21 @@ NO_PRIORS = GeometryPriors()
 
 def geometry_priors(record: TrainingRecord, space: FreeSpace | None, settings: TrainSettings) -> GeometryPriors:
     """The priors that `settings` want, on the CPU, from the training record and the record of free `space` (None: not
-    made)."""
+    made). Without training images the road is unknown."""
     return GeometryPriors(
         SparseGrid.from_numpy(space.lower, space.voxel, space.shape, space.keys) if space else None,
-        road_of(record, settings.road) if settings.road_weight else None,
+        road_of(record, settings.road) if settings.road_weight and len(record.train_images) else None,
     )
 
 
 def geometry_terms(
-    picture: Picture, model: SplatModel, priors: GeometryPriors, settings: TrainSettings
+    gaussians: Gaussians, model: SplatModel, priors: GeometryPriors, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The weighted loss terms of the surfaces of static parts."""
+    """The weighted loss terms of the surfaces of static parts, from all `gaussians` of the model at one time."""
     if not settings.flatness_weight and priors.road is None:
         return {}
     parts = [(part, rows) for part, rows in zip(model.parts, model.rows, strict=True) if not part.moves]
-    static = concatenate([picture.gaussians[rows] for _, rows in parts])
+    static = concatenate([gaussians[rows] for _, rows in parts])
     terms = {}
     if settings.flatness_weight:
         terms["flatness"] = settings.flatness_weight * thickness(static) / active_fraction([part for part, _ in parts])

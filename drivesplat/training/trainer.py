@@ -114,7 +114,7 @@ class Trainer:
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self.settings)
-            terms |= geometry_terms(picture, self.model, self.priors, self.settings)
+            terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
         if by_gradient:
             picture.info["means2d"].retain_grad()
@@ -130,6 +130,8 @@ class Trainer:
             picture = self.model.scan(scan.view, gaussians=self._scanned(scan.view.time), before=before)
         with stage("loss"):
             terms = scan_terms(picture, scan, self.model, self.settings)
+            if not self.images.views:
+                terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
         return self._follow(loss, terms, step, rates)
 

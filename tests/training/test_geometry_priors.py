@@ -205,7 +205,7 @@ def known() -> GeometryPriors:
 def test_terms_are_weighted_and_apply_to_static_parts_only():
     model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
-    terms = geometry_terms(picture, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
+    terms = geometry_terms(picture.gaussians, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
     still = model.parts[0].at(0.0)
     torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
     torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known().road))
@@ -221,10 +221,11 @@ def test_without_their_weights_there_are_no_terms():
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
     plain = TrainSettings()
     assert geometry_priors(record, None, plain) == NO_PRIORS
-    assert geometry_terms(picture, model, geometry_priors(record, None, plain), plain) == {}
+    assert geometry_terms(picture.gaussians, model, geometry_priors(record, None, plain), plain) == {}
     for changes, term in (({"flatness_weight": 0.1}, "flatness"), ({"road_weight": 0.1}, "road")):
         settings = TrainSettings(**changes)
-        assert geometry_terms(picture, model, geometry_priors(record, None, settings), settings).keys() == {term}
+        assert geometry_terms(picture.gaussians, model, geometry_priors(record, None, settings), settings).keys() == {term}
+    assert geometry_priors(training_record_of(0), None, TrainSettings(road_weight=0.1)) == NO_PRIORS
 
 
 def test_flatness_makes_the_shortest_axis_shorter_and_no_other():

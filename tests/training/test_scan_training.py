@@ -287,6 +287,19 @@ def test_without_images_every_iteration_fits_a_scan(tmp_path):
     np.testing.assert_allclose(trainer.sensor_positions[:, 0], [-0.5, 0.0, 0.5])
 
 
+def test_without_images_iterations_with_scans_flatten_surfaces():
+    """Without images the terms of surfaces belong to the iterations that fit scans. No road is known."""
+    scans = ScanTrainingSettings(share=1.0)
+
+    def terms(inputs: TrainingInputs, **changes: float) -> set[str]:
+        begun = prepare(inputs, job_of(iterations=10, **changes, scans=scans), CPU)
+        trainer = Trainer.begin(begun.model, begun.views, begun.settings, 0, CPU, begun.priors, scans=begun.scans)
+        return set(trainer.fit_one()[0])
+
+    surfaces = {"flatness_weight": 0.1, "road_weight": 0.1}
+    assert terms(without_images(), **surfaces) - terms(without_images()) == {"flatness"}
+
+
 def test_without_images_rays_limit_the_number_of_gaussians_as_pixels_do():
     inputs = without_images()
     rays = sum(int(scan.measured.sum()) for scan in inputs.scans)
