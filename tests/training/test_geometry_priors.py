@@ -224,7 +224,8 @@ def test_without_their_weights_there_are_no_terms():
     assert geometry_terms(picture.gaussians, model, geometry_priors(record, None, plain), plain) == {}
     for changes, term in (({"flatness_weight": 0.1}, "flatness"), ({"road_weight": 0.1}, "road")):
         settings = TrainSettings(**changes)
-        assert geometry_terms(picture.gaussians, model, geometry_priors(record, None, settings), settings).keys() == {term}
+        priors = geometry_priors(record, None, settings)
+        assert geometry_terms(picture.gaussians, model, priors, settings).keys() == {term}
     assert geometry_priors(training_record_of(0), None, TrainSettings(road_weight=0.1)) == NO_PRIORS
 
 
