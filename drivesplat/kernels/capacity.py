@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Int
 from torch import Tensor
 
@@ -46,14 +47,20 @@ def planned(needed: Sequence[int]) -> Iterator[list[tuple[Int[Tensor, ""], int]]
 
 def capacity_for(needed: Int[Tensor, ""]) -> int:
     """The capacity of the next list, which needs `needed` entries. Exact capacities synchronise with the host."""
+    return capacities_for([needed])[0]
+
+
+def capacities_for(needed: Sequence[Int[Tensor, ""]]) -> list[int]:
+    """The capacities of the next lists. Exact ones synchronise with the host once."""
     capacities = _current.get()
     if capacities is not None and capacities.planned is not None:
-        capacity = capacities.planned[len(capacities.lists)]
-        capacities.lists.append((needed, capacity))
-        return capacity
-    entries = int(needed)
+        first = len(capacities.lists)
+        chosen = capacities.planned[first : first + len(needed)]
+        capacities.lists.extend(zip(needed, chosen, strict=True))
+        return chosen
+    entries: list[int] = torch.stack(list(needed)).tolist() if len(needed) > 1 else [int(n) for n in needed]
     if capacities is not None:
-        capacities.needed.append(entries)
+        capacities.needed.extend(entries)
     return entries
 
 

@@ -1,5 +1,6 @@
 """Alpha compositing of projected Gaussians along the rays of a LiDAR scan, front to back by range."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -7,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels import triton_support
-from drivesplat.kernels.scan_part import ScanPart
-from drivesplat.kernels.scanned_gaussians import ScannedGaussians
+from drivesplat.kernels.scan_part import MetPart
 
 
 class CompositedScan(NamedTuple):
@@ -23,17 +23,20 @@ class CompositedScan(NamedTuple):
     median_range: Float[Tensor, "b a"]
 
 
-def composite_scan(
-    gaussians: ScannedGaussians, values: Float[Tensor, "n v"], part: ScanPart, until: Float[Tensor, "b a"]
-) -> CompositedScan:
-    """Composites Gaussians along the rays of a part, in Triton on a GPU and in numba elsewhere. Where Triton cannot be
-    used, or for float64, tensors on a GPU are copied to the CPU and back."""
+def composite_scan(met: Sequence[MetPart], values: Float[Tensor, "n v"]) -> list[CompositedScan]:
+    """Composites Gaussians along the rays of each part of a scan, in Triton on a GPU and in numba elsewhere. Where
+    Triton cannot be used, or for float64, tensors on a GPU are copied to the CPU and back."""
     if triton_support.usable_for(values) and values.dtype == torch.float32:
-        from drivesplat.kernels.triton.scan_compositing import ScanCompositing
+        from drivesplat.kernels.triton.scan_compositing import composite_parts
 
-        return CompositedScan(*ScanCompositing.apply(*gaussians, values, part, until))
+        return [CompositedScan(*composited) for composited in composite_parts(met, values)]
+    return [_on_cpu(part, values) for part in met]
+
+
+def _on_cpu(met: MetPart, values: Float[Tensor, "n v"]) -> CompositedScan:
     from drivesplat.kernels.numba.scan_compositing import ScanCompositing
 
-    inputs, rays = [tensor.cpu() for tensor in (*gaussians, values)], part.on_cpu
-    composited = ScanCompositing.apply(*inputs, rays.within, rays.elevations, until.cpu(), rays.borders)
+    inputs, rays = [tensor.cpu() for tensor in (*met.gaussians, values)], met.rays.on_cpu
+    until = torch.zeros_like(rays.azimuths) if met.until is None else met.until.cpu()
+    composited = ScanCompositing.apply(*inputs, rays.within, rays.elevations, until, rays.borders)
     return CompositedScan(*(tensor.to(values.device) for tensor in composited))

@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels.scan_borders import ON_CPU, ON_GPU, ScanBorders, TileTable, scan_borders, tile_table
-from drivesplat.kernels.scanned_gaussians import FiringTimes, wrapped
+from drivesplat.kernels.scanned_gaussians import FiringTimes, ScannedGaussians, wrapped
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,10 @@ class ScanPart:
 
     @cached_property
     def firings(self) -> FiringTimes:
-        """The mean azimuth and the median time of each firing, by ascending azimuth."""
+        """When each azimuth fires, by the mean azimuth and the median time of each firing."""
         mean = torch.atan2(self.azimuths.sin().sum(dim=0), self.azimuths.cos().sum(dim=0))
         order = mean.argsort()
-        return FiringTimes(mean[order], self.offsets_s.median(dim=0).values[order])
+        return FiringTimes.of(mean[order], self.offsets_s.median(dim=0).values[order])
 
     @cached_property
     def on_cpu(self) -> "ScanPart":
@@ -51,3 +52,11 @@ class ScanPart:
     def rays(self) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"], Float[Tensor, "b a"]]:
         """Azimuths, elevations and times."""
         return self.azimuths, self.elevations, self.offsets_s
+
+
+class MetPart(NamedTuple):
+    """A part of a scan, the Gaussians that its rays meet, and ranges (metres) before which alpha is wanted, too."""
+
+    rays: ScanPart
+    gaussians: ScannedGaussians
+    until: Float[Tensor, "b a"] | None = None

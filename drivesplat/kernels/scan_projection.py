@@ -84,13 +84,10 @@ def _at_firing(gaussians: Placement, revolution: Revolution, world_to_sensor: Fl
         relative = -revolution.linear[:, None].expand_as(gaussians.centers)
         if revolution.velocities is not None:
             relative = relative + world_to_sensor[:3, :3] @ revolution.velocities.T
-        offsets, (middles, known) = (
-            gaussians.centers.new_zeros(gaussians.centers.shape[1]),
-            revolution.firings.between(),
-        )
+        offsets, firings = gaussians.centers.new_zeros(gaussians.centers.shape[1]), revolution.firings
         for _ in range(FIRING_STEPS):
             x, y = _turned(_turns(-revolution.angular, offsets)[:2], gaussians.centers + relative * offsets)
-            offsets = known[torch.searchsorted(middles, _atan2(y, x))]
+            offsets = firings.offsets_s[torch.searchsorted(firings.between, _atan2(y, x))]
         turns, moved = _turns(-revolution.angular, offsets), relative * offsets
     axes = torch.stack([_turned(turns, axis) for axis in gaussians.axes.unbind(1)], dim=1)
     return Placement(_turned(turns, gaussians.centers + moved), axes)

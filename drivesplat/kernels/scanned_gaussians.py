@@ -41,21 +41,18 @@ class ScannedGaussians(NamedTuple):
 
 
 class FiringTimes(NamedTuple):
-    """When each azimuth fires: `azimuths` (a,) in radians, ascending within ±π, and their `offsets_s` (a,)."""
+    """When each azimuth fires: the azimuths `between` neighbouring firings of revolution after revolution (radians,
+    ascending), a + 1 of them, and the `offsets_s` of the a + 2 firings around them."""
 
-    azimuths: Float[Tensor, " a"]
-    offsets_s: Float[Tensor, " a"]
+    between: Float[Tensor, " c"]
+    offsets_s: Float[Tensor, " d"]
 
-    def between(self) -> tuple[Float[Tensor, " c"], Float[Tensor, " d"]]:
-        """The azimuths (radians) between neighbouring firings of revolution after revolution, a + 1 of them, and the
-        offsets of the a + 2 firings around them."""
-        first, last = slice(0, 1), slice(-1, None)
-        around = [self.azimuths[last] - 2.0 * math.pi, self.azimuths, self.azimuths[first] + 2.0 * math.pi]
-        azimuths, offsets_s = (
-            torch.cat(around),
-            torch.cat([self.offsets_s[last], self.offsets_s, self.offsets_s[first]]),
-        )
-        return 0.5 * (azimuths[1:] + azimuths[:-1]), offsets_s
+    @classmethod
+    def of(cls, azimuths: Float[Tensor, " a"], offsets_s: Float[Tensor, " a"]) -> "FiringTimes":
+        """Those of a firings, by their azimuths (radians, ascending within ±π) and times."""
+        first, last, turn = slice(0, 1), slice(-1, None), 2.0 * math.pi
+        around = torch.cat([azimuths[last] - turn, azimuths, azimuths[first] + turn])
+        return cls(0.5 * (around[1:] + around[:-1]), torch.cat([offsets_s[last], offsets_s, offsets_s[first]]))
 
 
 class Revolution(NamedTuple):

@@ -1,5 +1,6 @@
 """The rasterization of LiDAR scans, on any device, and its result."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drivesplat.kernels.scan_compositing import CompositedScan, composite_scan
-from drivesplat.kernels.scan_part import ScanPart
+from drivesplat.kernels.scan_part import MetPart, ScanPart
 from drivesplat.kernels.scan_projection import scanned
 from drivesplat.kernels.scanned_gaussians import Revolution, ScannedGaussians
 from drivesplat.scene.scan import ScanRays
@@ -33,27 +34,36 @@ class RayGrid:
     @cached_property
     def whole(self) -> ScanPart:
         """All rays."""
-        return ScanPart(self.azimuths, self.elevations, self.offsets_s)
+        return ScanPart(*self.rays)
 
     @cached_property
     def halves(self) -> "Halves":
         """The rays of the first and of the second half of a revolution, by time; without an empty half."""
-        order = self.offsets_s.median(dim=0).values.argsort(stable=True)
-        places = [half for half in order.tensor_split(2) if len(half)]
-        rays = (self.azimuths, self.elevations, self.offsets_s)
-        return Halves(
-            [ScanPart(*(values[:, half] for values in rays)) for half in places], places, torch.cat(places).argsort()
-        )
+        times = self.offsets_s.median(dim=0).values
+        order = times.argsort(stable=True)
+        firings = [half for half in order.tensor_split(2) if len(half)]
+        parts = [ScanPart(*(values[:, half] for values in self.rays)) for half in firings]
+        return Halves(parts, firings, None if bool((times.diff() >= 0).all()) else order.argsort())
+
+    @property
+    def rays(self) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"], Float[Tensor, "b a"]]:
+        """Azimuths, elevations and times."""
+        return self.azimuths, self.elevations, self.offsets_s
 
 
 @dataclass(frozen=True)
 class Halves:
     """The halves of a revolution as `parts`, the firings that each has in the scan, and the places of all firings of
-    the scan in the halves one after the other."""
+    the scan in the halves one after the other, unless they are in this order."""
 
     parts: list[ScanPart]
     firings: list[Int[Tensor, " _"]]
-    places: Int[Tensor, " a"]
+    places: Int[Tensor, " a"] | None
+
+    def joined(self, parts: Sequence[CompositedScan]) -> CompositedScan:
+        """What the rays of the scan measure, by that of the parts."""
+        whole = (torch.cat(values, dim=1) for values in zip(*parts, strict=True))
+        return CompositedScan(*(values if self.places is None else values[:, self.places] for values in whole))
 
 
 @dataclass(frozen=True)
@@ -153,18 +163,18 @@ def rasterize_scan(
     """
     if rays.azimuths.numel() == 0:
         raise ValueError(f"a scan needs rays; this one has {rays.azimuths.shape[0]} beams x {rays.azimuths.shape[1]}")
-    until = torch.zeros_like(rays.azimuths) if before is None else before
     gaussians = means, quats, scales, opacities, world_to_sensor
     if motion is None:
-        projected = [scanned(*gaussians, None, beam_spread, max_range)]
-        composited = composite_scan(projected[0], values, rays.whole, until)
+        met = [MetPart(rays.whole, scanned(*gaussians, None, beam_spread, max_range), before)]
+        (composited,) = composite_scan(met, values)
     else:
-        projected, scans = [], []
+        met = []
         for part, firings in zip(rays.halves.parts, rays.halves.firings, strict=True):
             revolution = Revolution(part.firings, motion.linear, motion.angular, motion.velocities)
-            projected.append(scanned(*gaussians, revolution, beam_spread, max_range))
-            scans.append(composite_scan(projected[-1], values, part, until[:, firings]))
-        composited = CompositedScan(*(torch.cat(t, dim=1)[:, rays.halves.places] for t in zip(*scans, strict=True)))
+            projected = scanned(*gaussians, revolution, beam_spread, max_range)
+            met.append(MetPart(part, projected, None if before is None else before[:, firings]))
+        composited = rays.halves.joined(composite_scan(met, values))
     range_sum, alpha, nearer, out, median = composited
     expected = range_sum / alpha.clamp(min=1e-10)
-    return ScanRendering(expected, median, alpha, out, None if before is None else nearer, tuple(projected))
+    gaussians_met = tuple(part.gaussians for part in met)
+    return ScanRendering(expected, median, alpha, out, None if before is None else nearer, gaussians_met)

@@ -9,6 +9,7 @@ from helpers.random_scans import REVOLUTION_S, ScanScene, even_rays, random_scan
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.scan_compositing import composite_scan
+from drivesplat.kernels.scan_part import MetPart
 from drivesplat.rasterization import RayGrid, ScanMotion
 
 HEIGHT = 1.8
@@ -165,8 +166,7 @@ def test_a_road_of_flat_gaussians_has_its_true_ranges_at_any_incidence(incidence
     assert (rendering.range - truth).abs().max() < 0.01
     assert (rendering.median_range - truth).abs().max() < 0.01
     flat = rendering.gaussians[0]._replace(slopes=torch.zeros_like(rendering.gaussians[0].slopes))
-    rays = scene.rays
-    found = composite_scan(flat, scene.values, rays.whole, torch.zeros_like(rays.azimuths))
+    (found,) = composite_scan([MetPart(scene.rays.whole, flat)], scene.values)
     without = (found.range_sum / found.alpha - truth).abs()
     assert without.median() > 0.08
 

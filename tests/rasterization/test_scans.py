@@ -10,6 +10,7 @@ from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
 
 from drivesplat.kernels.numba import scan_tiles
 from drivesplat.kernels.scan_compositing import composite_scan
+from drivesplat.kernels.scan_part import MetPart
 from drivesplat.rasterization import RayGrid, ScanMotion
 from drivesplat.scene.scan import ScanRays
 
@@ -228,7 +229,8 @@ def test_gradients_of_projected_gaussians_are_those_of_finite_differences():
 
     def seen(values: torch.Tensor, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         gaussians = projected._replace(**dict(zip(names, tensors, strict=True)), range_limits=limits)
-        return composite_scan(gaussians, values, rays.whole, torch.full_like(rays.azimuths, 7.0))[:4]
+        met = MetPart(rays.whole, gaussians, torch.full_like(rays.azimuths, 7.0))
+        return composite_scan([met], values)[0][:4]
 
     free = seen(scene.values, *inputs)[0]
     limits = limits * 1e6

@@ -10,6 +10,7 @@ remaining sum R_i = sum over j > i of w_j (g · value_j), the gradient of alpha_
 alpha_i); the sum over all j is known from the rendered scan, and that of earlier chunks from their sums.
 """
 
+from collections.abc import Sequence
 from typing import Any, no_type_check
 
 import torch
@@ -18,7 +19,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.scan_part import ScanPart
+from drivesplat.kernels.capacity import capacities_for
+from drivesplat.kernels.scan_part import MetPart, ScanPart
 from drivesplat.kernels.scanned_gaussians import ScannedGaussians
 from drivesplat.kernels.triton.scan_chunks import (
     MAX_ALPHA,
@@ -37,7 +39,7 @@ from drivesplat.kernels.triton.scan_chunks import (
     rays_of,
 )
 from drivesplat.kernels.triton.scan_gradients import add_gradients, remain
-from drivesplat.kernels.triton.scan_tiles import scan_lists
+from drivesplat.kernels.triton.scan_tiles import ReachedTiles, reached_tiles, scan_lists
 
 GROUP, GROUP_BACKWARD = 16, 8
 """Gaussians that are composited at a time."""
@@ -52,10 +54,12 @@ class ScanCompositing(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means2d: Tensor, ranges: Tensor, conics: Tensor, slopes: Tensor, range_limits: Tensor, radii: Tensor,
-        opacities: Tensor, values: Tensor, part: ScanPart, until: Tensor,
+        opacities: Tensor, values: Tensor, part: ScanPart, until: Tensor | None, reached: ReachedTiles | None,
+        capacity: int,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         gaussians = ScannedGaussians(means2d, ranges, conics, slopes, range_limits, radii, opacities)
-        chunks = chunks_of(gaussians, values, scan_lists(gaussians, part.tiles))
+        chunks = chunks_of(gaussians, values, scan_lists(gaussians, part.tiles, reached, capacity))
+        until = torch.zeros_like(part.azimuths) if until is None else until
         rays, numbers = [t.contiguous() for t in (part.within, part.elevations, until)], part.tiles.tiles
         shape, channels = part.azimuths.shape, values.shape[1]
         sizes, width = (*shape, numbers.shape[1], channels), triton.next_power_of_2(max(channels, 1))
@@ -87,7 +91,18 @@ class ScanCompositing(torch.autograd.Function):
             *sizes, GROUP_BACKWARD, num_warps=1,
         )  # fmt: skip
         v_means2d, v_ranges, v_conics, v_slopes, v_opacities, v_values = v_gaussians
-        return v_means2d, v_ranges, v_conics, v_slopes, None, None, v_opacities, v_values, None, None
+        return v_means2d, v_ranges, v_conics, v_slopes, None, None, v_opacities, v_values, None, None, None, None
+
+
+def composite_parts(met: Sequence[MetPart], values: Tensor) -> list[tuple[Tensor, ...]]:
+    """The results of `ScanCompositing` for each part of a scan. The host waits for the device once."""
+    reached = [reached_tiles(part.gaussians, part.rays.tiles) if len(values) else None for part in met]
+    capacities = capacities_for([tiles.ends[-1] for tiles in reached if tiles is not None]) or [0] * len(met)
+    lists = zip(met, reached, capacities, strict=True)
+    return [
+        ScanCompositing.apply(*part.gaussians, values, part.rays, part.until, tiles, capacity)
+        for part, tiles, capacity in lists
+    ]
 
 
 @triton.jit(do_not_specialize=SIZES)

@@ -55,7 +55,7 @@ def sensor_motion(world_to_sensor: Float[Tensor, "4 4"], revolution: Revolution 
         return SensorMotion(view, nothing, nothing, nothing)
     view, velocities = torch.cat([*pose, revolution.linear, revolution.angular]), revolution.velocities
     velocities = view.new_empty(0) if velocities is None else velocities.flatten()
-    return SensorMotion(view, velocities, *revolution.firings.between())
+    return SensorMotion(view, velocities, *revolution.firings)
 
 
 class ScanProjection(torch.autograd.Function):

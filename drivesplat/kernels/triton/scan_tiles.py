@@ -6,13 +6,14 @@ entry and the variance of elevation, which the radius tells: as the difference o
 """
 
 import math
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import torch
 import triton
 import triton.language as tl
+from jaxtyping import Int
+from torch import Tensor
 
-from drivesplat.kernels.capacity import capacity_for
 from drivesplat.kernels.scan_borders import BINS, TileTable
 from drivesplat.kernels.scanned_gaussians import MIN_ALPHA, ScannedGaussians
 from drivesplat.kernels.triton.tiles import TileLists
@@ -29,32 +30,55 @@ PER_RADIAN, WHOLE = tl.constexpr(BINS / (2.0 * math.pi)), tl.constexpr(math.pi)
 LAST_BIN = tl.constexpr(BINS - 1)
 
 
+class ReachedTiles(NamedTuple):
+    """The number of tiles that each of n Gaussians reaches, the Gaussians from the nearest to the farthest, and the
+    sums of their `counts` in this order."""
+
+    counts: Int[Tensor, " n"]
+    nearest: Int[Tensor, " n"]
+    ends: Int[Tensor, " n"]
+
+
 @torch.no_grad()
-def scan_lists(gaussians: ScannedGaussians, table: TileTable) -> TileLists:
-    """The lists of all tiles of a scan: those of a row by ascending azimuth, row after row, as one camera. Where the
-    planned capacity (`drivesplat.kernels.capacity`) is too small, the farthest Gaussians are left out."""
-    seen = tuple(
-        tensor.contiguous() for tensor in (gaussians.means2d, gaussians.conics, gaussians.radii, gaussians.opacities)
-    )
+def reached_tiles(gaussians: ScannedGaussians, table: TileTable) -> ReachedTiles:
+    """The tiles that at least one Gaussian reaches, counted."""
     count, (rows, columns) = len(gaussians.ranges), table.tiles.shape
-    tiles, device = rows * columns, gaussians.ranges.device
-    counts = torch.empty(count, dtype=torch.int32, device=device)
-    nearness, blocks = torch.empty_like(gaussians.ranges), (triton.cdiv(count, BLOCK),)
-    sizes = (rows, columns, rows.bit_length())
-    arcs = (table.first, table.last, table.lows, table.highs)
-    if count:
-        _count_tiles[blocks](*seen, gaussians.ranges.contiguous(), *arcs, counts, nearness, count, *sizes, BINS, BLOCK)
+    counts = torch.empty(count, dtype=torch.int32, device=gaussians.ranges.device)
+    nearness = torch.empty_like(gaussians.ranges)
+    _count_tiles[(triton.cdiv(count, BLOCK),)](
+        *_seen(gaussians), gaussians.ranges.contiguous(), *_arcs(table), counts, nearness, count, rows, columns,
+        rows.bit_length(), BINS, BLOCK,
+    )  # fmt: skip
     nearest = torch.argsort(nearness, stable=True)
-    ends = torch.cumsum(counts[nearest], dim=0, dtype=torch.int32)
-    capacity = capacity_for(ends[-1]) if count else 0
+    return ReachedTiles(counts, nearest, torch.cumsum(counts[nearest], dim=0, dtype=torch.int32))
+
+
+@torch.no_grad()
+def scan_lists(gaussians: ScannedGaussians, table: TileTable, reached: ReachedTiles | None, capacity: int) -> TileLists:
+    """The lists of all tiles of a scan: those of a row by ascending azimuth, row after row, as one camera. Where
+    `capacity`, the number of their entries, is too small, the farthest Gaussians are left out. None: no Gaussian."""
+    (rows, columns), device = table.tiles.shape, gaussians.ranges.device
+    count, tiles = len(gaussians.ranges), rows * columns
     kind = torch.int16 if tiles < torch.iinfo(torch.int16).max else torch.int32
     keys = torch.full((capacity,), tiles, dtype=kind, device=device)
     ids = torch.empty(capacity, dtype=torch.int32, device=device)
-    if count:
-        _list[blocks](*seen, *arcs, counts, nearest, ends, keys, ids, capacity, count, *sizes, BINS, BLOCK)
+    if reached is not None:
+        _list[(triton.cdiv(count, BLOCK),)](
+            *_seen(gaussians), *_arcs(table), *reached, keys, ids, capacity, count, rows, columns, rows.bit_length(),
+            BINS, BLOCK,
+        )  # fmt: skip
     keys, order = torch.sort(keys, stable=True)
     each_tile = torch.arange(tiles + 1, dtype=kind, device=device)
     return TileLists(ids, order, torch.searchsorted(keys, each_tile, out_int32=True), (1, rows, columns))
+
+
+def _seen(gaussians: ScannedGaussians) -> tuple[Tensor, ...]:
+    tensors = gaussians.means2d, gaussians.conics, gaussians.radii, gaussians.opacities
+    return tuple(tensor.contiguous() for tensor in tensors)
+
+
+def _arcs(table: TileTable) -> tuple[Tensor, ...]:
+    return table.first, table.last, table.lows, table.highs
 
 
 @triton.jit
