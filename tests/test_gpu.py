@@ -3,7 +3,7 @@
 import math
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -24,6 +24,7 @@ from helpers.trainings import (
     in_subprocess,
     mean_psnr,
     recorded_views,
+    scan_of_a_wall,
     settings_of,
     trained,
     untrained,
@@ -34,7 +35,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.kernels import capacity
-from drivesplat.kernels.cuda_graphs import CudaGraph, capture_stream
+from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
 from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
 from drivesplat.model.background import Background
@@ -45,10 +46,13 @@ from drivesplat.model.view import RollingShutter, View
 from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.rendering import captured_frames
 from drivesplat.rendering.frames import film_frame, film_frames
+from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.shutter import Shutter
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings, TrainSettings
+from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training import trainer as trainer_module
+from drivesplat.training.scans import initial_echo, load_scans
 from drivesplat.training.trainer import Trainer
 
 pytestmark = [
@@ -481,11 +485,12 @@ def rolling(view: View) -> View:
 
 
 def trained_with(
-    capture: bool, iterations: int = 30, iterations_done: int | None = None, shutters: bool = False, **settings
-) -> tuple[Trainer, list[float]]:
-    """A training of background and cars by every loss term, with or without CUDA graphs and rolling shutters."""
+    capture: bool, iterations: int = 30, iterations_done: int | None = None, shutters: bool = False,
+    recorded: Sequence[RecordedScan] = (), **settings,
+) -> tuple[Trainer, list[float]]:  # fmt: skip
+    """A training of background and cars by every loss term, with or without CUDA graphs, rolling shutters, scans."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
-    model = untrained_street(chosen)
+    model = untrained_street(chosen, echo=initial_echo(recorded) if recorded else None)
     for part in model.parts:  # no spheres, whose rotations learn from rounding
         part.params["scales"].data += 0.5 * torch.randn(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
@@ -496,7 +501,7 @@ def trained_with(
         views = [replace(view, view=rolling(view.view)) for view in views]
     chosen = chosen.model_copy(update={"cuda_graphs": capture, "iterations": iterations})
     with capture_stream(GPU):
-        trainer = Trainer.begin(model.to(GPU), views, chosen, 0, GPU)
+        trainer = Trainer.begin(model.to(GPU), views, chosen, 0, GPU, scans=load_scans(recorded, chosen.scans, GPU))
         losses = [
             float(torch.stack(list(continued(trainer).values())).sum()) for _ in range(iterations_done or iterations)
         ]
@@ -528,6 +533,31 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, caplo
             assert float(apart.quantile(0.5)) <= 0.1 * float(moved.max()), name
     steps = [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in captured.optimizers.all()]
     assert steps == [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in eager.optimizers.all()]
+
+
+def test_scans_are_captured_and_learn_what_they_learn_without_graphs(caplog):
+    """Of a sensor that moves while it turns, so that both halves of a revolution are rendered."""
+    moving = {"linear": np.array([3.0, 0.5, 0.0]), "angular": np.array([0.0, 0.0, 0.3])}
+    recorded = [replace(scan_of_a_wall(x), seconds=x, **moving) for x in (0.5, 1.0)]
+    half = ScanTrainingSettings(share=0.5)
+    captured, mine = trained_with(True, recorded=recorded, scans=half)
+    eager, theirs = trained_with(False, recorded=recorded, scans=half)
+    assert not caplog.records, "nothing was refused"
+    assert len(captured.graphs._graphs) == len(captured.images.views) + len(recorded) and not eager.graphs._graphs
+    np.testing.assert_allclose(mine, theirs, rtol=0.02)
+    assert mine[-2] < 0.8 * mine[0] and mine[-1] < 0.8 * mine[1], "images and scans in turn"
+
+
+def test_captured_velocities_are_those_of_the_actors_that_own_the_gaussians_at_a_replay():
+    actors = untrained_street(TrainSettings()).parts[1].to(GPU)
+    with capture_stream(GPU):
+        before = actors.velocities(1.5)
+        graph = capture(lambda: actors.velocities(1.5), [], new_pool(), GPU, "velocities")
+        assert graph is not None
+        actors.params["owner"].fill_(1)
+        graph.replay()
+        after = actors.velocities(1.5)
+    assert torch.equal(graph.result, after) and not torch.equal(after, before)
 
 
 def test_graphs_stay_valid_through_relocation_and_growth_into_preallocated_rows():

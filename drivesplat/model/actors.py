@@ -201,13 +201,11 @@ class Actors(Part):
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
         """The ownership matrix: 1 where a Gaussian is an actor's, else 0. Cached until densification changes `owner`;
-        computed within every captured training iteration, since its replays may follow a densification."""
+        computed within every CUDA graph, since replays of a training iteration may follow a densification."""
         owner, (known, version, matrix) = self.params["owner"], self._known_owners
         captured = owner.is_cuda and torch.cuda.is_current_stream_capturing()
-        changed = (
-            known is not owner or version != torch_private.write_count(owner) or (captured and torch.is_grad_enabled())
-        )
-        if matrix is None or changed or matrix.device != owner.device:
+        changed = known is not owner or version != torch_private.write_count(owner)
+        if matrix is None or changed or captured or matrix.device != owner.device:
             matrix = one_hot(owner, len(self.timeline.tracks)).float()
             if not captured:  # a captured matrix has no values before a replay
                 self._known_owners = owner, torch_private.write_count(owner), matrix

@@ -133,5 +133,7 @@ def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan
     edge. A ray that meets nothing has none."""
     met = scan.returned & (alpha > CERTAIN)
     errors = torch.where(met, (expected - scan.range).abs(), 0.0)
-    kept = errors <= torch.quantile(errors[met], 1.0 - IGNORED_DEPTHS) if bool(met.any()) else met
-    return (errors * kept).sum() / (met & kept).sum().clamp(min=1)
+    with torch.no_grad():  # NaN where no ray counts, which no error is below
+        largest = torch.nanquantile(torch.where(met, errors, torch.nan), 1.0 - IGNORED_DEPTHS)
+        kept = met & (errors <= largest)
+    return (errors * kept).sum() / kept.sum().clamp(min=1)

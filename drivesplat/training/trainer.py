@@ -1,6 +1,6 @@
 """The state of a training and its iteration: render one image, compare it, take a step."""
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -57,7 +57,7 @@ class Trainer:
         torch.manual_seed(seed)
         optimizers, known = make_optimizers(model), priors.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        capture = clock is UNTIMED and can_capture(settings, images, device)
+        capture = clock is UNTIMED and can_capture(settings, images, device, len(scans))
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
         return cls(
@@ -84,7 +84,9 @@ class Trainer:
         set_learning_rates(self.model, self.optimizers, self.step, self.settings)
         step, rates = self.schedule.update(self.step, self.optimizers)
         if self.fits_scan and not (with_picture and self.images.views):
-            return self.graphs.retry_without_graphs(lambda: self._learn_scan(step, rates)), None, None
+            number = scan_index(len(self.scans), self.step, self.settings.scans.share, self.seed)
+            terms = self._captured(("scan", number), lambda: self._learn_scan(self.scans[number], step, rates))
+            return terms, None, None
         with self.clock.stage("data"):
             number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
 
@@ -94,9 +96,15 @@ class Trainer:
         if with_picture or not self.graphs.enabled:
             return *self.graphs.retry_without_graphs(iteration), view
         image = self.images.factor(self.step), number
+        return self._captured(image, lambda: iteration()[0]), None, view
+
+    def _captured(self, recording: Hashable, iteration: Callable[[], Terms]) -> Terms:
+        """Runs an iteration with an image or a scan, by its CUDA graph where there is one."""
+        if not self.graphs.enabled:
+            return self.graphs.retry_without_graphs(iteration)
         headroom = max(part.row_count / max(1, len(part)) for part in self.model.parts)
         gaussians = GaussianCount(len(self.model), headroom)
-        return self.graphs.run(image, self._layout(), gaussians, lambda: iteration()[0]), None, view
+        return self.graphs.run(recording, self._layout(), gaussians, iteration)
 
     def _learn(
         self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
@@ -120,10 +128,9 @@ class Trainer:
             picture.info["means2d"].retain_grad()
         return self._follow(loss, terms, step, rates), picture
 
-    def _learn_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
-        """An iteration with a scan."""
+    def _learn_scan(self, scan: TrainingScan, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
+        """An iteration with a scan, as `_learn`."""
         stage, settings = self.clock.stage, self.settings.scans
-        scan = self.scans[scan_index(len(self.scans), self.step, settings.share, self.seed)]
         self.model.zero_grad()
         with stage("render"):
             before = (scan.range - settings.sight_margin).clamp(min=0.0) if settings.sight_weight else None

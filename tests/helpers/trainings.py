@@ -22,6 +22,8 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.regions import LABELS
+from drivesplat.scene.scan import Scan, ScanRays
+from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import (
     DefaultSettings,
@@ -50,6 +52,9 @@ CPU = torch.device("cpu")
 WIDTH, HEIGHT = 32, 24
 
 
+WALL_AT = 6.0
+
+
 ITERATIONS, CHECKPOINT_AT, ENDED_AT = 60, 30, 43
 
 
@@ -74,13 +79,32 @@ def recorded_views(count: int = 5, width: int = WIDTH, height: int = HEIGHT, dev
     return views
 
 
+def scan_of_a_wall(x: float = 0.0, intensity: float = 0.3) -> RecordedScan:
+    """What a sensor at (x, 0, 0) that looks along z measures of a wall at WALL_AT before the cameras of
+    `recorded_views`; the last fifth of the rays is dropped."""
+    azimuths, elevations = (
+        values.astype(np.float32) for values in np.meshgrid(np.linspace(-0.35, 0.35, 30), np.linspace(-0.2, 0.2, 12))
+    )
+    ranges = (WALL_AT / (np.cos(elevations) * np.cos(azimuths))).astype(np.float32)
+    returned = np.ones(ranges.shape, dtype=bool)
+    returned[:, 24:] = False
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]  # the sensor's x is the cameras' z
+    pose[0, 3] = x
+    values = np.full(ranges.shape, intensity, dtype=np.float32)
+    scan = Scan(ScanRays(azimuths, elevations, np.zeros_like(ranges)), returned, ranges * returned, values * returned)
+    no_object, measured, blocked = np.full(ranges.shape, -1, np.int16), np.ones_like(returned), np.zeros_like(returned)
+    still = np.zeros(3), np.zeros(3)
+    return RecordedScan("TOP", 0, 0.0, 0, True, "train", pose, *still, scan, measured, no_object, blocked)
+
+
 def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(1)
     return rng.uniform([-3, -1.5, 3], [3, 1.5, 6], (count, 3)), rng.uniform(0.3, 0.7, (count, 3))
 
 
-def untrained(settings: TrainSettings, sky: bool = False) -> SplatModel:
-    part = Background.from_points(*seed_points(), settings.gaussians, 1.0)
+def untrained(settings: TrainSettings, sky: bool = False, echo: tuple[float, float] | None = None) -> SplatModel:
+    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, echo=echo)
     return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
 
 
@@ -94,10 +118,11 @@ def cars() -> list[ActorTrack]:
     ]
 
 
-def untrained_street(settings: TrainSettings) -> SplatModel:
-    """Background, two cars and a sky."""
-    still = untrained(settings, sky=True)
-    return SplatModel([*still.parts, actors_of(*cars(), count=25, settings=settings.actors, shaken=False)], still.sky)
+def untrained_street(settings: TrainSettings, echo: tuple[float, float] | None = None) -> SplatModel:
+    """Background, two cars and a sky; with `echo`, logits of intensity and returns, for a LiDAR, too."""
+    still = untrained(settings, sky=True, echo=echo)
+    moving = actors_of(*cars(), count=25, settings=settings.actors, shaken=False, echo=echo)
+    return SplatModel([*still.parts, moving], still.sky)
 
 
 def guided_views(device: torch.device = CPU) -> list[TrainingView]:

@@ -140,13 +140,15 @@ def test_which_trainings_capture_graphs(settings, device, compiles, expected, mo
     assert can_capture(chosen, TrainingImages(guided_views(), chosen, 0), torch.device(device)) == expected
 
 
-def test_classes_and_too_many_images_disable_graphs(monkeypatch):
+def test_classes_and_too_many_recordings_disable_graphs(monkeypatch):
     monkeypatch.setattr(triton_support, "compiles", lambda: True)
     views, gpu = guided_views(), torch.device("cuda")
     labelled = [dataclasses.replace(view, classes=torch.zeros_like(view.sky, dtype=torch.uint8)) for view in views]
     assert not can_capture(TrainSettings(), TrainingImages(labelled, TrainSettings(), 0), gpu)
-    monkeypatch.setattr(iteration_graphs, "MAX_IMAGES", len(views) - 1)
-    assert not can_capture(TrainSettings(), TrainingImages(views, TrainSettings(), 0), gpu)
+    images = TrainingImages(views, TrainSettings(), 0)
+    monkeypatch.setattr(iteration_graphs, "MAX_RECORDINGS", len(views) + 1)
+    assert can_capture(TrainSettings(), images, gpu, scans=1)
+    assert not can_capture(TrainSettings(), images, gpu, scans=2)
 
 
 def test_graphs_are_dropped_when_memory_runs_out(monkeypatch, caplog):

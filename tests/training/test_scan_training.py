@@ -8,15 +8,23 @@ import pytest
 import torch
 from helpers.hand_made import round_gaussians
 from helpers.records import training_record_of
-from helpers.trainings import CPU, folders_of, guided_views, job_of, recorded_views, seed_points, settings_of, untrained
+from helpers.trainings import (
+    CPU,
+    WALL_AT,
+    folders_of,
+    guided_views,
+    job_of,
+    recorded_views,
+    scan_of_a_wall,
+    settings_of,
+    untrained,
+)
 from pydantic import ValidationError
 
-from drivesplat.model.background import Background
 from drivesplat.model.build import gaussian_cap
 from drivesplat.model.scans import ScanPicture
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.scan import Scan, ScanRays
-from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.scene.scan import Scan
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training.run import TrainingInputs, prepare
@@ -32,41 +40,7 @@ from drivesplat.training.scans import (
 from drivesplat.training.train import train
 from drivesplat.training.trainer import Trainer
 
-WALL_AT = 6.0
 SHARE = ScanTrainingSettings(share=0.5)
-
-
-def scan_of_a_wall(x: float = 0.0, intensity: float = 0.3) -> RecordedScan:
-    """What a sensor at (x, 0, 0) that looks along z measures of a wall before the cameras of `recorded_views`; the last
-    fifth of the rays is dropped."""
-    azimuths, elevations = (
-        values.astype(np.float32) for values in np.meshgrid(np.linspace(-0.35, 0.35, 30), np.linspace(-0.2, 0.2, 12))
-    )
-    ranges = (WALL_AT / (np.cos(elevations) * np.cos(azimuths))).astype(np.float32)
-    returned = np.ones(ranges.shape, dtype=bool)
-    returned[:, 24:] = False
-    pose = np.eye(4)
-    pose[:3, :3] = [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]  # the sensor's x is the cameras' z
-    pose[0, 3] = x
-    values = np.full(ranges.shape, intensity, dtype=np.float32)
-    rays = ScanRays(azimuths, elevations, np.zeros_like(ranges))
-    scan = Scan(rays, returned, ranges * returned, values * returned)
-    nothing = np.full(ranges.shape, -1, dtype=np.int16)
-    return RecordedScan(
-        "TOP",
-        0,
-        0.0,
-        0,
-        True,
-        "train",
-        pose,
-        np.zeros(3),
-        np.zeros(3),
-        scan,
-        np.ones_like(returned),
-        nothing,
-        np.zeros_like(returned),
-    )
 
 
 def picture_of(scan, **changes) -> ScanPicture:
@@ -165,8 +139,7 @@ def nothing_met(scan) -> torch.Tensor:
 
 def with_echoes(settings: TrainSettings) -> SplatModel:
     """The untrained model of `untrained`, with echoes."""
-    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, echo=initial_echo([scan_of_a_wall()]))
-    return SplatModel([part], None)
+    return untrained(settings, echo=initial_echo([scan_of_a_wall()]))
 
 
 def test_initial_echoes_are_the_recorded_intensity_and_a_likely_return():

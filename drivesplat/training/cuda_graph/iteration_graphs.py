@@ -1,9 +1,9 @@
 """Training iterations captured as CUDA graphs and replayed: Python launches one graph in place of a thousand kernels.
 
 At 640x360 the GPU runs an iteration's hundreds of kernels faster than Python can launch them. A graph keeps the
-addresses of what it reads and writes, so it belongs to one image and stays valid while the model's tensors keep their
-addresses: preallocated rows let the number of Gaussians grow meanwhile. An image's graph is captured when the image is
-used again.
+addresses of what it reads and writes, so it belongs to one recording, an image or a LiDAR scan, and stays valid while
+the model's tensors keep their addresses: preallocated rows let the number of Gaussians grow meanwhile. The graph of a
+recording is captured when it is used again.
 """
 
 import logging
@@ -23,9 +23,9 @@ log = logging.getLogger(__name__)
 
 Terms = dict[str, Tensor]
 T = TypeVar("T")
-MAX_IMAGES = 4096
-"""A training with more images captures nothing: graphs hold on to cached time states, up to three for an image, and
-four times as many are cached."""
+MAX_RECORDINGS = 4096
+"""A training with more images and scans captures nothing: graphs hold on to cached time states, up to three for each,
+and four times as many are cached."""
 
 
 @dataclass(frozen=True)
@@ -36,28 +36,32 @@ class GaussianCount:
     headroom: float
 
 
-def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.device) -> bool:
-    """Whether iterations can and shall be captured. Densification by gradient reads intermediate results of an
-    iteration; class logits have too many values for lists of planned capacity."""
-    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(images.views) <= MAX_IMAGES
+def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.device, scans: int = 0) -> bool:
+    """Whether iterations of a training, with so many LiDAR `scans`, can and shall be captured. Densification by
+    gradient reads intermediate results of an iteration; class logits have too many values for lists of planned
+    capacity."""
+    few = len(images.views) + scans <= MAX_RECORDINGS
+    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and few
     return wanted and graphs_supported(device) and all(view.classes is None for view in images.views)
 
 
 @dataclass
 class IterationGraphs:
-    """The CUDA graphs of a training's iterations, by image; none where they are not `enabled`."""
+    """The CUDA graphs of a training's iterations, by recording; none where they are not `enabled`."""
 
     enabled: bool
     device: torch.device
     _layout: Hashable = None
     _needs: dict[Hashable, list[float]] = field(default_factory=dict)
-    """By image, the entries per Gaussian that each of its lists last needed."""
+    """By recording, the entries per Gaussian that each of its lists last needed."""
     _graphs: dict[Hashable, CudaGraph[Terms]] = field(default_factory=dict)
     _count: int = 1
     _pool: MemoryPool | None = None
 
-    def run(self, image: Hashable, layout: Hashable, gaussians: GaussianCount, iteration: Callable[[], Terms]) -> Terms:
-        """Runs an iteration with an image, by its graph where there is one. Graphs are invalid once `layout`
+    def run(
+        self, recording: Hashable, layout: Hashable, gaussians: GaussianCount, iteration: Callable[[], Terms]
+    ) -> Terms:
+        """Runs an iteration with a recording, by its graph where there is one. Graphs are invalid once `layout`
         changes."""
         if not self.enabled:
             return iteration()
@@ -65,13 +69,13 @@ class IterationGraphs:
             self._drop(list(self._graphs))
             self._layout = layout
         self._count = max(1, gaussians.now)
-        graph = self._graphs.get(image)
-        if graph is None and image in self._needs:
-            graph = self._capture(image, self._count * gaussians.headroom, iteration)
+        graph = self._graphs.get(recording)
+        if graph is None and recording in self._needs:
+            graph = self._capture(recording, self._count * gaussians.headroom, iteration)
         if graph is None:
             with capacity.exact() as needs:
                 terms = self.retry_without_graphs(iteration)
-            self._needs[image] = [need / self._count for need in needs]
+            self._needs[recording] = [need / self._count for need in needs]
             return terms
         graph.replay()
         return graph.result
@@ -93,7 +97,7 @@ class IterationGraphs:
         if not self._graphs:
             return
         missing = torch.stack([graph.missing for graph in self._graphs.values()]).tolist()
-        overflowed = [image for image, more in zip(self._graphs, missing, strict=True) if more > 0]
+        overflowed = [recording for recording, more in zip(self._graphs, missing, strict=True) if more > 0]
         if overflowed:
             log.debug("the lists of %d CUDA graphs lacked up to %d entries", len(overflowed), max(missing))
         self._drop(overflowed)
@@ -103,13 +107,13 @@ class IterationGraphs:
         self._drop(list(self._graphs))
         return self.enabled
 
-    def _drop(self, images: list[Hashable]) -> None:
-        """Drops the graphs of `images`; remembers the entries that their lists last needed. Waits for the device."""
-        if not images:
+    def _drop(self, recordings: list[Hashable]) -> None:
+        """Drops graphs and remembers the entries that their lists last needed. Waits for the device."""
+        if not recordings:
             return
-        needs = iter(torch.cat([self._graphs[image].needed for image in images]).tolist())
-        for image in images:
-            self._needs[image] = [next(needs) / self._count for _ in self._graphs.pop(image).needed]
+        needs = iter(torch.cat([self._graphs[recording].needed for recording in recordings]).tolist())
+        for recording in recordings:
+            self._needs[recording] = [next(needs) / self._count for _ in self._graphs.pop(recording).needed]
         if not self._graphs:
             self._pool = None  # torch frees it with the last graph
 
@@ -121,14 +125,16 @@ class IterationGraphs:
         self._graphs.clear()
         self._pool = None
 
-    def _capture(self, image: Hashable, gaussians: float, iteration: Callable[[], Terms]) -> CudaGraph[Terms] | None:
+    def _capture(
+        self, recording: Hashable, gaussians: float, iteration: Callable[[], Terms]
+    ) -> CudaGraph[Terms] | None:
         """The graph of an iteration with lists for so many Gaussians; the capture does not run it. Where the GPU or its
         driver refuses, returns None and disables graphs."""
         self._pool = self._pool or new_pool()
-        expected = [int(need * gaussians) for need in self._needs[image]]
+        expected = [int(need * gaussians) for need in self._needs[recording]]
         graph = capture(iteration, expected, self._pool, self.device, "iterations")
         if graph is None:
             self._disable()
         else:
-            self._graphs[image] = graph
+            self._graphs[recording] = graph
         return graph
