@@ -7,9 +7,10 @@ axle's centre. Poses are the unit's, in Mercator's projection with the scale of 
 development kit. Boxes are those of tracklet_labels.xml, if it is there.
 
 KITTI's readme: "the velodyne scanner takes depth measurements continuously while rotating [...] you have to 'untwist'
-the points linearly", it "rotates in counter-clockwise direction", and cameras are triggered when it looks forward.
-Scans are therefore untwisted here to the time at which the scanner faces forward. Some users report another direction,
-or scans that are compensated already: compare the edges of poles in check.png, and choose with --scans.
+the points linearly", and cameras are triggered when it looks forward. Scans are therefore untwisted here to the time at
+which the scanner faces forward. The readme says that the scanner "rotates in counter-clockwise direction"; the scans
+themselves fit each other best if it turns clockwise (docs/own_data.md), as KISS-ICP's loader takes them. Some users
+report scans that are compensated already: compare the edges of poles in check.png, and choose with --scans.
 """
 
 import argparse
@@ -205,7 +206,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("drive", help="number of a drive, such as 0001")
     parser.add_argument("out", type=Path, help="the drive folder, new or empty")
     parser.add_argument("--cameras", nargs="+", choices=COLOUR, help="colour cameras; by default those there are")
-    directions = ["counter-clockwise", "clockwise", "compensated"]
+    directions = ["clockwise", "counter-clockwise", "compensated"]
     parser.add_argument("--scans", default=directions[0], choices=directions, help="direction in which scans turn")
     asked = parser.parse_args(arguments)
     return reported("kitti_raw", lambda: convert(asked.date, asked.drive, asked.out, asked.cameras, asked.scans))

@@ -18,7 +18,7 @@ from drivesplat.settings.edits_file import read_edits
 
 pytestmark = pytest.mark.slow
 
-NAMES = {"day", "dense", "night", "slope", "six_cameras"}
+NAMES = {"day", "dense", "lidar", "night", "slope", "six_cameras"}
 
 
 @pytest.fixture(scope="module", params=WORLDS)

@@ -25,8 +25,8 @@ from examples import argoverse2, kitti_raw
 
 TILT = Rotation.from_euler("ZYX", [0.65, 0.05, -0.03]).as_matrix()
 ELEVATIONS = np.radians(np.linspace(-25.0, 3.0, 8))
-AZIMUTHS = np.radians(np.arange(-179.0, 180.0, 6.0))
-"""Of a scan, in the order in which it turns counter-clockwise from behind the vehicle."""
+AZIMUTHS = np.radians(np.arange(179.0, -180.0, -6.0))
+"""Of a scan, in the order in which it turns clockwise from behind the vehicle."""
 
 
 def origin_of(scene: Scene, drive: TurningDrive) -> np.ndarray:
@@ -147,11 +147,11 @@ def tracklets_xml(drive: TurningDrive) -> str:
 
 
 def scan(drive: TurningDrive, time: int) -> tuple[np.ndarray, np.ndarray]:
-    """A turn of the scanner that looks forward at `time`, counter-clockwise from behind: what it writes, each point as
+    """A turn of the scanner that looks forward at `time`, clockwise from behind: what it writes, each point as
     seen at its own time, and where the points are in the world; (n, 3) each."""
     raw, true = [], []
     for azimuth in AZIMUTHS:
-        now = time + SPIN * azimuth / np.pi
+        now = time - SPIN * azimuth / np.pi
         hits = drive.hits(VELODYNE, rays_at(azimuth, ELEVATIONS), now)
         true.append(hits)
         raw.append(seen_from(drive.ego(now) @ VELODYNE, hits))
@@ -233,8 +233,9 @@ def test_scans_that_are_compensated_already_are_left_as_they_are(kitti, tmp_path
     np.testing.assert_allclose(read_returns(scene.sweeps[2]).points, points, atol=1e-5)
     mirrored = points * [1.0, -1.0, 1.0]
     start, end = drive.ego(TIMES[2] - SPIN) @ VELODYNE, drive.ego(TIMES[2] + SPIN) @ VELODYNE
-    turned = [kitti_raw.untwisted(mirrored, scans, start, end, start) for scans in ("clockwise", "counter-clockwise")]
-    assert np.linalg.norm(turned[0] - turned[1], axis=1).max() > 0.3
+    directions = ("clockwise", "counter-clockwise")
+    turned, other = (kitti_raw.untwisted(mirrored, scans, start, end, start) for scans in directions)
+    assert np.linalg.norm(turned - other, axis=1).max() > 0.3
 
 
 # Argoverse 2
