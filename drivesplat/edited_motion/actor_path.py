@@ -63,6 +63,11 @@ class ActorPath:
         position = self.position(times)
         return self.trajectory.distance(position.clock) + position.advance
 
+    def walked(self, times: np.ndarray) -> np.ndarray:
+        """The distance (n,) in metres by which the limbs of the actor have advanced: backwards where it moves against
+        the direction that it faces."""
+        return self.facing * self.distance(times)
+
     def present(self, times: np.ndarray) -> np.ndarray:
         """Whether the actor is present (n,): while it was recorded and, once its pace is edited, also while its
         distance without offsets is within the recorded range."""

@@ -53,6 +53,10 @@ class EditedActor:
             return self.path.trajectory.motion.poses(times)
         return self.path.poses(times, float(self.size[2]))
 
+    def walked(self, times: np.ndarray) -> np.ndarray:
+        """The distance (n,) in metres by which its limbs have advanced at `times` (n,) in film seconds."""
+        return self.path.walked(np.asarray(times, dtype=np.float64))
+
 
 def edited_actors(
     actors: Sequence[EditedActor], edit: Edit, where: str, other_ids: Collection[str] = (),

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,15 +110,22 @@ def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> E
 
 
 def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list[list[ActorPlacement]]:
-    """The actors present at each of `seconds` (n,), with their poses then and HALF_STEP before and after."""
+    """The actors present at each of `seconds` (n,), with their poses and distances then and HALF_STEP before and
+    after."""
     result: list[list[ActorPlacement]] = [[] for _ in seconds]
     for actor in actors:
-        poses = [actor.poses(seconds + step) for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
+        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix)
+        times = [seconds + step for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
+        poses, walked = [actor.poses(at) for at in times], [actor.walked(at) for at in times]
         for number in np.flatnonzero(actor.present(seconds)):
-            pose, *around = (of_time[number] for of_time in poses) if poses else (None,)
-            result[number].append(
-                ActorPlacement(actor.source, pose, actor.scale, actor.color_matrix, tuple(around) or None)
-            )
+            placement = own
+            if times:
+                pose, *around = (of_time[number] for of_time in poses)
+                distance, *beside = (float(of_time[number]) for of_time in walked)
+                placement = replace(
+                    own, object_to_world=pose, around=tuple(around), walked=distance, walked_around=tuple(beside)
+                )
+            result[number].append(placement)
     return result
 
 

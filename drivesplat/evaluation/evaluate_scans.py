@@ -53,7 +53,7 @@ def evaluate_scans(
     spread = inputs.checkpoint.job.train.scans.beam_spread_rad
     with explain_out_of_memory(lambda: len(model)):
         lidar = lidar_metrics(model, inputs.scene, inputs.scans, spread, device)
-    of_images = {"gap_db": None, **dict.fromkeys(REGIONS)}
+    of_images = {"gap_db": None, "human_gap_db": None, **dict.fromkeys(REGIONS)}
     record = inputs.record
     return {
         "schema": 1,

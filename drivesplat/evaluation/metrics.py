@@ -135,13 +135,21 @@ class RegionMetrics:
 
 
 def with_gap(regions: dict[str, dict[str, Any] | None]) -> dict[str, Any]:
-    """The record of a group of held-out frames: `gap_db`, then its regions."""
-    return {"gap_db": gap_db(regions), **regions}
+    """The record of a group of held-out frames: `gap_db` and `human_gap_db`, then its regions."""
+    return {"gap_db": gap_db(regions), "human_gap_db": human_gap_db(regions), **regions}
 
 
 def gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
     """PSNR of static minus that of moving vehicles in dB, or of all vehicles if none moves; None if there are none."""
-    static, moving = regions["static"], regions["moving_vehicle"] or regions["vehicle"]
+    return _difference(regions["static"], regions["moving_vehicle"] or regions["vehicle"])
+
+
+def human_gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
+    """PSNR of static minus that of moving people in dB; None if there are none."""
+    return _difference(regions["static"], regions["moving_human"])
+
+
+def _difference(static: dict[str, Any] | None, moving: dict[str, Any] | None) -> float | None:
     if static is None or moving is None or static["psnr"] is None or moving["psnr"] is None:
         return None
     return static["psnr"] - moving["psnr"]

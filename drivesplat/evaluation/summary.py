@@ -32,7 +32,8 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
         for group, where in GROUP_PLACES.items():
             gap = method[group].get("gap_db")
             if (static := _psnr(method[group], "static")) is not None:
-                lines.append(f"{name}, frames {where}: {_with_moving_vehicles(static, method[group], gap)}")
+                people = _people(method[group])
+                lines.append(f"{name}, frames {where}: {_with_moving_vehicles(static, method[group], gap)}{people}")
             if regions := method[group].get("lidar"):
                 others = {other: groups[group] for other, groups in metrics.get("lidar_baselines", {}).items()}
                 lines.append(f"{name}, LiDAR scans {where}: {_scans_with_baselines(regions, others)}")
@@ -119,6 +120,12 @@ def _with_moving_vehicles(static: float, group: dict[str, Any], gap: float | Non
     if gap is None or moving is None:
         return f"static {static:.1f} dB, no moving vehicle to compare with"
     return f"moving vehicles {moving:.1f} dB, static {static:.1f} dB: a gap of {gap:.1f} dB"
+
+
+def _people(group: dict[str, Any]) -> str:
+    """The figures of moving people, if any."""
+    people, gap = _psnr(group, "moving_human"), group.get("human_gap_db")
+    return "" if people is None or gap is None else f"; moving people {people:.1f} dB: a gap of {gap:.1f} dB"
 
 
 def print_summary(path: str | Path) -> None:

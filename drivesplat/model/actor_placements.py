@@ -9,6 +9,7 @@ from torch import Tensor
 
 from drivesplat.kernels.placement import ObjectPoses
 from drivesplat.model.part import ActorPlacement
+from drivesplat.model.timeline import TimeState
 
 
 def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:
@@ -24,6 +25,15 @@ def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence
             quats[i] = torch.from_numpy(turned).to(quats)
             translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
     return ObjectPoses(quats, translations, sizes, presence)
+
+
+def with_walked(state: TimeState, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> TimeState:
+    """The time state with the lengths of the paths that placements state."""
+    walked = state.walked.clone()
+    for placement in placements:
+        if placement.walked is not None:
+            walked[ids.index(placement.source)] = placement.walked
+    return state._replace(walked=walked)
 
 
 def placement_sets(

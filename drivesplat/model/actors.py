@@ -18,7 +18,7 @@ from drivesplat.kernels import torch_private
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
-from drivesplat.model.actor_placements import placement_sets, with_placements
+from drivesplat.model.actor_placements import placement_sets, with_placements, with_walked
 from drivesplat.model.gaussians import Gaussians, concatenate, recolored
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
@@ -104,22 +104,29 @@ class Actors(Part):
         translations = state.translations + weights @ self.shared["translation"]
         return ObjectPoses(quats, translations, sizes, state.present.to(sizes.dtype))
 
+    def local(self, state: TimeState) -> LocalGaussians:
+        """The Gaussians in the frames of their objects at a time state."""
+        p = self.params
+        return LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
+
     @torch.no_grad()
     def velocities(self, time: float) -> Float[Tensor, "n 3"]:
-        return self._velocities(*self._poses_beside(time))
+        return self._velocities(*((state, self.poses(state)) for state in self._beside(time)))
 
     def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
         return self._echoes(self.poses(self.time_state(time))) if "echoes" in self.params else None
 
-    def _poses_beside(self, time: float) -> tuple[ObjectPoses, ObjectPoses]:
-        """The poses HALF_STEP seconds before and after a time."""
-        return self.poses(self.time_state(time - HALF_STEP)), self.poses(self.time_state(time + HALF_STEP))
+    def _beside(self, time: float) -> tuple[TimeState, TimeState]:
+        """The states HALF_STEP seconds before and after a time."""
+        return self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
 
-    def _velocities(self, before: ObjectPoses, after: ObjectPoses) -> Float[Tensor, "n 3"]:
-        """The velocities of its Gaussians, m/s, by poses HALF_STEP seconds before and after; 0 for actors that are
-        absent then."""
-        there = of_owners(before.presence * after.presence, self._owns)[:, None]
-        return there * (self._positions(after) - self._positions(before)) / (2.0 * HALF_STEP)
+    def _velocities(
+        self, before: tuple[TimeState, ObjectPoses], after: tuple[TimeState, ObjectPoses]
+    ) -> Float[Tensor, "n 3"]:
+        """The velocities of its Gaussians, m/s, by states and poses HALF_STEP seconds before and after; 0 for actors
+        that are absent then."""
+        there = of_owners(before[1].presence * after[1].presence, self._owns)[:, None]
+        return there * (self._positions(*after) - self._positions(*before)) / (2.0 * HALF_STEP)
 
     def _echoes(self, poses: ObjectPoses) -> Float[Tensor, "n 4 2"]:
         """The echoes of actors at these poses along directions in the world."""
@@ -127,28 +134,27 @@ class Actors(Part):
         turned = of_owners(turns, self._owns) @ own[:, 1:]
         return torch.cat([own[:, :1], turned], dim=1)
 
-    def _positions(self, poses: ObjectPoses) -> Float[Tensor, "n 3"]:
+    def _positions(self, state: TimeState, poses: ObjectPoses) -> Float[Tensor, "n 3"]:
         """The centres of its Gaussians in the world."""
-        p = self.params
-        local = LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
-        return place(local, poses, p["owner"], self._owns)[0]
+        return place(self.local(state), poses, self.params["owner"], self._owns)[0]
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         state, known = self.time_state(time), self._known
         poses, sets = self.poses(state), []
         for chosen, rows in self._sets(placements):  # few: transforming all actors for each copy costs little
             own = [placements[i] for i in chosen]
-            sets.append(self._recolored(self.placed(state, with_placements(poses, known, own)), own)[rows])
+            there = with_walked(state, known, own), with_placements(poses, known, own)
+            sets.append(self._recolored(self.placed(*there), own)[rows])
         return concatenate(sets)
 
     @torch.no_grad()
     def velocities_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Float[Tensor, "m 3"]:
-        recorded, sets = self._poses_beside(time), []
+        recorded, known, sets = self._beside(time), self._known, []
         for chosen, rows in self._sets(placements):
-            beside = [
-                with_placements(poses, self._known, [placements[i].beside(number) for i in chosen])
-                for number, poses in enumerate(recorded)
-            ]
+            beside = []
+            for number, state in enumerate(recorded):
+                own = [placements[i].beside(number) for i in chosen]
+                beside.append((with_walked(state, known, own), with_placements(self.poses(state), known, own)))
             sets.append(self._velocities(*beside)[rows])
         return torch.cat(sets)
 
@@ -192,11 +198,10 @@ class Actors(Part):
     def placed(self, state: TimeState, poses: ObjectPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
         p, owner, owns = self.params, self.params["owner"], self._owns
-        local = LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
         # colors rotate by a few degrees: their gradient would add only noise to the track
         rotations = rotation_of_harmonics(rotation_matrix(poses.quats.detach()), p["shN"].shape[2] + 1)
         sh = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
-        return Gaussians.of(*place(local, poses, owner, owns), sh)
+        return Gaussians.of(*place(self.local(state), poses, owner, owns), sh)
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
@@ -240,11 +245,11 @@ class Actors(Part):
 
     @torch.no_grad()
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
-        p = self.params
-        scales, opacities = torch.exp(p["scales"]), torch.sigmoid(p["opacities"])
-        local = Gaussians.of(p["means"], p["quats"], scales, opacities, self.harmonics(self.time_state(time)))
+        state = self.time_state(time)
+        means, quats, scales, opacities = self.local(state)
+        local = Gaussians.of(means, quats, torch.exp(scales), torch.sigmoid(opacities), self.harmonics(state))
         return {
-            track.id: RigidGroup(local[p["owner"] == i], motion)
+            track.id: RigidGroup(local[self.params["owner"] == i], motion)
             for i, (track, motion) in enumerate(zip(self.timeline.tracks, self.motions(), strict=True))
         }
 

@@ -10,6 +10,7 @@ import torch
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.camera_poses import TIMES, CameraPoses
+from drivesplat.model.deformable import Deformable
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -17,12 +18,14 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train import PartName, SkyKind, TrainSettings
+from drivesplat.settings.train import ActorSettings, PartName, SkyKind, TrainSettings
 
 EXPOSURE_PREFIX = "exposure.first."
 """Prefix of the initial gains of exposures in a model's state; the camera name follows."""
 POSES_PREFIX = "camera_poses." + TIMES
 """Prefix of the times of corrected camera poses in a model's state; the camera name follows."""
+OBJECTS: dict[str, type[Actors]] = {kind.name: kind for kind in (Actors, Deformable)}
+"""The parts that consist of objects, by name."""
 MIN_SEED_POINTS = 4
 """Seed points that an actor keeps whatever the cap: the initial scale of a Gaussian comes from three neighbours."""
 
@@ -56,8 +59,10 @@ def gaussian_cap(record: TrainingRecord, settings: TrainSettings, rays: int = 0)
 
 def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings) -> SplatModel:
     """An untrained model without the parts that would be empty, such as actors in a static scene."""
-    makers = {"background": _init_background, "actors": _init_actors}
-    made = (makers[name](init, settings) for name in parts)
+    made = (
+        _init_objects(OBJECTS[name], init, parts, settings) if name in OBJECTS else _init_background(init, settings)
+        for name in parts
+    )
     return SplatModel(
         [part for part in made if part is not None],
         _sky(sky, settings, init.sky_color),
@@ -77,15 +82,11 @@ def rebuild_model(
     state: Mapping[str, torch.Tensor], parts: list[PartDefinition], sky: SkyKind, settings: TrainSettings
 ) -> SplatModel:
     """The model whose `state_dict` is `state` and whose `definitions` are `parts`."""
-    makers = {
-        "background": lambda params, definition: Background(params, settings.gaussians, definition.extent),
-        "actors": lambda params, definition: Actors(params, definition.tracks, settings.actors, settings.gaussians),
-    }
     made = []
     for i, definition in enumerate(parts):
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-        made.append(makers[definition.part](params, definition))
+        made.append(_rebuilt(params, definition, settings))
     exposed = {
         key.removeprefix(EXPOSURE_PREFIX): gains for key, gains in state.items() if key.startswith(EXPOSURE_PREFIX)
     }
@@ -102,6 +103,13 @@ def rebuild_model(
     return model
 
 
+def _rebuilt(params: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
+    if definition.part == Background.name:
+        return Background(params, settings.gaussians, definition.extent)
+    own = getattr(settings, definition.part)
+    return OBJECTS[definition.part](params, definition.tracks, own, settings.gaussians)
+
+
 def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
     record = init.record
     kept = random_subset(len(record.points), settings.cap_max)
@@ -109,27 +117,31 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
     return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes, init.echo)
 
 
-def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
-    actors = [actor for actor in init.actors if actor.part == Actors.name and len(actor.points)]
+def _init_objects(
+    kind: type[Actors], init: ModelInit, parts: Sequence[PartName], settings: TrainSettings
+) -> Part | None:
+    """The part of this kind with its objects among the actors, None without any."""
+    actors = [actor for actor in init.actors if actor.part_in(parts) == kind.name and len(actor.points)]
     if not actors:
         return None
+    own: ActorSettings = getattr(settings, kind.name)
     tracks = [ActorTrack(actor.id, actor.size, actor.motion) for actor in actors]
-    limits = [actor_cap(actor, settings) for actor in actors]
+    limits = [actor_cap(actor, own, settings.pixels_per_gaussian) for actor in actors]
     counts = [len(actor.points) for actor in actors]
-    shares = split_cap(list(map(min, counts, limits)), settings.actors.cap_max)
+    shares = split_cap(list(map(min, counts, limits)), own.cap_max)
     kept = [random_subset(count, share) for count, share in zip(counts, shares, strict=True)]
     chosen = list(zip(actors, kept, strict=True))
     points, colors = [actor.points[rows] for actor, rows in chosen], [actor.points_rgb[rows] for actor, rows in chosen]
-    capped = settings.actors.model_copy(update={"cap_max": min(settings.actors.cap_max, sum(limits))})
+    capped = own.model_copy(update={"cap_max": min(own.cap_max, sum(limits))})
     colors = [values / 255.0 for values in colors]
-    return Actors.from_points(tracks, points, colors, capped, settings.gaussians, init.classes, init.echo)
+    return kind.from_points(tracks, points, colors, capped, settings.gaussians, init.classes, init.echo)
 
 
-def actor_cap(actor: ActorRecord, settings: TrainSettings) -> int:
+def actor_cap(actor: ActorRecord, settings: ActorSettings, pixels_per_gaussian: float) -> int:
     """The maximum number of Gaussians for the training pixels in an actor's box."""
-    if not settings.pixels_per_gaussian:
-        return settings.actors.cap_max
-    return max(settings.actors.least, int(actor.pixels / settings.pixels_per_gaussian))
+    if not pixels_per_gaussian:
+        return settings.cap_max
+    return max(settings.least, int(actor.pixels / pixels_per_gaussian))
 
 
 def split_cap(wanted: Sequence[int], cap: int) -> list[int]:

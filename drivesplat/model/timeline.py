@@ -32,7 +32,7 @@ class TimeState(NamedTuple):
 
     `quats` (w, x, y, z) and `translations` (metres) are the annotated object to world; `weights` the interpolation
     weight of each annotation in its actor's position; `series` cos(i pi t / T), t running from 0 to T over an actor's
-    annotations.
+    annotations; `walked` the length (metres) of an actor's horizontal path since its first annotation.
     """
 
     quats: Float[Tensor, "a 4"]
@@ -40,6 +40,7 @@ class TimeState(NamedTuple):
     present: Bool[Tensor, " a"]
     weights: Float[Tensor, " m"]
     series: Float[Tensor, "a f"]
+    walked: Float[Tensor, " a"]
 
 
 class Timeline:
@@ -95,15 +96,16 @@ class Timeline:
         """The states at the seconds `at` (n,)."""
         shape, owned = (len(at), len(self.tracks)), self.owned
         weights, poses = np.zeros((len(at), owned[-1].stop)), np.tile(np.eye(4), (*shape, 1, 1))
-        present, progress = np.zeros(shape, dtype=bool), np.zeros(shape)
+        present, progress, walked = np.zeros(shape, dtype=bool), np.zeros(shape), np.zeros(shape)
         for i, (track, own) in enumerate(zip(self.tracks, owned, strict=True)):
             motion = track.motion
             there = present[:, i] = motion.present(at)
             if there.any():
                 weights[there, own], poses[there, i] = motion.weights(at[there]), motion.poses(at[there])
+            walked[:, i] = motion.walked(at)
             progress[:, i] = np.clip((at - motion.times[0]) / (np.ptp(motion.times) or np.inf), 0.0, 1.0)
         series = np.cos(np.pi * progress[..., None] * np.arange(self._terms))
         quats = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
-        values = (quats.reshape(*shape, 4), poses[..., :3, 3], present, weights, series)
+        values = (quats.reshape(*shape, 4), poses[..., :3, 3], present, weights, series, walked)
         tensors = (torch.from_numpy(value if value.dtype == bool else value.astype(np.float32)) for value in values)
         return [TimeState(*each) for each in zip(*(tensor.to(device).unbind() for tensor in tensors), strict=True)]

@@ -14,7 +14,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.sweeps import returns_of
-from drivesplat.scene.actor_record import RULE, ActorRecord, ActorRecords
+from drivesplat.scene.actor_record import ActorRecord, ActorRecords
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.regions import MIN_PIXELS, hulls_in, owner_image
@@ -23,7 +23,7 @@ from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.shutter import Shutter, shutter_of, where_seen
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
-from drivesplat.settings.train import STAGE_OF_PART, PartName
+from drivesplat.settings.train import PartName
 
 log = logging.getLogger(__name__)
 
@@ -38,12 +38,11 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
     for dynamic_object in sorted(dynamic_objects(scene), key=lambda item: item.track.id):
-        part = job.actors.part_of(dynamic_object.track.object_class)
-        if STAGE_OF_PART.get(part) == RULE:
+        parts = job.actors.parts_of(dynamic_object.track.object_class)
+        if parts:
             random = np.random.default_rng((job.random_seed, order[dynamic_object.track.id]))
-            seeds.append(
-                Seed(dynamic_object, part, *gathered_points(scene, dynamic_object, sweeps, job.actors, random))
-            )
+            points = gathered_points(scene, dynamic_object, sweeps, job.actors, random)
+            seeds.append(Seed(dynamic_object, parts, *points))
     frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
     for view in prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames):
         for seed in seeds:
@@ -117,8 +116,8 @@ class Seed:
     A point has the colour of its nearest camera among those whose image shows the actor at the point's pixel.
     """
 
-    def __init__(self, dynamic_object: DynamicObject, part: PartName, points: np.ndarray, lidar: int):
-        self.dynamic_object, self._part = dynamic_object, part
+    def __init__(self, dynamic_object: DynamicObject, parts: tuple[PartName, ...], points: np.ndarray, lidar: int):
+        self.dynamic_object, self._parts = dynamic_object, parts
         self.seen, self.pixels = False, 0
         self._points, self.lidar = points, lidar
         self._colors = np.zeros((len(points), 3), dtype=np.uint8)
@@ -159,5 +158,5 @@ class Seed:
             points_rgb=np.where(shown[:, None], self._colors, mean).astype(np.uint8),
             lidar_points=self.lidar,
             pixels=self.pixels,
-            part=self._part,
+            parts=self._parts,
         )

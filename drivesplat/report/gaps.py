@@ -23,6 +23,8 @@ from drivesplat.workflow.job_logs import why_missing
 
 SCHEMA = 3
 REGIONS = ("moving_vehicle", "static", "vehicle")
+HUMANS = ("moving_human", "human_gap_db")
+"""The PSNR of moving people, and the gap between static pixels and theirs."""
 WHOLE_IMAGE = ("psnr", "psnr_frame_mean", "ssim", "lpips")
 """The metrics of all pixels of an image."""
 
@@ -81,7 +83,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
 
 COLUMNS = (
     "scene", "dataset", "method",
-    *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", *WHOLE_IMAGE)),
+    *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", *HUMANS, *WHOLE_IMAGE)),
     "gaussians", "train_seconds",
 )  # fmt: skip
 
@@ -132,9 +134,9 @@ def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
     result = record["methods"][method]
     row = {"scene": record["scene"], "dataset": record["dataset"], "method": method}
     for group in HELD_OUT_GROUPS:
-        for region in REGIONS:
-            row[f"{group}_{region}"] = result[group][region]["psnr"] if result[group][region] else None
-        row[f"{group}_gap_db"] = result[group]["gap_db"]
+        for region in (*REGIONS, HUMANS[0]):
+            row[f"{group}_{region}"] = (result[group].get(region) or {}).get("psnr")
+        row |= {f"{group}_{gap}": result[group].get(gap) for gap in ("gap_db", HUMANS[1])}
         whole = result[group]["all"] or dict.fromkeys(WHOLE_IMAGE)
         row |= {f"{group}_{name}": whole[name] for name in WHOLE_IMAGE}
     costs = {"gaussians": result["gaussians"], "train_seconds": result["train_seconds"]}
@@ -191,6 +193,13 @@ def _figure(row: dict[str, Any], column: str) -> int | float | None:
     """The figure of a row that enters a mean."""
     group, _, name = column.partition("_")
     return moving_gap(row, group) if name == "gap_db" else row[column]
+
+
+def shows_people(report: dict[str, Any]) -> bool:
+    """Whether a scene of a report has moving people in held-out frames."""
+    return any(
+        row[f"{group}_{name}"] is not None for row in report["rows"] for group in HELD_OUT_GROUPS for name in HUMANS
+    )
 
 
 def summary_sentences(report: dict[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
 from drivesplat.io.html_page import filled_page
 from drivesplat.report import page
-from drivesplat.report.gaps import summary_sentences
+from drivesplat.report.gaps import shows_people, summary_sentences
 from drivesplat.report.lidar import page_table
 from drivesplat.report.media import MethodMedia, data_url, difference_position, read_image
 from drivesplat.report.plot import gap_plot
@@ -22,6 +22,10 @@ REGION_FIGURES = [
     {"key": "static", "title": "static", "form": "{:.1f}", "kind": ""},
     {"key": "vehicle", "title": "vehicle", "form": "{:.1f}", "kind": ""},
     {"key": "gap_db", "title": "gap", "form": "{:.1f}", "kind": ""},
+]
+HUMAN_FIGURES = [
+    {"key": "moving_human", "title": "people", "form": "{:.1f}", "kind": "first"},
+    {"key": "human_gap_db", "title": "gap", "form": "{:.1f}", "kind": ""},
 ]
 WHOLE_IMAGE_FIGURES = [
     {"key": "psnr", "title": "PSNR ↑", "form": "{:.1f}", "kind": "first"},
@@ -67,6 +71,7 @@ def report_page(
         places=GROUP_PLACES,
         tables=[
             _table("Moving vehicles and static pixels: PSNR in dB", REGION_FIGURES, []),
+            *([_table("Moving people: PSNR in dB", HUMAN_FIGURES, [])] if shows_people(report) else []),
             _table("Whole images, with the cost of training", WHOLE_IMAGE_FIGURES, COSTS),
         ],
         lidar=page_table(report["lidar"]),

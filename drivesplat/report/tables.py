@@ -6,13 +6,21 @@ from typing import Any
 import pandas as pd
 
 from drivesplat.io.storage import atomic_write
-from drivesplat.report.gaps import COLUMNS, REGIONS
+from drivesplat.report.gaps import COLUMNS, HUMANS, REGIONS, shows_people
 from drivesplat.report.lidar import LIDAR_COLUMNS, REGION_NAMES, page_table
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.published import MEAN
 
 NAMES, COSTS = ["scene", "method"], ["gaussians", "train_seconds"]
-TITLES = {"moving_vehicle": "moving", "gap_db": "gap", "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}
+TITLES = {
+    "moving_vehicle": "moving",
+    "gap_db": "gap",
+    "moving_human": "people",
+    "human_gap_db": "their gap",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+}
 FORMS = {"ssim": "{:.3f}", "lpips": "{:.3f}", "gaussians": "{:,.0f}", "train_seconds": "{:,.0f}"}
 """The formats of figures; all others are in dB with two digits."""
 
@@ -49,8 +57,9 @@ def _csv_row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def gap_table(report: dict[str, Any]) -> str:
-    """PSNR by region with the gap, in both groups of held-out frames, and the means over scenes."""
-    return _as_text(report, [*REGIONS, "gap_db"], [])
+    """PSNR by region with the gap, and those of people where any move, in both groups of held-out frames, and the means
+    over scenes."""
+    return _as_text(report, [*REGIONS, "gap_db", *(HUMANS if shows_people(report) else ())], [])
 
 
 def whole_image_table(report: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 The stage `actors` writes it (`drivesplat.preprocess.actor_seed`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +23,7 @@ class ActorRecord:
     in seconds since the scene's first image, `points` in the object's frame (metres) and their colours.
 
     The first `lidar_points` points are LiDAR returns. `pixels` is the number of pixels that show the actor, over all
-    training images at training size. `part` names the part of a model that represents the actor.
+    training images at training size. `parts` names the parts of a model that can represent the actor, the best first.
     """
 
     id: str
@@ -33,7 +34,11 @@ class ActorRecord:
     points_rgb: UInt8[np.ndarray, "p 3"]
     lidar_points: int
     pixels: int
-    part: str = "actors"
+    parts: tuple[str, ...] = ("actors",)
+
+    def part_in(self, parts: Sequence[str]) -> str | None:
+        """The one of a model's `parts` that represents the actor; None: the background shows it."""
+        return next((part for part in self.parts if part in parts), None)
 
 
 @dataclass(frozen=True)

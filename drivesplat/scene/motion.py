@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import runs
 
+PATH_STEP = 0.05
+"""Seconds between the positions that give the length of a path."""
 HALF_STEP = 0.02
 """Half the time in seconds between the two poses that give the velocity of a moving object; some readout times of a
 camera."""
@@ -64,6 +66,22 @@ class Motion:
             about_vertical = Rotation.from_rotvec((weights @ self.turns)[:, None] * [0.0, 0.0, 1.0])
             poses[:, :3, :3] = poses[:, :3, :3] @ about_vertical.as_matrix()
         return poses
+
+    def walked(self, at: np.ndarray) -> np.ndarray:
+        """The length (n,) in metres of the horizontal path from the first annotation to the seconds `at` (n,); negative
+        before it. A gap of the annotations is a straight line, and beyond the ends the path does not go on."""
+        times, lengths = self._path
+        return np.interp(at, times, lengths)
+
+    @cached_property
+    def _path(self) -> tuple[np.ndarray, np.ndarray]:
+        """Seconds (s,), and the length of the path from the first annotation to each."""
+        spans = [np.clip(self.times[[a, b]] + [-self.reach, self.reach], *self.span) for a, b in self.runs]
+        times = np.concatenate([np.linspace(a, b, max(2, int((b - a) / PATH_STEP) + 1)) for a, b in spans])
+        times = np.unique(np.concatenate([times, self.times[:1]]))
+        steps = np.linalg.norm(np.diff(self.poses(times)[:, :2, 3], axis=0), axis=1)
+        lengths = np.concatenate([[0.0], np.cumsum(steps)])
+        return times, lengths - lengths[np.searchsorted(times, self.times[0])]
 
     def weights(self, at: np.ndarray) -> np.ndarray:
         """The annotations' weights (n, k) in the position at the seconds `at` (n,): position = weights @ positions.

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
-from drivesplat.settings.train import PartName
+from drivesplat.settings.train import STAGE_OF_PART, PartName
 
 ObjectClassName = Literal[
     "car", "truck", "bus", "trailer", "construction_vehicle", "tram", "vehicle", "motorcycle", "bicycle", "rider",
@@ -15,7 +15,8 @@ ObjectClassName = Literal[
 """The values of `drivesplat.scene.object_class.ObjectClass`."""
 CYCLES = ("motorcycle", "bicycle", "rider")
 NO_VEHICLES = ("pedestrian", "animal", "other_movable")
-DEFAULT_CLASSES: dict[ObjectClassName, PartName] = {
+ClassParts = PartName | tuple[PartName, ...]
+DEFAULT_CLASSES: dict[ObjectClassName, ClassParts] = {
     name: "background" if name in NO_VEHICLES else "actors" for name in get_args(ObjectClassName)
 }
 
@@ -24,8 +25,8 @@ class ActorSeedSettings(Settings):
     """Selection of actors and of their seed points. An actor is a vehicle that moves during the drive and is visible in
     a training image; it gets a set of Gaussians in its own frame."""
 
-    classes: dict[ObjectClassName, PartName] = DEFAULT_CLASSES
-    """The part of a model that represents the moving objects of each class."""
+    classes: dict[ObjectClassName, ClassParts] = DEFAULT_CLASSES
+    """The part of a model that represents the moving objects of each class, or several: the first that a method has."""
     cycles: bool = True
     """Make actors of motorcycles, bicycles and riders, too. false overrides `classes`."""
     humans: bool = False
@@ -40,13 +41,16 @@ class ActorSeedSettings(Settings):
     box_margin: float = Field(0.1, ge=0, le=2)
     """LiDAR returns closer than this (metres) to the sides or the roof of a box belong to its actor."""
 
-    def part_of(self, object_class: str) -> PartName:
-        """The part that represents the moving objects of a class."""
+    def parts_of(self, object_class: str) -> tuple[PartName, ...]:
+        """The parts of moving objects that can represent a class, the best first; none for the background."""
         if object_class in CYCLES and not self.cycles:
-            return "background"
+            return ()
         if object_class == "pedestrian" and self.humans:
-            return "actors"
-        return {**DEFAULT_CLASSES, **self.classes}[object_class]
+            return ("actors",)
+        chosen = {**DEFAULT_CLASSES, **self.classes}[object_class]
+        every = (chosen,) if isinstance(chosen, str) else chosen
+        before_background = every[: every.index("background")] if "background" in every else every
+        return tuple(part for part in before_background if part in STAGE_OF_PART)
 
 
 class ActorSeedJob(Settings):

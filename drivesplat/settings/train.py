@@ -8,8 +8,8 @@ from drivesplat.settings import Settings
 from drivesplat.settings.train_cameras import CameraPoseSettings, ExposureSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 
-PartName = Literal["background", "actors"]
-STAGE_OF_PART: dict[PartName, str] = {"actors": "actors"}
+PartName = Literal["background", "actors", "deformable"]
+STAGE_OF_PART: dict[PartName, str] = {"actors": "actors", "deformable": "actors"}
 """The parts whose Gaussians are objects that move, and the stage that finds these objects in a scene. The settings of
 such a part are the field of TrainSettings with its name."""
 SkyKind = Literal["none", "mask", "cubemap"]
@@ -24,6 +24,7 @@ def _complete(parts: tuple[PartName, ...]) -> tuple[PartName, ...]:
     return parts
 
 
+Nodes = Annotated[int, Field(ge=2, le=64)]
 Parts = Annotated[
     tuple[PartName, ...],
     AfterValidator(_complete),
@@ -96,6 +97,30 @@ class ActorSettings(Settings):
     box_margin: float = Field(0.1, ge=0, le=2)
     """Gaussians with centres farther than this (metres) outside their box are faded out."""
     tracks: TrackSettings = TrackSettings()
+
+
+class DeformableSettings(ActorSettings):
+    """The part `deformable`: people, animals and cyclists, each a set of Gaussians in the frame of its box that deform
+    with the distance walked and with time."""
+
+    harmonics: int = Field(3, ge=1, le=8)
+    """Number of multiples of the gait's phase in the deformation: a cosine and a sine each."""
+    stride: float = Field(0.83, gt=0, le=20)
+    """Initial length of a gait cycle, which is two steps, in heights of the box."""
+    nodes: tuple[Nodes, Nodes, Nodes] = (3, 8, 12)
+    """Nodes of the deformation's lattice along the length, width and height of the box."""
+    lr_lattice: float = Field(2e-3, gt=0)
+    """Learning rate of displacements (metres) and rotations (radians) at the nodes."""
+    lr_stride: float = Field(5e-4, gt=0)
+    """Learning rate of the logarithm of a cycle's length."""
+    lr_phase: float = Field(1e-3, gt=0)
+    """Learning rate of corrections of the phase (cycles)."""
+    size_weight: float = Field(0.01, ge=0)
+    """Loss weight of the mean squared displacements and rotations, times the square of the order of their function."""
+    smoothness_weight: float = Field(0.1, ge=0)
+    """Loss weight of the mean squared difference between neighbouring nodes."""
+    gait_weight: float = Field(0.01, ge=0)
+    """Loss weight of the mean squared corrections of the phase (cycles) and of a cycle's length."""
 
 
 class CoarseToFineSettings(Settings):
@@ -177,6 +202,7 @@ class TrainSettings(Settings):
     thousand kilometres away (docs/exports.md)."""
     gaussians: GaussianSettings = GaussianSettings()
     actors: ActorSettings = ActorSettings()
+    deformable: DeformableSettings = DeformableSettings()
     mcmc: McmcSettings = McmcSettings()
     default: DefaultSettings = DefaultSettings()
     floaters: FloaterSettings = FloaterSettings()

@@ -10,7 +10,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation.evaluate import findings
-from drivesplat.evaluation.metrics import RegionMetrics, gap_db, psnr, ssim_map, with_gap
+from drivesplat.evaluation.metrics import RegionMetrics, gap_db, human_gap_db, psnr, ssim_map, with_gap
 from drivesplat.scene.regions import LABELS, REGIONS, region_masks
 
 HEIGHT, WIDTH = 40, 50
@@ -160,8 +160,8 @@ def test_pooled_figures_equal_those_of_the_concatenated_pixels():
 
 
 def test_regions_follow_the_protocol():
-    expected = {"all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human", "gap_db"}
-    assert measured((*pair(4), labels_of())).keys() == expected
+    regions = {"all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human"}
+    assert measured((*pair(4), labels_of())).keys() == {*regions, "gap_db", "human_gap_db"}
 
 
 @pytest.mark.parametrize(
@@ -256,6 +256,18 @@ def record_of(value: float | None) -> dict[str, Any]:
 )
 def test_gap_is_static_minus_moving(static, moving, vehicle, expected):
     assert gap_db({"static": static, "moving_vehicle": moving, "vehicle": vehicle}) == expected
+
+
+@pytest.mark.parametrize(
+    ("static", "people", "expected"),
+    [
+        (record_of(30.0), record_of(19.5), 10.5), (record_of(30.0), None, None), (None, record_of(19.5), None),
+        (record_of(30.0), record_of(None), None),
+    ],
+)  # fmt: skip
+def test_the_gap_of_people_is_static_minus_theirs_alone(static, people, expected):
+    regions = {"static": static, "moving_vehicle": record_of(25.0), "vehicle": None, "moving_human": people}
+    assert human_gap_db(regions) == with_gap(regions)["human_gap_db"] == expected
 
 
 def test_the_gap_of_the_summary_equals_that_of_its_regions():

@@ -29,20 +29,24 @@ def region(psnr: float | None, lpips: float | None = None) -> dict[str, Any]:
     return {"psnr": psnr, **identical, "psnr_frame_mean": psnr, "ssim": 0.8, "lpips": lpips, "pixels": 5000}
 
 
-def group(static: float, moving: float | None = None, parked: float | None = None, lpips: float | None = None) -> dict:
-    """The figures of a group: a moving and a parked vehicle, or neither."""
+def group(
+    static: float, moving: float | None = None, parked: float | None = None, lpips: float | None = None,
+    people: float | None = None,
+) -> dict:  # fmt: skip
+    """The figures of a group: a moving and a parked vehicle, or neither, and people, or none."""
     there = [psnr for psnr in (moving, parked) if psnr is not None]
     vehicle = sum(there) / len(there) if there else None
     behind = moving if moving is not None else vehicle
     return {
         "gap_db": None if behind is None else static - behind,
+        "human_gap_db": None if people is None else static - people,
         "all": region(static - 1.0, lpips),
         "static": region(static, lpips),
         "vehicle": None if vehicle is None else region(vehicle, lpips),
         "car": None,
         "moving_vehicle": None if moving is None else region(moving, lpips),
         "parked_vehicle": None if parked is None else region(parked, lpips),
-        "moving_human": None,
+        "moving_human": None if people is None else region(people, lpips),
     }
 
 

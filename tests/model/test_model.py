@@ -367,7 +367,8 @@ def test_actors_are_initialised_from_their_records():
 )
 def test_an_actors_gaussians_are_capped_by_its_training_pixels(pixels, changes, expected):
     settings = TrainSettings(**{"pixels_per_gaussian": 20.0, "actors": ActorSettings(least=8, cap_max=300), **changes})
-    assert actor_cap(actor_record(a_track(), pixels=pixels), settings) == expected
+    record = actor_record(a_track(), pixels=pixels)
+    assert actor_cap(record, settings.actors, settings.pixels_per_gaussian) == expected
 
 
 def test_each_actor_is_initialised_with_at_most_its_cap():
@@ -424,7 +425,7 @@ def test_seeds_are_thinned_to_a_reproducible_subset():
 
 def test_the_part_actors_takes_the_records_of_its_own_objects():
     record = actor_record(track_of(motion_through(np.array([0.0, 1.0]), np.zeros((2, 3))), "a"))
-    others = dataclasses.replace(record, id="b", part="another")
+    others = dataclasses.replace(record, id="b", parts=("another",))
     assert [part.name for part in street_of(record, others).parts] == ["background", "actors"]
     assert street_of(record, others).parts[1].definition().tracks[0].id == "a"
     assert [part.name for part in street_of(others).parts] == ["background"]

@@ -37,7 +37,6 @@ from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, ObjectClassName
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.train import STAGE_OF_PART
 
 CAR = World().things[0]
 """A car ahead of the ego vehicle: 4 x 2 x 1.6 m, its rear initially 4.8 m from the camera."""
@@ -405,13 +404,23 @@ def test_actors_are_sorted_by_id_and_their_random_points_are_independent(tmp_pat
         np.testing.assert_array_equal(one.points, same.points)
 
 
-def test_each_actor_names_its_part_among_all_parts_that_the_stage_finds_objects_for(tmp_path, monkeypatch):
+def test_each_actor_names_the_parts_that_can_represent_it(tmp_path):
     walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (8.0, 0.0, 0.95), (4.2, 0.0))
-    scene = drive(tmp_path, CAR, walker)
-    assert {actor.category: actor.part for actor in actors_of(scene, job())} == {"vehicle.car": "actors"}
-    monkeypatch.setitem(STAGE_OF_PART, "background", "actors")
-    parts = {actor.category: actor.part for actor in actors_of(scene, job())}
-    assert parts == {"vehicle.car": "actors", "human.pedestrian.adult": "background"}
+    rider = Thing("vehicle.bicycle", (1.8, 0.6, 1.9), (8.0, 2.0, 0.95), (4.2, 0.0))
+    classes = {"pedestrian": "deformable", "bicycle": ("deformable", "actors")}
+    scene = drive(tmp_path, CAR, walker, rider)
+    found = {actor.category: actor for actor in actors_of(scene, job(classes=classes))}
+    assert {category: actor.parts for category, actor in found.items()} == {
+        "vehicle.car": ("actors",),
+        "human.pedestrian.adult": ("deformable",),
+        "vehicle.bicycle": ("deformable", "actors"),
+    }
+    for category, rigid, deforming in (
+        ("vehicle.car", "actors", "actors"), ("human.pedestrian.adult", None, "deformable"),
+        ("vehicle.bicycle", "actors", "deformable"),
+    ):  # fmt: skip
+        assert found[category].part_in(("background", "actors")) == rigid
+        assert found[category].part_in(("background", "actors", "deformable")) == deforming
 
 
 def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
@@ -512,23 +521,23 @@ def test_class_names_in_settings_equal_those_of_objects():
 
 @pytest.mark.parametrize("known", ObjectClass)
 def test_by_default_vehicles_are_actors_and_nothing_else_is(known):
-    assert ActorSeedSettings().part_of(known) == ("actors" if known.is_vehicle else "background")
+    assert ActorSeedSettings().parts_of(known) == (("actors",) if known.is_vehicle else ())
 
 
 @pytest.mark.parametrize(
     ("settings", "changed"),
     [
-        ({"cycles": False}, {"motorcycle": "background", "bicycle": "background", "rider": "background"}),
-        ({"humans": True}, {"pedestrian": "actors"}),
-        ({"classes": {"bus": "background", "pedestrian": "actors"}}, {"bus": "background", "pedestrian": "actors"}),
-        ({"classes": {"bicycle": "actors"}, "cycles": False},
-         {"motorcycle": "background", "bicycle": "background", "rider": "background"}),
+        ({"cycles": False}, {"motorcycle": (), "bicycle": (), "rider": ()}),
+        ({"humans": True}, {"pedestrian": ("actors",)}),
+        ({"classes": {"bus": "background", "pedestrian": "actors"}}, {"bus": (), "pedestrian": ("actors",)}),
+        ({"classes": {"car": ("deformable", "background", "actors")}}, {"car": ("deformable",)}),
+        ({"classes": {"bicycle": "actors"}, "cycles": False}, {"motorcycle": (), "bicycle": (), "rider": ()}),
     ],
-)  # fmt: skip
-def test_a_setting_changes_the_part_of_its_class_only(settings, changed):
+)
+def test_a_setting_changes_the_parts_of_its_class_only(settings, changed):
     chosen, default = ActorSeedSettings.model_validate(settings), ActorSeedSettings()
-    assert {known.value: chosen.part_of(known) for known in ObjectClass} == {
-        known.value: changed.get(known.value, default.part_of(known)) for known in ObjectClass
+    assert {known.value: chosen.parts_of(known) for known in ObjectClass} == {
+        known.value: changed.get(known.value, default.parts_of(known)) for known in ObjectClass
     }
 
 

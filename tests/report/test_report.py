@@ -14,7 +14,8 @@ from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics
 
 from drivesplat.report.files import console_table
 from drivesplat.report.gaps import gap_report, summary_sentences
-from drivesplat.report.tables import write_figures
+from drivesplat.report.html import report_page
+from drivesplat.report.tables import gap_table, write_figures
 
 VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
 VANILLA_B = method(group(26.0, None, 22.0, lpips=0.1), group(23.0), gaussians=3000, seconds=80.0)
@@ -39,16 +40,31 @@ def test_a_row_has_the_figures_of_both_groups(write):
         {
             "scene": "0061", "dataset": "nuscenes", "method": "vanilla",
             "interpolation_static": 24.0, "interpolation_vehicle": 19.0, "interpolation_moving_vehicle": 17.0,
-            "interpolation_gap_db": 7.0, "interpolation_psnr": 23.0,
+            "interpolation_gap_db": 7.0, "interpolation_moving_human": None, "interpolation_human_gap_db": None,
+            "interpolation_psnr": 23.0,
             "interpolation_psnr_frame_mean": 23.0, "interpolation_ssim": 0.8, "interpolation_lpips": 0.3,
             "extrapolation_static": 22.0, "extrapolation_vehicle": 14.0, "extrapolation_moving_vehicle": 14.0,
-            "extrapolation_gap_db": 8.0, "extrapolation_psnr": 21.0,
+            "extrapolation_gap_db": 8.0, "extrapolation_moving_human": None, "extrapolation_human_gap_db": None,
+            "extrapolation_psnr": 21.0,
             "extrapolation_psnr_frame_mean": 21.0, "extrapolation_ssim": 0.8, "extrapolation_lpips": None,
             "gaussians": 1000, "train_seconds": 60.0, "shown": None,
         }
     ]  # fmt: skip
     assert report["left_out"] == report["missing"] == [] and report["partial"] is False
     assert report["schema"] == 3 and report["protocols"] == {"0061": PROTOCOL}
+
+
+def test_people_have_a_gap_of_their_own(write):
+    """In the rows, the means, the table and the page; reports without people do not mention them."""
+    walking = method(group(30.0, 28.0, people=19.5), group(24.0))
+    with_people = gap_report([write(metrics("0061", {"vanilla": walking}))], expecting("0061"), NO_LOGS)
+    (row,), (mean,) = with_people["rows"], with_people["means"]
+    assert (row["interpolation_moving_human"], row["interpolation_human_gap_db"]) == (19.5, 10.5)
+    assert row["extrapolation_human_gap_db"] is None and row["interpolation_gap_db"] == 2.0
+    assert mean["figures"]["interpolation_human_gap_db"]["mean"] == 10.5
+    assert "people" in gap_table(with_people) and "Moving people" in report_page(with_people, {})
+    without = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061"), NO_LOGS)
+    assert "people" not in gap_table(without) and "Moving people" not in report_page(without, {})
 
 
 def test_a_region_that_is_null_is_null_in_its_row(write):
@@ -310,7 +326,10 @@ def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
     write_figures(tmp_path / "gap_report.csv", report)
     with open(Path(tmp_path / "gap_report.csv"), newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    figures = ("moving_vehicle", "static", "vehicle", "gap_db", "psnr", "psnr_frame_mean", "ssim", "lpips")
+    figures = (
+        "moving_vehicle", "static", "vehicle", "gap_db", "moving_human", "human_gap_db", "psnr", "psnr_frame_mean",
+        "ssim", "lpips",
+    )  # fmt: skip
     assert list(rows[0]) == [
         "scene", "dataset", "method",
         *(f"interpolation_{name}" for name in figures), *(f"extrapolation_{name}" for name in figures),
