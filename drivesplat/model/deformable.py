@@ -104,7 +104,8 @@ def hat_functions(walked: Sequence[np.ndarray]) -> np.ndarray:
     (3, m), the distances before each annotation, at it and after it. The first and last hold beyond the ends."""
     found = []
     for own in walked:
-        here = np.maximum.accumulate(own) + MIN_STEP * np.arange(len(own))
+        least = MIN_STEP * np.arange(len(own))
+        here = np.maximum.accumulate(own - least) + least
         found.append(np.stack([np.append(-FAR, here[:-1]), here, np.append(here[1:], FAR)]))
     return np.concatenate(found, axis=1)
 

@@ -364,6 +364,20 @@ def test_a_reversed_actor_follows_the_recording_backwards_in_time(pose_at):
     np.testing.assert_allclose(turned[:, :3, :2], -actor.poses(FILM)[:, :3, :2], atol=1e-9)
 
 
+def test_limbs_follow_the_pace_of_an_edit():
+    """Slower, standing, backwards, and turned round: half the distance, none, the same distance back and forth."""
+    slow, waits = edited(straight, {"speed": {"factor": 0.5}}), edited(straight, {"stop": {"at": 5.0}})
+    back, turned = (edited(straight, {"reverse": {"turn": turn}}) for turn in (False, True))
+    assert advance(slow, 2.0, 6.0) == pytest.approx(0.5 * SPEED * 4.0, rel=0.01)
+    assert abs(advance(waits, 8.0, 9.0)) < 1e-6 and advance(waits, 0.0, 2.0) > 1.0
+    assert advance(back, 2.0, 3.0) == pytest.approx(-SPEED, rel=0.01)
+    assert advance(turned, 2.0, 3.0) == pytest.approx(SPEED, rel=0.01)
+
+
+def advance(actor: EditedActor, first: float, last: float) -> float:
+    return float(np.diff(actor.walked(np.array([first, last])))[0])
+
+
 @pytest.mark.parametrize(("turn", "side"), [(False, 1.0), (True, -1.0)])
 def test_shifts_after_a_reversal_use_the_new_direction(turn, side):
     actor = edited(straight, {"reverse": {"turn": turn}}, {"shift": {"lateral": 2.0, "longitudinal": 5.0}})

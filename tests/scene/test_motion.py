@@ -198,3 +198,15 @@ def test_on_a_curve_the_motion_is_closer_to_the_truth_than_boxes_are(tiny_scene)
     assert max(box_off) == pytest.approx(sagitta, rel=0.05)
     assert max(aside) < 1.4 * sagitta
     assert max(off) < 0.5 * sagitta and np.median(off) < 0.05 * sagitta
+
+
+def test_the_path_walked_counts_from_the_first_annotation_and_bridges_gaps():
+    motion = with_a_gap()
+    at = np.array([-0.25, 0.0, 0.5, 1.2, 3.0, 3.25, 99.0])
+    bridge = np.hypot(20.0 - 2.5, 4.5)  # from 1.25 to 2.25 s
+    expected = [-0.5, 0.0, 1.0, 2.4, 2.5 + bridge + 1.5, 2.5 + bridge + 2.0, 2.5 + bridge + 2.0]
+    np.testing.assert_allclose(motion.walked(at), expected, atol=1e-6)
+
+
+def test_what_stands_walks_no_path():
+    assert not motion_through([2.0], [[1.0, 2.0, 3.0]], 0.7).walked(np.array([1.0, 2.0, 3.0])).any()

@@ -1,0 +1,249 @@
+"""Actors whose limbs move: the lattice that deforms them, the phase of their gait, and what edits do to it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import actor_record, actors_of, motion_through, track_of
+from helpers.records import training_record_of
+
+from drivesplat.kernels.quaternions import rotation_matrix
+from drivesplat.model.build import ModelInit, build_model, definitions, rebuild_model
+from drivesplat.model.deformable import Deformable, function_orders
+from drivesplat.model.lattice import corners, deformation, roughness
+from drivesplat.model.part import ActorPlacement
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.scene.motion import HALF_STEP
+from drivesplat.settings.train import DeformableSettings, GaussianSettings, TrainSettings
+
+SIZE, SPEED = (0.8, 0.6, 1.8), 1.5
+STRIDE = 0.83 * SIZE[2]
+NODES = (3, 4, 5)
+TIMES = 0.5 * np.arange(9)
+
+
+def walker(name: str = "walker", speed: float = SPEED) -> ActorTrack:
+    """Walks along x for four seconds."""
+    return track_of(motion_through(TIMES, [[speed * t, 2.0, 0.9] for t in TIMES], 0.0 * TIMES), name, SIZE)
+
+
+def people_of(*tracks: ActorTrack, seed: int = 0, **changes) -> Deformable:
+    """A part with 40 Gaussians for each track, and random deformations."""
+    rng, settings = np.random.default_rng(seed), DeformableSettings(nodes=NODES, **changes)
+    points = [rng.uniform(-0.5, 0.5, (40, 3)) * track.size for track in tracks]
+    colors = [rng.uniform(0.0, 1.0, (40, 3)) for _ in tracks]
+    part = Deformable.from_points(tracks, points, colors, settings, GaussianSettings())
+    with torch.no_grad():
+        lattice = part.shared["lattice"]
+        lattice += 0.1 * torch.from_numpy(rng.normal(size=lattice.shape)).float()
+    return part
+
+
+def in_box(part: Deformable, time: float) -> torch.Tensor:
+    return part.local(part.time_state(time)).means.detach()
+
+
+# ---- the lattice
+
+
+def points_and_owners(n: int = 20) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Points of two objects in boxes of different sizes: positions, owners (as numbers and one-hot), half sizes."""
+    generator = torch.Generator().manual_seed(0)
+    owner = torch.arange(n) % 2
+    reach = torch.tensor([[1.0, 0.5, 2.0], [0.4, 0.3, 0.9]]).double()
+    means = (2.0 * torch.rand(n, 3, generator=generator).double() - 1.0) * reach[owner]
+    return means, owner, torch.nn.functional.one_hot(owner, 2).double(), reach
+
+
+def test_a_lattice_reproduces_linear_deformations():
+    """Trilinear interpolation is exact for x -> A x + b, with its own A and b for each object and function."""
+    means, owner, owns, reach = points_and_owners()
+    generator = torch.Generator().manual_seed(1)
+    slopes, shifts = (torch.randn(2, 2, *s, generator=generator).double() for s in ((6, 3), (6,)))
+    axes = [torch.linspace(-1.0, 1.0, count).double() for count in NODES]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)[None] * reach[:, None, None, None]
+    linear = torch.einsum("akdc,axyzc->akxyzd", slopes, grid) + shifts[:, :, None, None, None]
+    basis = torch.randn(2, 2, generator=generator).double()
+    found = torch.cat(deformation(linear, basis, corners(means, owner, owns, reach, NODES)), dim=1)
+    own = torch.einsum("nkdc,nc->nkd", slopes[owner], means) + shifts[owner]
+    torch.testing.assert_close(found, (basis[owner][:, :, None] * own).sum(dim=1))
+
+
+def test_points_outside_the_box_move_with_its_surface():
+    _, _, _, reach = points_and_owners()
+    owner = torch.tensor([1, 1, 1])
+    means = torch.stack([reach[1], 3.0 * reach[1], torch.tensor([0.4, 9.0, 0.9]).double()])
+    coefficients = torch.randn(2, 1, *NODES, 6, generator=torch.Generator().manual_seed(2)).double()
+    owns = torch.nn.functional.one_hot(owner, 2).double()
+    moved = deformation(coefficients, torch.ones(2, 1).double(), corners(means, owner, owns, reach, NODES))
+    assert (moved.shifts == coefficients[1, 0, -1, -1, -1, :3]).all()
+
+
+def test_gradients_of_the_lattice_are_those_of_finite_differences():
+    means, owner, owns, reach = points_and_owners(6)
+    generator = torch.Generator().manual_seed(3)
+    inputs = [
+        torch.randn(2, 2, *NODES, 6, generator=generator).double(),
+        torch.randn(2, 2, generator=generator).double(),
+    ]
+    inputs = [value.requires_grad_() for value in (*inputs, means)]
+
+    def moved(coefficients, basis, points):
+        return tuple(deformation(coefficients, basis, corners(points, owner, owns, reach, NODES)))
+
+    assert torch.autograd.gradcheck(moved, inputs)
+
+
+def test_equal_nodes_are_smooth():
+    same = torch.ones(2, 3, *NODES, 6) * torch.arange(3.0)[:, None, None, None, None]
+    assert (roughness(same) == 0.0).all()
+    same[0, 1, 1, 1, 1, 0] += 1.0
+    assert roughness(same)[1] > 0.0 and (roughness(same)[[0, 2]] == 0.0).all()
+
+
+# ---- the part
+
+
+def test_without_displacements_it_is_a_rigid_actor():
+    tracks = walker(), walker("other", -2.0)
+    part = people_of(*tracks)
+    rigid = actors_of(*tracks, count=40, shaken=False)
+    with torch.no_grad():
+        part.shared["lattice"].zero_()
+        for name, values in rigid.params.items():
+            values.copy_(part.params[name])
+    for found, expected in zip(part.at(1.3).tensors.values(), rigid.at(1.3).tensors.values(), strict=True):
+        torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(part.velocities(1.3), rigid.velocities(1.3))
+
+
+def test_the_limbs_return_after_a_stride():
+    part = people_of(walker(), fourier=1)
+    cycle = STRIDE / SPEED
+    torch.testing.assert_close(in_box(part, 0.4 + cycle), in_box(part, 0.4), atol=1e-4, rtol=0.0)
+    assert (in_box(part, 0.4 + 0.5 * cycle) - in_box(part, 0.4)).norm(dim=1).median() > 0.05
+    first, last = (part.cycles(part.time_state(at)).detach() for at in (0.4, 0.4 + cycle))
+    assert float(last - first) == pytest.approx(1.0)
+
+
+def test_the_limbs_of_who_stands_change_with_time_alone():
+    still = people_of(walker(speed=0.0), fourier=1)
+    assert torch.equal(in_box(still, 0.3), in_box(still, 2.9))
+    gestures = people_of(walker(speed=0.0))
+    assert (in_box(gestures, 0.3) - in_box(gestures, 2.9)).norm(dim=1).median() > 0.05
+
+
+def test_a_longer_stride_and_a_correction_change_the_phase():
+    part = people_of(walker())
+    walked = SPEED * 2.25
+    with torch.no_grad():
+        part.shared["stride"].fill_(math.log(1.25))
+        part.shared["phase"].copy_(0.1 * torch.arange(9))
+    assert float(part.cycles(part.time_state(2.25)).detach()) == pytest.approx(
+        walked / (1.25 * STRIDE) + 0.45, abs=1e-4
+    )
+    far = ActorPlacement("walker", np.eye(4), walked=1000.0)
+    state = part.time_state(2.0)._replace(walked=torch.tensor([far.walked]))
+    assert float(part.cycles(state).detach()) == pytest.approx(1000.0 / (1.25 * STRIDE) + 0.8, abs=1e-3), (
+        "the last holds"
+    )
+
+
+def test_gaussians_turn_with_their_limb():
+    part = people_of(walker(), fourier=1)
+    with torch.no_grad():
+        part.shared["lattice"].zero_()
+        part.shared["lattice"][:, 0, ..., 4] = math.tan(0.15)  # 0.3 rad about the y axis at phase 0
+    state = part.time_state(0.0)
+    turned = rotation_matrix(torch.nn.functional.normalize(part.local(state).quats, dim=1)).detach()
+    assert turned[:, 0, 2].mean() == pytest.approx(math.sin(0.3), abs=1e-5)
+
+
+def test_velocities_include_those_of_limbs():
+    part, step = people_of(walker()), HALF_STEP
+    expected = (part.at(1.3 + step).means - part.at(1.3 - step).means) / (2.0 * step)
+    torch.testing.assert_close(part.velocities(1.3), expected.detach(), atol=1e-3, rtol=1e-3)
+    assert (part.velocities(1.3)[:, 0] - SPEED).abs().max() > 0.1
+
+
+def test_edited_actors_move_their_limbs_by_the_distance_that_they_walk():
+    part, pose = people_of(walker(), fourier=1), walker().motion.poses(np.array([1.0]))[0]
+    recorded = part.at(1.0).means.detach()
+    as_recorded = part.with_placements(1.0, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
+    torch.testing.assert_close(as_recorded, recorded, atol=1e-4, rtol=0.0)
+    later = part.with_placements(2.7, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
+    torch.testing.assert_close(later, recorded, atol=1e-4, rtol=0.0)
+    stride_on = part.with_placements(2.7, [ActorPlacement("walker", pose, walked=SPEED + STRIDE)]).means.detach()
+    torch.testing.assert_close(stride_on, recorded, atol=1e-3, rtol=0.0)
+    half_on = part.with_placements(1.0, [ActorPlacement("walker", pose, walked=SPEED + 0.5 * STRIDE)]).means.detach()
+    assert (half_on - recorded).norm(dim=1).median() > 0.05
+
+
+def test_a_placement_that_stands_has_no_velocity_and_one_that_walks_on_the_spot_only_that_of_its_limbs():
+    part, pose = people_of(walker(), fourier=1), np.eye(4)
+    standing = ActorPlacement("walker", pose, around=(pose, pose), walked=2.0, walked_around=(2.0, 2.0))
+    assert part.velocities_with_placements(1.0, [standing]).abs().max() < 1e-4
+    beside = (2.0 - HALF_STEP * SPEED, 2.0 + HALF_STEP * SPEED)
+    walking = ActorPlacement("walker", pose, around=(pose, pose), walked=2.0, walked_around=beside)
+    assert part.velocities_with_placements(1.0, [walking]).abs().max() > 0.1
+
+
+def test_penalties_grow_with_displacements_and_their_order():
+    part = people_of(walker())
+    field = DeformableSettings(nodes=NODES)
+    assert function_orders(field).tolist() == [1, 1, 4, 4, 9, 9, 1, 4, 9, 16]
+    sizes = []
+    for function in range(len(function_orders(field))):
+        with torch.no_grad():
+            part.shared["lattice"].zero_()
+            part.shared["lattice"][:, function] = 0.1
+        found = part.penalties()
+        assert float(found["lattice_roughness"]) == 0.0
+        sizes.append(float(found["lattice_size"]))
+    np.testing.assert_allclose(np.array(sizes) / sizes[0], function_orders(field), rtol=1e-5)
+
+
+def test_a_part_is_built_of_its_own_objects_and_survives_a_checkpoint():
+    tracks = {"car": ("actors",), "rider": ("deformable", "actors"), "walker": ("deformable",)}
+    records = [
+        actor_record(track_of(motion_through(TIMES, [[t, i, 0.9] for t in TIMES], 0.0 * TIMES), name, SIZE))
+        for i, name in enumerate(tracks)
+    ]
+    records = [type(r)(**{**vars(r), "parts": parts}) for r, parts in zip(records, tracks.values(), strict=True)]
+    init, settings = ModelInit(training_record_of(3), records, np.full(3, 0.5)), TrainSettings()
+    rigid = build_model(init, ("background", "actors"), "none", settings)
+    assert [track.id for track in rigid.parts[1].timeline.tracks] == ["car", "rider"]
+    parts = ("background", "actors", "deformable")
+    model = build_model(init, parts, "none", settings)
+    assert [[t.id for t in part.timeline.tracks] for part in model.parts[1:]] == [["car"], ["rider", "walker"]]
+    with torch.no_grad():
+        model.parts[2].shared["lattice"].normal_(0.0, 0.1, generator=torch.Generator().manual_seed(4))
+    again = rebuild_model(model.state_dict(), definitions(model), "none", settings)
+    for found, expected in zip(
+        again.gaussians_at(1.1).tensors.values(), model.gaussians_at(1.1).tensors.values(), strict=True
+    ):
+        assert torch.equal(found, expected)
+
+
+def test_a_swinging_leg_is_learned():
+    """From where its points are at 40 times; between them it swings on."""
+    track, settings = walker(), DeformableSettings(nodes=NODES, fourier=1, lr_lattice=0.01)
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-0.05, 0.05, -0.9], [0.05, 0.15, 0.0], (60, 3))
+    part = Deformable.from_points([track], [points], [np.full((60, 3), 0.5)], settings, GaussianSettings())
+
+    def truth(time: float) -> torch.Tensor:
+        angle = 0.5 * math.sin(2.0 * math.pi * SPEED * time / STRIDE)
+        return torch.from_numpy(points + np.array([1.0, 0.0, 0.0]) * -angle * points[:, 2:]).float()
+
+    optimizer = torch.optim.Adam([part.shared["lattice"]], lr=0.01)
+    times = rng.uniform(0.0, 4.0, 40)
+    for step in range(400):
+        optimizer.zero_grad()
+        time = times[step % len(times)]
+        (part.local(part.time_state(time)).means - truth(time)).square().sum().backward()
+        optimizer.step()
+    for time in (0.33, 1.71, 3.2):
+        off = (in_box(part, time) - truth(time)).norm(dim=1)
+        assert off.max() < 0.03 < 0.1 < (torch.from_numpy(points).float() - truth(1.71)).norm(dim=1).max()
