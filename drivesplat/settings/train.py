@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.deformable import FieldName, GaitSettings, LatticeSettings, NetworkSettings
 from drivesplat.settings.train_cameras import CameraPoseSettings, ExposureSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 
@@ -24,7 +25,6 @@ def _complete(parts: tuple[PartName, ...]) -> tuple[PartName, ...]:
     return parts
 
 
-Nodes = Annotated[int, Field(ge=2, le=64)]
 Parts = Annotated[
     tuple[PartName, ...],
     AfterValidator(_complete),
@@ -101,26 +101,13 @@ class ActorSettings(Settings):
 
 class DeformableSettings(ActorSettings):
     """The part `deformable`: people, animals and cyclists, each a set of Gaussians in the frame of its box that deform
-    with the distance walked and with time."""
+    with the distance walked and with time (docs/street.md)."""
 
-    harmonics: int = Field(3, ge=1, le=8)
-    """Number of multiples of the gait's phase in the deformation: a cosine and a sine each."""
-    stride: float = Field(0.83, gt=0, le=20)
-    """Initial length of a gait cycle, which is two steps, in heights of the box."""
-    nodes: tuple[Nodes, Nodes, Nodes] = (3, 8, 12)
-    """Nodes of the deformation's lattice along the length, width and height of the box."""
-    lr_lattice: float = Field(2e-3, gt=0)
-    """Learning rate of displacements (metres) and rotations (radians) at the nodes."""
-    lr_stride: float = Field(5e-4, gt=0)
-    """Learning rate of the logarithm of a cycle's length."""
-    lr_phase: float = Field(1e-3, gt=0)
-    """Learning rate of corrections of the phase (cycles)."""
-    size_weight: float = Field(0.01, ge=0)
-    """Loss weight of the mean squared displacements and rotations, times the square of the order of their function."""
-    smoothness_weight: float = Field(0.1, ge=0)
-    """Loss weight of the mean squared difference between neighbouring nodes."""
-    gait_weight: float = Field(0.01, ge=0)
-    """Loss weight of the mean squared corrections of the phase (cycles) and of a cycle's length."""
+    field: FieldName = "lattice"
+    """What deforms them."""
+    gait: GaitSettings = GaitSettings()
+    lattice: LatticeSettings = LatticeSettings()
+    network: NetworkSettings = NetworkSettings()
 
 
 class CoarseToFineSettings(Settings):

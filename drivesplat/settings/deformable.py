@@ -1,0 +1,55 @@
+"""Settings of the deformation of people, animals and cyclists."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from drivesplat.settings import Settings
+
+Nodes = Annotated[int, Field(ge=2, le=64)]
+
+
+class GaitSettings(Settings):
+    """The phase of a gait, which advances with the distance walked."""
+
+    stride: float = Field(0.83, gt=0, le=20)
+    """Initial length of a cycle, which is two steps, in heights of the box."""
+    harmonics: int = Field(3, ge=1, le=8)
+    """Number of multiples of the phase that deform the object, a cosine and a sine each."""
+    lr_stride: float = Field(5e-4, gt=0)
+    """Learning rate of the logarithm of a cycle's length."""
+    lr_phase: float = Field(1e-3, gt=0)
+    """Learning rate of corrections of the phase (cycles) along the path."""
+    weight: float = Field(0.01, ge=0)
+    """Loss weight of the mean square of both."""
+
+
+class LatticeSettings(Settings):
+    """field: lattice. Displacements and rotations at the nodes of a lattice in each box."""
+
+    nodes: tuple[Nodes, Nodes, Nodes] = (3, 8, 12)
+    """Nodes along the length, width and height of the box."""
+    learning_rate: float = Field(2e-3, gt=0)
+    """Learning rate of displacements (metres) and rotations (radians)."""
+    size_weight: float = Field(0.01, ge=0)
+    """Loss weight of their mean square, times the square of the multiple of the phase."""
+    smoothness_weight: float = Field(0.1, ge=0)
+    """Loss weight of the mean squared difference between neighbouring nodes."""
+
+
+class NetworkSettings(Settings):
+    """field: network. One network for all objects, with an embedding for each. Slow without a GPU."""
+
+    layers: int = Field(8, ge=1, le=16)
+    """Number of hidden layers."""
+    width: int = Field(256, ge=8, le=1024)
+    """Values of a hidden layer."""
+    frequencies: int = Field(10, ge=0, le=16)
+    """Frequencies of the encoding of places."""
+    embedding: int = Field(16, ge=1, le=256)
+    """Values of an object's embedding."""
+    learning_rate: float = Field(5e-4, gt=0)
+    """Learning rate of the network and the embeddings."""
+
+
+FieldName = Literal["lattice", "network"]
