@@ -26,7 +26,8 @@ ORIGIN = np.eye(4)[None]
 class EditedActor:
     """An actor of an edited drive: `id` is a track's or the name of a duplicate. It has the Gaussians of the track
     `source`, scaled by `scale` about the box centre to `size` (3,): length, width, height in metres, their
-    RGB colours mapped by `color_matrix` (3, 3; None: as trained). Unless `edited` it is as recorded."""
+    RGB colours mapped by `color_matrix` (3, 3; None: as trained), and a gait that is ahead by `phase` cycles. Unless
+    `edited` it is as recorded."""
 
     id: str
     source: str
@@ -36,6 +37,7 @@ class EditedActor:
     edited: bool
     path: ActorPath = field(repr=False)
     color_matrix: np.ndarray | None = None
+    phase: float = 0.0
 
     @classmethod
     def recorded(cls, id: str, category: str, size: np.ndarray, motion: Motion) -> "EditedActor":
@@ -196,4 +198,4 @@ def _copied(state: _EditState, actor: EditedActor, copy: Duplicate | Place, path
         raise _StepError(f"the name {copy.name!r} in 'as' is already used; names in use: {used}")
     if copy.name in state.other_ids:
         raise _StepError(f"the name {copy.name!r} in 'as' is the id of another track; choose another name")
-    return state.with_actors(replace(actor, id=copy.name, path=path, edited=True))
+    return state.with_actors(replace(actor, id=copy.name, path=path, edited=True, phase=actor.phase + copy.phase))

@@ -114,7 +114,7 @@ def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list
     after."""
     result: list[list[ActorPlacement]] = [[] for _ in seconds]
     for actor in actors:
-        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix)
+        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix, phase=actor.phase)
         times = [seconds + step for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
         poses, walked = [actor.poses(at) for at in times], [actor.walked(at) for at in times]
         for number in np.flatnonzero(actor.present(seconds)):

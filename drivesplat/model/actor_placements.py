@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -27,12 +27,18 @@ def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence
     return ObjectPoses(quats, translations, sizes, presence)
 
 
-def with_walked(state: TimeState, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> TimeState:
-    """The time state with the lengths of the paths that placements state."""
+def with_walked(
+    state: TimeState, ids: Sequence[str], placements: Sequence[ActorPlacement], cycles: Float[Tensor, " a"]
+) -> TimeState:
+    """The time state with the lengths of the paths of placements. A scaled object takes scaled steps; a phase is a path
+    of as many `cycles` (metres each)."""
     walked = state.walked.clone()
     for placement in placements:
+        i = ids.index(placement.source)
         if placement.walked is not None:
-            walked[ids.index(placement.source)] = placement.walked
+            walked[i] = placement.walked / placement.scale
+        if placement.phase:
+            walked[i] += placement.phase * cycles[i]
     return state._replace(walked=walked)
 
 

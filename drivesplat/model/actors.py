@@ -143,7 +143,7 @@ class Actors(Part):
         poses, sets = self.poses(state), []
         for chosen, rows in self._sets(placements):  # few: transforming all actors for each copy costs little
             own = [placements[i] for i in chosen]
-            there = with_walked(state, known, own), with_placements(poses, known, own)
+            there = self._state_with(state, own), with_placements(poses, known, own)
             sets.append(self._recolored(self.placed(*there), own)[rows])
         return concatenate(sets)
 
@@ -154,7 +154,7 @@ class Actors(Part):
             beside = []
             for number, state in enumerate(recorded):
                 own = [placements[i].beside(number) for i in chosen]
-                beside.append((with_walked(state, known, own), with_placements(self.poses(state), known, own)))
+                beside.append((self._state_with(state, own), with_placements(self.poses(state), known, own)))
             sets.append(self._velocities(*beside)[rows])
         return torch.cat(sets)
 
@@ -194,6 +194,15 @@ class Actors(Part):
                 matrix = torch.from_numpy(placement.color_matrix).to(gaussians.sh0)
                 gaussians = recolored(gaussians, matrix, self.of_track(placement.source))
         return gaussians
+
+    def _state_with(self, state: TimeState, placements: Sequence[ActorPlacement]) -> TimeState:
+        """The time state with the paths of placements."""
+        return with_walked(state, self._known, placements, self.cycle_lengths)
+
+    @property
+    def cycle_lengths(self) -> Float[Tensor, " a"]:
+        """The length of a gait cycle of each actor in metres; 0 without limbs."""
+        return self._reach.new_zeros(len(self.timeline.tracks))
 
     def placed(self, state: TimeState, poses: ObjectPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""

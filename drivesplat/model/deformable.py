@@ -56,6 +56,10 @@ class Deformable(Actors):
         heights = torch.tensor([float(track.size[2]) for track in tracks])
         self.register_buffer("_strides", settings.gait.stride * heights, persistent=False)
 
+    @property
+    def cycle_lengths(self) -> Float[Tensor, " a"]:
+        return self._strides * torch.exp(self.shared["stride"])
+
     def cycles(self, state: TimeState) -> Float[Tensor, " a"]:
         """The phase of each actor's gait at a time state, in cycles."""
         before, here, after = self._knots  # (m,) each
@@ -63,7 +67,7 @@ class Deformable(Actors):
         hats = torch.minimum((x - before) / (here - before), (after - x) / (after - here)).clamp(0.0, 1.0)
         weights = hats * self._annotated
         corrections = (weights @ self.shared["phase"]) / weights.sum(dim=1).clamp(min=1e-6)
-        return state.walked / (self._strides * torch.exp(self.shared["stride"])) + corrections
+        return state.walked / self.cycle_lengths + corrections
 
     def basis(self, state: TimeState) -> Float[Tensor, "a k"]:
         """The k functions that deform each actor at a time state: cosine and sine of the phase and of its multiples,

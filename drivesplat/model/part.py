@@ -29,7 +29,7 @@ class ActorPlacement:
     `color_matrix` (3, 3) (None: as trained). `around` are the poses HALF_STEP seconds before and after an edited one,
     which give velocities; None: the object stands. `walked` is the length (metres) of the object's path until then,
     which the limbs of deformable objects follow, and `walked_around` HALF_STEP seconds before and after; None: as
-    recorded at the time."""
+    recorded at the time. Their gait is ahead by `phase` cycles."""
 
     source: str
     object_to_world: np.ndarray | None = None
@@ -38,6 +38,7 @@ class ActorPlacement:
     around: tuple[np.ndarray, np.ndarray] | None = None
     walked: float | None = None
     walked_around: tuple[float, float] | None = None
+    phase: float = 0.0
 
     def beside(self, number: int) -> "ActorPlacement":
         """The placement HALF_STEP seconds before (0) or after (1)."""

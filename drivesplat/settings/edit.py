@@ -130,6 +130,8 @@ class Duplicate(Settings):
     """Offset to the left of the original (metres)."""
     delay: float = Field(0.0, ge=-60, le=60)
     """Delay of the copy (seconds)."""
+    phase: float = Field(0.0, ge=-1, le=1)
+    """Cycles by which the gait of a deformable copy is ahead: 0.5, and the other foot is in front."""
 
 
 Waypoint = tuple[
@@ -151,6 +153,8 @@ class Place(Settings):
     """Points of its path, in time order. One point: it stands there, facing as the ego vehicle did."""
     yaw: float = Field(0.0, ge=-360, le=360)
     """Rotation to its left about its vertical axis (degrees)."""
+    phase: float = Field(0.0, ge=-1, le=1)
+    """Cycles by which the gait of a deformable copy is ahead."""
 
     @model_validator(mode="after")
     def _times_increase(self) -> "Place":

@@ -189,6 +189,20 @@ def test_edited_actors_move_their_limbs_by_the_distance_that_they_walk():
     assert (half_on - recorded).norm(dim=1).median() > 0.05
 
 
+def test_copies_have_their_own_phase_and_scaled_people_take_scaled_steps():
+    part, pose = people_of(walker(), fourier=1), np.eye(4)
+
+    def at(**placement) -> torch.Tensor:
+        return part.with_placements(1.0, [ActorPlacement("walker", pose, **placement)]).means.detach()
+
+    torch.testing.assert_close(at(walked=1.0, phase=0.25), at(walked=1.0 + 0.25 * STRIDE), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(at(walked=2.0, scale=2.0), 2.0 * at(walked=1.0), atol=1e-5, rtol=0.0)
+    copies = [ActorPlacement("walker", pose, walked=1.0), ActorPlacement("walker", pose, walked=1.0, phase=0.5)]
+    first, second = part.with_placements(1.0, copies).means.detach().split(40)
+    torch.testing.assert_close(first, at(walked=1.0))
+    torch.testing.assert_close(second, at(walked=1.0, phase=0.5))
+
+
 def test_a_placement_that_stands_has_no_velocity_and_one_that_walks_on_the_spot_only_that_of_its_limbs():
     part, pose = people_of(walker(), fourier=1), np.eye(4)
     standing = ActorPlacement("walker", pose, around=(pose, pose), walked=2.0, walked_around=(2.0, 2.0))
