@@ -1,6 +1,7 @@
 """The static world: one set of Gaussians, fixed in world coordinates."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -33,9 +34,10 @@ class Background(Part):
         extent: float,
         classes: int = 0,
         echo: tuple[float, float] | None = None,
+        offsets: bool = False,
     ) -> "Background":
         """Initialised from seed points: `positions` (n, 3) metres and `colors` (n, 3) in [0, 1]; see `init_params`."""
-        return cls(init_params(positions, colors, settings, classes, echo), settings, extent)
+        return cls(init_params(positions, colors, settings, classes, echo, offsets), settings, extent)
 
     def time_state(self, time: float) -> Sequence[Tensor]:
         return ()
@@ -49,6 +51,17 @@ class Background(Part):
             torch.sigmoid(p["opacities"]),
             p["sh0"],
             p["shN"],
+        )
+
+    def seen_by_lidar(self, gaussians: Gaussians) -> Gaussians:
+        p = self.params
+        if "lidar_means" not in p:
+            return gaussians
+        return replace(
+            gaussians,
+            means=p["means"] + p["lidar_means"],
+            scales=torch.exp(p["scales"] + p["lidar_scales"]),
+            opacities=torch.sigmoid(p["opacities"] + p["lidar_opacities"]),
         )
 
     def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:

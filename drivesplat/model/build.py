@@ -114,7 +114,15 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
     record = init.record
     kept = random_subset(len(record.points), settings.cap_max)
     positions, colors = record.points[kept], record.points_rgb[kept] / 255.0
-    return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes, init.echo)
+    return Background.from_points(
+        positions,
+        colors,
+        settings.gaussians,
+        record.scene_scale,
+        init.classes,
+        init.echo,
+        init.echo is not None and settings.scans.own,
+    )
 
 
 def _init_objects(

@@ -2,7 +2,8 @@
 
 `means` (n, 3) metres, `scales` (n, 3) log metres, `quats` (n, 4) w, x, y, z, `opacities` (n,) logits, `sh0` and `shN`
 spherical harmonics of degree 0 and of the degrees above; with semantic classes also `classes` (n, c) logits; with LiDAR
-also `echoes` (n, 4, 2), see `drivesplat.model.gaussians.Gaussians`, their directions in the frame of the Gaussians.
+also `echoes` (n, 4, 2), see `drivesplat.model.gaussians.Gaussians`, their directions in the frame of the Gaussians, and
+where a LiDAR sees Gaussians elsewhere than cameras do, OFFSETS of `means`, `scales` and `opacities`.
 """
 
 import math
@@ -15,6 +16,9 @@ from torch import Tensor, nn
 from drivesplat.kernels.spherical_harmonics import SH_C0
 from drivesplat.settings.train import GaussianSettings
 
+OFFSETS = {"means": "lidar_means", "scales": "lidar_scales", "opacities": "lidar_opacities"}
+"""The parameters that a LiDAR adds to others, by the names of these."""
+
 
 def init_params(
     positions: np.ndarray,
@@ -22,14 +26,16 @@ def init_params(
     settings: GaussianSettings,
     classes: int = 0,
     echo: tuple[float, float] | None = None,
+    offsets: bool = False,
 ) -> dict[str, Tensor]:
     """Parameters of Gaussians initialised at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1], equal logits for
-    all `classes`, and the logits `echo` of intensity and return (None: no LiDAR)."""
+    all `classes`, the logits `echo` of intensity and return (None: no LiDAR), and OFFSETS of 0 if wanted."""
     neighbours = min(4, len(positions))
     distances = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0].reshape(len(positions), -1)[:, 1:]
     spacing = np.sqrt(np.mean(distances**2, axis=1)) if neighbours > 1 else np.ones(len(positions))
     scales = torch.from_numpy(np.log(np.maximum(spacing * settings.init_scale, 1e-4))).float()
     count = len(positions)
+    shapes = {"lidar_means": (3,), "lidar_scales": (3,), "lidar_opacities": ()} if offsets else {}
     return {
         "means": torch.from_numpy(np.asarray(positions)).float(),
         "scales": scales[:, None].repeat(1, 3),
@@ -39,6 +45,7 @@ def init_params(
         "shN": torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3),
         **({"classes": torch.zeros(count, classes)} if classes else {}),
         **({} if echo is None else {"echoes": _echoes(count, echo)}),
+        **{name: torch.zeros(count, *shape) for name, shape in shapes.items()},
     }
 
 
@@ -62,4 +69,5 @@ def learning_rates(settings: GaussianSettings, extent: float) -> dict[str, float
     """The initial learning rate of each parameter of Gaussians that spread over `extent` metres."""
     rates = {"means": settings.lr_means * extent, "scales": settings.lr_scales, "quats": settings.lr_quats}
     rates |= {"opacities": settings.lr_opacities, "sh0": settings.lr_sh0, "shN": settings.lr_shN}
-    return {**rates, "classes": settings.lr_classes, "echoes": settings.lr_echoes}
+    of_lidar = {offset: rates[name] for name, offset in OFFSETS.items()}
+    return {**rates, **of_lidar, "classes": settings.lr_classes, "echoes": settings.lr_echoes}

@@ -121,6 +121,10 @@ class Part(nn.Module, ABC):
         for a part that was not trained with LiDAR."""
         return None
 
+    def seen_by_lidar(self, gaussians: Gaussians) -> Gaussians:
+        """Its Gaussians where a LiDAR sees them, by those that cameras see (`at`)."""
+        return gaussians
+
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one
         object are appended as extra rows."""

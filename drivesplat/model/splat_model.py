@@ -74,9 +74,8 @@ class SplatModel(nn.Module):
         found = []
         for part in self.parts:
             velocities = part.velocities(time) if with_velocities else None
-            found.append(
-                replace(part.at(time), velocities=velocities, echoes=part.echoes(time) if with_echoes else None)
-            )
+            shown = part.seen_by_lidar(part.at(time)) if with_echoes else part.at(time)
+            found.append(replace(shown, velocities=velocities, echoes=part.echoes(time) if with_echoes else None))
         return concatenate(found)
 
     def time_states(self, time: float) -> list[Sequence[Tensor]] | None:
@@ -100,7 +99,9 @@ class SplatModel(nn.Module):
         for part in self.parts:
             velocities = part.velocities_with_placements(time, placements) if with_velocities else None
             echoes = part.echoes_with_placements(time, placements) if with_echoes else None
-            found.append(replace(part.with_placements(time, placements), velocities=velocities, echoes=echoes))
+            shown = part.with_placements(time, placements)
+            shown = part.seen_by_lidar(shown) if with_echoes else shown
+            found.append(replace(shown, velocities=velocities, echoes=echoes))
         return concatenate(found)
 
     def placement_of_rows(self, placements: Sequence[ActorPlacement]) -> Int[Tensor, " m"]:

@@ -16,9 +16,13 @@ class ScanTrainingSettings(Settings):
     share: float = Field(0.0, ge=0, le=1)
     """Fraction of the iterations that fit a scan in place of an image. 0 = LiDAR is not rendered. Without cameras every
     iteration fits a scan where it is above 0."""
-    geometry: bool = True
-    """Scans also move and shape Gaussians. false = they fit intensities and returns alone, and images are rendered as
-    without LiDAR."""
+    geometry: float = Field(1.0, ge=0, le=1)
+    """Factor of the gradient by which scans move and shape Gaussians. 0 = they fit intensities and returns alone, and
+    images are rendered as without LiDAR."""
+    own: bool = False
+    """Background Gaussians have offsets of position, size and opacity for LiDAR, on which `geometry` has no effect."""
+    own_weight: float = Field(0.01, ge=0)
+    """Loss weight of the mean square of these offsets (metres, logarithms and logits)."""
     range_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute error of ranges (metres), without the worst 5 % of the rays."""
     intensity_weight: float = Field(1.0, ge=0)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drivesplat.lidar.sweeps import thin
+from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
@@ -125,7 +126,13 @@ def scan_terms(
         terms["scan_intensity"] = weights.intensity_weight * (errors * returned).sum() / count
     if picture.alpha_before is not None:
         terms["scan_sight"] = weights.sight_weight * (picture.alpha_before * returned).sum() / count
-    return {**terms, **regularization(picture.gaussians, model, settings)}
+    return {**terms, **_offsets(model, weights.own_weight), **regularization(picture.gaussians, model, settings)}
+
+
+def _offsets(model: SplatModel, weight: float) -> dict[str, Float[Tensor, ""]]:
+    """The weighted size of what LiDAR adds to parameters of Gaussians, if anything."""
+    own = [part.params[name] for part in model.parts for name in OFFSETS.values() if name in part.params]
+    return {"scan_own": weight * torch.stack([values.square().mean() for values in own]).sum()} if own else {}
 
 
 def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan: TrainingScan) -> Float[Tensor, ""]:

@@ -1,14 +1,13 @@
 """The state of a training and its iteration: render one image, compare it, take a step."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
@@ -21,6 +20,9 @@ from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import DeviceSchedule, ModelOptimizers, make_optimizers, set_learning_rates
 from drivesplat.training.scans import TrainingScan, fits_scan, scan_index, scan_terms, scans_before
 from drivesplat.training.views import TrainingView
+
+GEOMETRY = ("means", "quats", "scales", "opacities")
+"""The parameters of Gaussians that images and scans share."""
 
 
 @dataclass
@@ -134,33 +136,37 @@ class Trainer:
         self.model.zero_grad()
         with stage("render"):
             before = (scan.range - settings.sight_margin).clamp(min=0.0) if settings.sight_weight else None
-            picture = self.model.scan(scan.view, gaussians=self._scanned(scan.view.time), before=before)
+            picture = self.model.scan(scan.view, before=before)
         with stage("loss"):
             terms = scan_terms(picture, scan, self.model, self.settings)
             if not self.images.views:
                 terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
-        return self._follow(loss, terms, step, rates)
+        return self._follow(loss, terms, step, rates, settings.geometry)
 
-    def _scanned(self, time: float) -> Gaussians:
-        """The model's Gaussians for a LiDAR; their geometry without gradient where scans must not change it."""
-        gaussians = self.model.gaussians_at(time, with_velocities=True, with_echoes=True)
-        if self.settings.scans.geometry:
-            return gaussians
-        fixed = ("means", "quats", "scales", "opacities")
-        return replace(gaussians, **{name: gaussians.tensors[name].detach() for name in fixed})
-
-    def _follow(self, loss: Tensor, terms: Terms, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
-        """The step down the gradient of a loss; returns its terms without gradients."""
+    def _follow(
+        self, loss: Tensor, terms: Terms, step: int | Tensor, rates: Mapping[str, Tensor] | None, geometry: float = 1.0
+    ) -> Terms:
+        """The step down the gradient of a loss, whose gradient for the geometry is multiplied by a factor; returns its
+        terms without gradients."""
         stage = self.clock.stage
         with stage("backward"):
             loss.backward()
+            if geometry != 1.0:
+                self._scale_gradients(geometry)
         with stage("checks"):
             losses = {f"loss {name}": value for name, value in terms.items()}
             self.guard.watch(step, {**losses, **self._gradient_norms()})
         with stage("optimizer"):
             self.optimizers.step(rates)
         return {name: value.detach() for name, value in terms.items()}
+
+    def _scale_gradients(self, factor: float) -> None:
+        """Multiplies the gradients of all parameters that images show; at 0 there are none."""
+        for part in self.model.parts:
+            shown = [part.params[name] for name in GEOMETRY] + list(part.shared.values())
+            for parameter in (parameter for parameter in shown if parameter.grad is not None):
+                parameter.grad = parameter.grad.mul_(factor) if factor else None
 
     @property
     def _image_step(self) -> int:

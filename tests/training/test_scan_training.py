@@ -170,7 +170,7 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
 
 
 def test_scans_leave_the_geometry_alone_where_they_are_told_to():
-    settings = settings_of(scans=ScanTrainingSettings(share=0.5, geometry=False))
+    settings = settings_of(scans=ScanTrainingSettings(share=0.5, geometry=0.0))
     scans = load_scans([scan_of_a_wall()], settings.scans, CPU)
     model = with_echoes(settings)
     trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=scans)
