@@ -103,8 +103,10 @@ def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
     return rng.uniform([-3, -1.5, 3], [3, 1.5, 6], (count, 3)), rng.uniform(0.3, 0.7, (count, 3))
 
 
-def untrained(settings: TrainSettings, sky: bool = False, echo: tuple[float, float] | None = None) -> SplatModel:
-    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, echo=echo)
+def untrained(
+    settings: TrainSettings, sky: bool = False, echo: tuple[float, float] | None = None, offsets: bool = False
+) -> SplatModel:
+    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, echo=echo, offsets=offsets)
     return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
 
 

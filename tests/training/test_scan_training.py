@@ -21,7 +21,8 @@ from helpers.trainings import (
 )
 from pydantic import ValidationError
 
-from drivesplat.model.build import gaussian_cap
+from drivesplat.model.build import definitions, gaussian_cap, rebuild_model
+from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanPicture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan
@@ -137,9 +138,9 @@ def nothing_met(scan) -> torch.Tensor:
     return torch.zeros_like(scan.range)
 
 
-def with_echoes(settings: TrainSettings) -> SplatModel:
+def with_echoes(settings: TrainSettings, offsets: bool = False) -> SplatModel:
     """The untrained model of `untrained`, with echoes."""
-    return untrained(settings, echo=initial_echo([scan_of_a_wall()]))
+    return untrained(settings, echo=initial_echo([scan_of_a_wall()]), offsets=offsets)
 
 
 def test_initial_echoes_are_the_recorded_intensity_and_a_likely_return():
@@ -169,10 +170,11 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
     assert picture.returned[scans[1].returned].median() > 0.7 > 0.5 > picture.returned[~scans[1].returned].median()
 
 
-def test_scans_leave_the_geometry_alone_where_they_are_told_to():
-    settings = settings_of(scans=ScanTrainingSettings(share=0.5, geometry=0.0))
+@pytest.mark.parametrize("own", [False, True])
+def test_scans_leave_the_geometry_alone_where_they_are_told_to(own):
+    settings = settings_of(scans=ScanTrainingSettings(share=0.5, geometry=0.0, own=own))
     scans = load_scans([scan_of_a_wall()], settings.scans, CPU)
-    model = with_echoes(settings)
+    model = with_echoes(settings, offsets=own)
     trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=scans)
     before = {name: value.detach().clone() for name, value in model.parts[0].params.items()}
     trainer.step = 1
@@ -180,7 +182,50 @@ def test_scans_leave_the_geometry_alone_where_they_are_told_to():
     terms, picture, view = trainer.fit_one(with_picture=False)
     assert picture is None and view is None and "scan_range" in terms
     changed = {name for name, value in model.parts[0].params.items() if not torch.equal(value, before[name])}
-    assert changed == {"echoes"}
+    assert changed == {"echoes", *(OFFSETS.values() if own else ())}
+
+
+def test_a_factor_scales_the_gradients_of_what_images_show():
+    settings = settings_of(scans=ScanTrainingSettings(share=0.5, own=True))
+    model = with_echoes(settings, offsets=True)
+    trainer = Trainer.begin(model, [], settings, 0, CPU, scans=load_scans([scan_of_a_wall()], settings.scans, CPU))
+    shown = {"means", "quats", "scales", "opacities"}
+    for factor in (0.25, 0.0):
+        for parameter in model.parts[0].params.values():
+            parameter.grad = torch.ones_like(parameter)
+        trainer._scale_gradients(factor)
+        for name, parameter in model.parts[0].params.items():
+            if name in shown and not factor:
+                assert parameter.grad is None, "a step of Adam would move it on"
+            else:
+                assert (parameter.grad == (factor if name in shown else 1.0)).all(), name
+
+
+def test_cameras_do_not_see_what_lidar_sees_elsewhere():
+    """Offsets of all background Gaussians by 0.5 m along the rays: the wall is farther for the LiDAR alone."""
+    settings = settings_of(scans=ScanTrainingSettings(share=0.5, own=True), antialiased=False)
+    model, (scan,) = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
+    (view, *_) = recorded_views(1)
+    image, range_before = model.render(view.view).image, model.scan(scan.view).range
+    with torch.no_grad():
+        model.parts[0].params["lidar_means"][:, 2] = 0.5
+    assert torch.equal(model.render(view.view).image, image)
+    met = range_before > 1.0
+    assert 0.3 < (model.scan(scan.view).range - range_before)[met].median() < 0.7
+    with torch.no_grad():
+        model.parts[0].params["lidar_opacities"].fill_(-20.0)
+    assert model.scan(scan.view).alpha.max() < 1e-3 and torch.equal(model.render(view.view).image, image)
+
+
+def test_offsets_shrink_by_their_weight_and_survive_a_checkpoint():
+    settings = settings_of(scans=ScanTrainingSettings(share=0.5, own=True, own_weight=2.0))
+    model, (scan,) = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
+    with torch.no_grad():
+        model.parts[0].params["lidar_scales"].fill_(-0.3)
+    terms = scan_terms(model.scan(scan.view), scan, model, settings)
+    assert float(terms["scan_own"].detach()) == pytest.approx(2.0 * 0.09)
+    again = rebuild_model(model.state_dict(), definitions(model), "none", settings)
+    assert torch.equal(again.scan(scan.view).range, model.scan(scan.view).range)
 
 
 def test_an_iteration_whose_picture_is_wanted_fits_an_image():
