@@ -38,6 +38,9 @@ class Actors(Part):
 
     name = "actors"
     moves = True
+    _per_annotation: tuple[str, ...] = ("translation", "yaw")
+    _per_track: tuple[str, ...] = ()
+    """Entries of `shared` with a row for each annotation, and those with a row for each track."""
 
     def __init__(
         self,
@@ -247,6 +250,19 @@ class Actors(Part):
     @torch.no_grad()
     def confine(self) -> None:
         self.fade((self.params["means"].abs() > of_owners(self._reach, self._owns)).any(dim=1))
+
+    @torch.no_grad()
+    def broken_tracks(self) -> list[str]:
+        rows = torch.zeros_like(self.params["opacities"], dtype=torch.bool)
+        for values in self.params.values():
+            rows |= ~torch.isfinite(values).flatten(1).all(dim=1) if values.dim() > 1 else ~torch.isfinite(values)
+        broken = {int(i) for i in self.params["owner"][rows].unique()}
+        for i, own in enumerate(self.timeline.owned):
+            of_track = [self.shared[name][own] for name in self._per_annotation]
+            of_track += [self.shared[name][i] for name in self._per_track]
+            if not all(bool(torch.isfinite(values).all()) for values in of_track):
+                broken.add(i)
+        return [self.timeline.tracks[i].id for i in sorted(broken)]
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         known = self._known

@@ -37,6 +37,7 @@ class Deformable(Actors):
     """
 
     name = "deformable"
+    _per_annotation = ("translation", "yaw", "phase")
 
     def __init__(
         self,
@@ -49,6 +50,7 @@ class Deformable(Actors):
         self._gait, self._field = settings.gait, field_of(settings)
         initial = self._field.initial(len(tracks))
         self._field_names = tuple(initial)
+        self._per_track = ("stride", *(name for name in ("lattice", "embedding") if name in initial))
         gait = {"stride": torch.zeros(len(tracks)), "phase": torch.zeros(len(self.shared["yaw"]))}
         self.shared.update(make_parameters({**gait, **initial}))
         walked = [track.motion.walked(track.motion.times) for track in tracks]

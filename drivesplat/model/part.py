@@ -176,6 +176,10 @@ class Part(nn.Module, ABC):
         """The mask of a track's rows; None where this part does not know the track as an object."""
         return None
 
+    def broken_tracks(self) -> list[str]:
+        """The ids of tracks with parameters that are not finite."""
+        return []
+
     def __len__(self) -> int:
         """The number of its Gaussians."""
         return self.row_count - self.preallocated

@@ -3,7 +3,7 @@
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
@@ -42,8 +42,9 @@ class FiniteGuard:
         first = self._first[names]
         torch.minimum(first, torch.where(finite, NEVER, step), out=first)
 
-    def check(self, checkpoint: str) -> None:
-        """Raises TrainingError naming the earliest iteration and its terms where one was not finite."""
+    def check(self, checkpoint: str, tracks: Callable[[], list[str]] = list) -> None:
+        """Raises TrainingError naming the earliest iteration and its terms where one was not finite, and the `tracks`
+        whose parameters are not finite since."""
         found = [
             (step, name)
             for names, first in self._first.items()
@@ -52,8 +53,10 @@ class FiniteGuard:
         step = min((step for step, _ in found), default=NEVER)
         if step < NEVER:
             names = ", ".join(name for at, name in found if at == step)
+            broken = tracks()
+            where = f" (tracks {', '.join(broken)})" if broken else ""
             raise TrainingError(
-                f"iteration {step + 1}: {names} is not finite; the last good checkpoint is kept ({checkpoint}); "
+                f"iteration {step + 1}: {names} is not finite{where}; the last good checkpoint is kept ({checkpoint}); "
                 "lower the learning rates (train.gaussians.lr_*) or raise train.mcmc.min_opacity"
             )
 

@@ -131,7 +131,8 @@ class TrainingRun:
 
     def check(self) -> None:
         """Raises TrainingError where something was not finite, or no Gaussian is left."""
-        self.trainer.guard.check(str(self.folders.state))
+        parts = self.trainer.model.parts
+        self.trainer.guard.check(str(self.folders.state), lambda: [id for part in parts for id in part.broken_tracks()])
         if not any(densifier.any_alive() for densifier in self.trainer.densifiers):
             raise TrainingError(
                 f"iteration {self.trainer.step + 1}: no Gaussian is left; "

@@ -249,6 +249,18 @@ def test_a_part_is_built_of_its_own_objects_and_survives_a_checkpoint():
         assert torch.equal(found, expected)
 
 
+@pytest.mark.parametrize(
+    ("owner", "name", "row"),
+    [("params", "means", 45), ("shared", "lattice", 1), ("shared", "stride", 1), ("shared", "phase", 12)],
+)
+def test_tracks_with_a_value_that_is_not_finite_are_named(owner, name, row):
+    part = people_of(walker("first"), walker("second"))
+    assert part.broken_tracks() == []
+    with torch.no_grad():
+        getattr(part, owner)[name][row] = math.nan
+    assert part.broken_tracks() == ["second"]
+
+
 def test_a_network_deforms_nothing_at_first_and_each_object_in_its_own_way_later():
     network = NetworkSettings(layers=2, width=32, frequencies=2)
     part = people_of(walker(), walker("other"), field="network", network=network)

@@ -639,8 +639,10 @@ def test_the_guard_keeps_apart_iterations_that_watch_different_terms():
     guard = FiniteGuard(CPU)
     guard.watch(3, {"loss l1": torch.tensor(1.0), "loss sky_alpha": torch.tensor(math.nan)})
     guard.watch(2, {"loss l1": torch.tensor(math.nan)})
-    with pytest.raises(TrainingError, match="iteration 3: loss l1 is not finite"):
+    with pytest.raises(TrainingError, match="iteration 3: loss l1 is not finite; "):
         guard.check("state.npz")
+    with pytest.raises(TrainingError, match=r"iteration 3: loss l1 is not finite \(tracks a, b\); "):
+        guard.check("state.npz", lambda: ["a", "b"])
 
 
 @pytest.mark.parametrize("log_every", [1, 50])
