@@ -24,8 +24,9 @@ from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
+from drivesplat.model.track_penalties import track_penalties
 from drivesplat.scene.motion import HALF_STEP, Motion
-from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings
+from drivesplat.settings.train import ActorSettings, GaussianSettings
 
 
 class Actors(Part):
@@ -288,16 +289,3 @@ class Actors(Part):
             poses[:, :3, 3] += shifts[own]
             motions.append(replace(track.motion, object_to_world=poses, turns=turns[own]))
         return motions
-
-
-def track_penalties(
-    translation: Float[Tensor, "m 3"], yaw: Float[Tensor, " m"], neighbours: Int[Tensor, "q 3"], settings: TrackSettings
-) -> dict[str, Float[Tensor, ""]]:
-    """The penalties of corrections: their mean square, and that of their second differences along the tracks, both in
-    units of the expected annotation error. `neighbours` are all triples of consecutive annotations."""
-    off = torch.cat([translation / settings.sigma_translation, yaw[:, None] / settings.sigma_yaw], dim=1)
-    penalties = {"track_size": settings.size_weight * off.square().sum(dim=1).mean()}
-    if len(neighbours):
-        before, here, after = off[neighbours].unbind(dim=1)
-        penalties["track_bend"] = settings.bend_weight * (before - 2.0 * here + after).square().sum(dim=1).mean()
-    return penalties

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.placement import ObjectPoses
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
-from drivesplat.model.actors import Actors, track_penalties
+from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.track_penalties import track_penalties
 from drivesplat.settings.train import ActorSettings, DefaultSettings, GaussianSettings, McmcSettings, TrackSettings
 from drivesplat.training.optimizers import make_optimizers
 
