@@ -133,7 +133,7 @@ def _init_objects(
     if not actors:
         return None
     own: ActorSettings = getattr(settings, kind.name)
-    tracks = [ActorTrack(actor.id, actor.size, actor.motion) for actor in actors]
+    tracks = [ActorTrack(actor.id, actor.size, actor.motion, actor.object_class) for actor in actors]
     limits = [actor_cap(actor, own, settings.pixels_per_gaussian) for actor in actors]
     counts = [len(actor.points) for actor in actors]
     shares = split_cap(list(map(min, counts, limits)), own.cap_max)

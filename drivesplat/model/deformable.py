@@ -55,8 +55,8 @@ class Deformable(Actors):
         self.shared.update(make_parameters({**gait, **initial}))
         walked = [track.motion.walked(track.motion.times) for track in tracks]
         self.register_buffer("_knots", torch.from_numpy(hat_functions(walked)).float(), persistent=False)
-        heights = torch.tensor([float(track.size[2]) for track in tracks])
-        self.register_buffer("_strides", settings.gait.stride * heights, persistent=False)
+        strides = [settings.gait.stride_of(track.object_class) * float(track.size[2]) for track in tracks]
+        self.register_buffer("_strides", torch.tensor(strides), persistent=False)
 
     @property
     def cycle_lengths(self) -> Float[Tensor, " a"]:

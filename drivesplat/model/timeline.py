@@ -20,11 +20,13 @@ cache 100 MB."""
 
 @dataclass(frozen=True)
 class ActorTrack:
-    """The track that owns a set of Gaussians: `size` (3,) length, width, height in metres, and the annotated motion."""
+    """The track that owns a set of Gaussians: `size` (3,) length, width, height in metres, the annotated motion, and
+    the class, an `ObjectClass`."""
 
     id: str
     size: Float[np.ndarray, "3"]
     motion: Motion
+    object_class: str = "vehicle"
 
 
 class TimeState(NamedTuple):

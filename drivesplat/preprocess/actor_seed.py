@@ -159,4 +159,5 @@ class Seed:
             lidar_points=self.lidar,
             pixels=self.pixels,
             parts=self._parts,
+            object_class=str(track.object_class.value),
         )

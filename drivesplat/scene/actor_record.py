@@ -23,7 +23,8 @@ class ActorRecord:
     in seconds since the scene's first image, `points` in the object's frame (metres) and their colours.
 
     The first `lidar_points` points are LiDAR returns. `pixels` is the number of pixels that show the actor, over all
-    training images at training size. `parts` names the parts of a model that can represent the actor, the best first.
+    training images at training size. `parts` names the parts of a model that can represent the actor, the best first;
+    `object_class` is an `ObjectClass`.
     """
 
     id: str
@@ -35,6 +36,7 @@ class ActorRecord:
     lidar_points: int
     pixels: int
     parts: tuple[str, ...] = ("actors",)
+    object_class: str = "vehicle"
 
     def part_in(self, parts: Sequence[str]) -> str | None:
         """The one of a model's `parts` that represents the actor; None: the background shows it."""

@@ -1,18 +1,14 @@
 """Settings of the rule `actors`."""
 
-from typing import Literal, get_args
+from typing import get_args
 
 from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
+from drivesplat.settings.object_classes import ObjectClassName
 from drivesplat.settings.train import STAGE_OF_PART, PartName
 
-ObjectClassName = Literal[
-    "car", "truck", "bus", "trailer", "construction_vehicle", "tram", "vehicle", "motorcycle", "bicycle", "rider",
-    "pedestrian", "animal", "other_movable",
-]  # fmt: skip
-"""The values of `drivesplat.scene.object_class.ObjectClass`."""
 CYCLES = ("motorcycle", "bicycle", "rider")
 NO_VEHICLES = ("pedestrian", "animal", "other_movable")
 ClassParts = PartName | tuple[PartName, ...]

@@ -5,15 +5,19 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.object_classes import ObjectClassName
 
 Nodes = Annotated[int, Field(ge=2, le=64)]
+Stride = Annotated[float, Field(gt=0, le=20)]
+STRIDES: dict[ObjectClassName, float] = {"pedestrian": 0.83, "animal": 1.2, "bicycle": 3.0, "rider": 3.0}
 
 
 class GaitSettings(Settings):
     """The phase of a gait, which advances with the distance walked."""
 
-    stride: float = Field(0.83, gt=0, le=20)
-    """Initial length of a cycle, which is two steps, in heights of the box."""
+    strides: dict[ObjectClassName, Stride] = STRIDES
+    """Initial length of a cycle by class, in heights of the box: two steps of a person (0.413 to 0.415 heights each, as
+    pedometers take them), a turn of a bicycle's crank. Classes that are not named have that of a pedestrian."""
     harmonics: int = Field(3, ge=1, le=8)
     """Number of multiples of the phase that deform the object, a cosine and a sine each."""
     lr_stride: float = Field(5e-4, gt=0)
@@ -22,6 +26,11 @@ class GaitSettings(Settings):
     """Learning rate of corrections of the phase (cycles) along the path."""
     weight: float = Field(0.01, ge=0)
     """Loss weight of the mean square of both."""
+
+    def stride_of(self, object_class: str) -> float:
+        """The initial length of a cycle of a class, in heights of the box."""
+        known: dict[str, float] = {**STRIDES, **self.strides}
+        return known.get(object_class, known["pedestrian"])
 
 
 class LatticeSettings(Settings):

@@ -1,5 +1,6 @@
 """Actors whose limbs move: the lattice that deforms them, the phase of their gait, and what edits do to it."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -16,7 +17,7 @@ from drivesplat.model.lattice import LatticeField, roughness
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.motion import HALF_STEP
-from drivesplat.settings.deformable import LatticeSettings, NetworkSettings
+from drivesplat.settings.deformable import GaitSettings, LatticeSettings, NetworkSettings
 from drivesplat.settings.train import DeformableSettings, GaussianSettings, TrainSettings
 
 SIZE, SPEED = (0.8, 0.6, 1.8), 1.5
@@ -134,6 +135,14 @@ def test_the_limbs_return_after_a_stride():
     assert (in_box(part, 0.4 + 0.5 * cycle) - in_box(part, 0.4)).norm(dim=1).median() > 0.05
     first, last = (part.cycles(part.time_state(at)).detach() for at in (0.4, 0.4 + cycle))
     assert float(last - first) == pytest.approx(1.0)
+
+
+def test_a_cyclist_pedals_less_often_than_a_person_steps():
+    cyclist = dataclasses.replace(walker("cyclist"), object_class="rider")
+    lengths = people_of(walker(), cyclist).cycle_lengths.tolist()
+    assert lengths == pytest.approx([STRIDE, 3.0 * SIZE[2]])
+    own = GaitSettings(strides={"rider": 2.0})
+    assert people_of(walker(), cyclist, gait=own).cycle_lengths.tolist() == pytest.approx([STRIDE, 2.0 * SIZE[2]])
 
 
 def test_the_limbs_of_who_stands_change_with_time_alone():
