@@ -53,10 +53,10 @@ class FiniteGuard:
         step = min((step for step, _ in found), default=NEVER)
         if step < NEVER:
             names = ", ".join(name for at, name in found if at == step)
-            broken = tracks()
-            where = f" (tracks {', '.join(broken)})" if broken else ""
+            if broken := tracks():
+                names += f" (tracks {', '.join(broken)})"
             raise TrainingError(
-                f"iteration {step + 1}: {names} is not finite{where}; the last good checkpoint is kept ({checkpoint}); "
+                f"iteration {step + 1}: {names} is not finite; the last good checkpoint is kept ({checkpoint}); "
                 "lower the learning rates (train.gaussians.lr_*) or raise train.mcmc.min_opacity"
             )
 

@@ -641,7 +641,7 @@ def test_the_guard_keeps_apart_iterations_that_watch_different_terms():
     guard.watch(2, {"loss l1": torch.tensor(math.nan)})
     with pytest.raises(TrainingError, match="iteration 3: loss l1 is not finite; "):
         guard.check("state.npz")
-    with pytest.raises(TrainingError, match=r"iteration 3: loss l1 is not finite \(tracks a, b\); "):
+    with pytest.raises(TrainingError, match=r"iteration 3: loss l1 \(tracks a, b\) is not finite; "):
         guard.check("state.npz", lambda: ["a", "b"])
 
 

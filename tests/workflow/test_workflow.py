@@ -74,7 +74,7 @@ def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
 def test_every_method_is_measured_in_both_groups_and_all_regions(finished):
     for result in finished.read("results/0001/metrics.json")["methods"].values():
         for group in ("interpolation", "extrapolation"):
-            assert set(REGIONS) | {"gap_db", "depth"} == set(result[group])
+            assert set(REGIONS) | {"gap_db", "human_gap_db", "depth"} == set(result[group])
             assert result[group]["all"]["psnr"] > 8.0
             for region in REGIONS:
                 record = result[group][region]
