@@ -178,6 +178,22 @@ def test_gaussians_turn_with_their_limb():
     assert turned[:, 0, 2].mean() == pytest.approx(math.sin(0.3), abs=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("times", "places"),
+    [
+        pytest.param([2.0], [[1.0, 2.0, 0.9]], id="one annotation"),
+        pytest.param([0.0, 0.5], [[1.0, 2.0, 0.9], [1.0, 2.0, 0.9]], id="stands"),
+        pytest.param([0.0, 0.5, 1.0], [[0.0, 0.0, 0.9], [500.0, 0.0, 0.9], [0.5, 0.0, 0.9]], id="jumps"),
+    ],
+)
+def test_odd_tracks_have_finite_gaussians_and_gradients(times, places):
+    part = people_of(track_of(motion_through(times, places, np.zeros(len(times))), "odd", SIZE), walker())
+    part.at(times[-1]).means.square().sum().backward()
+    learned = [value for value in (*part.params.values(), *part.shared.values()) if value.grad is not None]
+    assert learned and all(value.grad.isfinite().all() for value in learned)
+    assert part.velocities(times[-1]).isfinite().all()
+
+
 def test_velocities_include_those_of_limbs():
     part, step = people_of(walker()), HALF_STEP
     expected = (part.at(1.3 + step).means - part.at(1.3 - step).means) / (2.0 * step)
