@@ -49,7 +49,7 @@ lint: setup
 # Uses the Python at hand where there is no .venv: GPU machines often bring their own torch.
 test-gpu:
 	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -m gpu -rs -v
-	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -rs -v tests/kernels/test_triton.py tests/kernels/test_triton_tiles.py
+	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -rs -v tests/kernels/test_triton.py tests/kernels/test_triton_tiles.py tests/kernels/test_triton_scans.py
 
 test-slurm: setup
 	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/workflow/test_slurm.py

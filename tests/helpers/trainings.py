@@ -15,7 +15,9 @@ import torch
 from PIL import Image
 
 from drivesplat.lidar.depth_record import PixelDepths
+from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
+from drivesplat.model.deformable import Deformable
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -120,10 +122,16 @@ def cars() -> list[ActorTrack]:
     ]
 
 
-def untrained_street(settings: TrainSettings, echo: tuple[float, float] | None = None) -> SplatModel:
-    """Background, two cars and a sky; with `echo`, logits of intensity and returns, for a LiDAR, too."""
-    still = untrained(settings, sky=True, echo=echo)
-    moving = actors_of(*cars(), count=25, settings=settings.actors, shaken=False, echo=echo)
+def untrained_street(
+    settings: TrainSettings, echo: tuple[float, float] | None = None, people: bool = False
+) -> SplatModel:
+    """Background, two cars and a sky; with `echo`, logits of intensity and returns, for a LiDAR, too, with the offsets
+    that settings want. `people`: what the cars are deforms."""
+    still = untrained(settings, sky=True, echo=echo, offsets=settings.scans.own)
+    moving: Actors = actors_of(*cars(), count=25, settings=settings.actors, shaken=False, echo=echo)
+    if people:
+        own = {name: value.detach() for name, value in moving.params.items()}
+        moving = Deformable(own, moving.timeline.tracks, settings.deformable, settings.gaussians)
     return SplatModel([*still.parts, moving], still.sky)
 
 
