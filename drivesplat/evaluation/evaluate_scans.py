@@ -5,6 +5,7 @@ from typing import Any
 
 from drivesplat.evaluation.drive_summary import summarize_swept_drive
 from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, training_figures
+from drivesplat.evaluation.metrics import with_gap
 from drivesplat.evaluation.scan_evaluation import lidar_metrics
 from drivesplat.io.storage import Provenance
 from drivesplat.machine.device import explain_out_of_memory
@@ -53,7 +54,7 @@ def evaluate_scans(
     spread = inputs.checkpoint.job.train.scans.beam_spread_rad
     with explain_out_of_memory(lambda: len(model)):
         lidar = lidar_metrics(model, inputs.scene, inputs.scans, spread, device)
-    of_images = {"gap_db": None, "human_gap_db": None, **dict.fromkeys(REGIONS)}
+    of_images = with_gap(dict.fromkeys(REGIONS))
     record = inputs.record
     return {
         "schema": 1,

@@ -18,7 +18,7 @@ from drivesplat.kernels import torch_private
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
-from drivesplat.model.actor_placements import placement_sets, with_placements, with_walked
+from drivesplat.model.actor_placements import placement_sets, with_placements
 from drivesplat.model.gaussians import Gaussians, concatenate, recolored
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
@@ -200,13 +200,8 @@ class Actors(Part):
         return gaussians
 
     def _state_with(self, state: TimeState, placements: Sequence[ActorPlacement]) -> TimeState:
-        """The time state with the paths of placements."""
-        return with_walked(state, self._known, placements, self.cycle_lengths)
-
-    @property
-    def cycle_lengths(self) -> Float[Tensor, " a"]:
-        """The length of a gait cycle of each actor in metres; 0 without limbs."""
-        return self._reach.new_zeros(len(self.timeline.tracks))
+        """The time state that placements give their actors; rigid ones have no limbs that would follow a path."""
+        return state
 
     def placed(self, state: TimeState, poses: ObjectPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""

@@ -16,11 +16,13 @@ from torch.nn.functional import normalize
 
 from drivesplat.kernels.placement import LocalGaussians
 from drivesplat.kernels.quaternions import left_factor
+from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.actors import Actors
 from drivesplat.model.deformation import Field, Undeformed
 from drivesplat.model.deformation_network import NetworkField
 from drivesplat.model.lattice import LatticeField
 from drivesplat.model.parameters import make_parameters
+from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.train import DeformableSettings, GaussianSettings
 
@@ -58,8 +60,12 @@ class Deformable(Actors):
         strides = [settings.gait.stride_of(track.object_class) * float(track.size[2]) for track in tracks]
         self.register_buffer("_strides", torch.tensor(strides), persistent=False)
 
+    def _state_with(self, state: TimeState, placements: Sequence[ActorPlacement]) -> TimeState:
+        return with_walked(state, self._known, placements, self.cycle_lengths)
+
     @property
     def cycle_lengths(self) -> Float[Tensor, " a"]:
+        """The length of a gait cycle of each actor in metres."""
         return self._strides * torch.exp(self.shared["stride"])
 
     def cycles(self, state: TimeState) -> Float[Tensor, " a"]:
