@@ -46,10 +46,12 @@ lint: setup
 	$(BIN)/snakefmt --check Snakefile rules
 	$(BIN)/snakemake --lint
 
-# Uses the Python at hand where there is no .venv: GPU machines often bring their own torch.
+# Uses the Python at hand where there is no .venv: GPU machines often bring their own torch. Imports only modules with
+# GPU tests, since such a machine may lack what the others need (ffmpeg, usd-core, ...).
+GPU_PYTHON = $(if $(wildcard $(BIN)/python),$(BIN)/python,python3)
 test-gpu:
-	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -m gpu -rs -v
-	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -rs -v tests/kernels/test_triton.py tests/kernels/test_triton_tiles.py tests/kernels/test_triton_scans.py
+	$(GPU_PYTHON) -m pytest -m gpu -rs -v $$(grep -rl --include='*.py' 'pytest\.mark\.gpu' tests)
+	$(GPU_PYTHON) -m pytest -rs -v tests/kernels/test_triton.py tests/kernels/test_triton_tiles.py tests/kernels/test_triton_scans.py
 
 test-slurm: setup
 	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/workflow/test_slurm.py

@@ -17,6 +17,14 @@ def rotation_matrix(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
     return torch.einsum("...i,...j,ijkl->...kl", quats, quats, _rotations(quats.dtype, quats.device))
 
 
+def rotated_back(quats: Float[Tensor, "*n 4"], vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Vectors rotated by the inverses of unit quaternions: v to q* v q. Elementwise, since a GPU multiplies a million
+    small matrices slowly."""
+    axis = quats[..., 1:]
+    twice = 2.0 * torch.linalg.cross(axis, vectors)
+    return vectors - quats[..., :1] * twice + torch.linalg.cross(axis, twice)
+
+
 def about_vertical(angles: Float[Tensor, "*n"]) -> Float[Tensor, "*n 4"]:
     """Rotations by `angles` (radians) about z."""
     half, nothing = 0.5 * angles, torch.zeros_like(angles)

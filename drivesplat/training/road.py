@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.kernels.quaternions import rotation_matrix
+from drivesplat.kernels.quaternions import rotated_back
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import RoadSettings
@@ -59,8 +59,7 @@ def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
     heights = (gaussians.means * normals).sum(dim=1) - road.offsets[index]
     on_road &= (heights.detach().abs() < road.reach) & (gaussians.opacities.detach() > 0.0)
     weights = road.weights[index] * on_road
-    axes = rotation_matrix(F.normalize(gaussians.quats, dim=1))
-    along = torch.einsum("nij,ni->nj", axes, normals) * gaussians.scales
+    along = rotated_back(F.normalize(gaussians.quats, dim=1), normals) * gaussians.scales
     distance = torch.sqrt(heights.square() + along.square().sum(dim=1) + ROUGHNESS**2) - ROUGHNESS
     return (weights * distance).sum() / weights.sum().clamp(min=1e-6)
 

@@ -12,7 +12,7 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, Terms, can_capture
+from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, Recording, Terms, can_capture
 from drivesplat.training.densify import Densifier
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
@@ -87,7 +87,8 @@ class Trainer:
         step, rates = self.schedule.update(self.step, self.optimizers)
         if self.fits_scan and not (with_picture and self.images.views):
             number = scan_index(len(self.scans), self.step, self.settings.scans.share, self.seed)
-            terms = self._captured(("scan", number), lambda: self._learn_scan(self.scans[number], step, rates))
+            scan = Recording("scan", number)
+            terms = self._captured(scan, lambda: self._learn_scan(self.scans[number], step, rates), self._addresses())
             return terms, None, None
         with self.clock.stage("data"):
             number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
@@ -97,16 +98,17 @@ class Trainer:
 
         if with_picture or not self.graphs.enabled:
             return *self.graphs.retry_without_graphs(iteration), view
-        image = self.images.factor(self.step), number
-        return self._captured(image, lambda: iteration()[0]), None, view
+        image = Recording("image", (self.images.factor(self.step), number))
+        layout = self.images.factor(self.step), self.sh_degree(), *self._addresses()
+        return self._captured(image, lambda: iteration()[0], layout), None, view
 
-    def _captured(self, recording: Hashable, iteration: Callable[[], Terms]) -> Terms:
-        """Runs an iteration with an image or a scan, by its CUDA graph where there is one."""
+    def _captured(self, recording: Recording, iteration: Callable[[], Terms], layout: Hashable) -> Terms:
+        """Runs an iteration with an image or a scan, by its CUDA graph where there is one of the same `layout`."""
         if not self.graphs.enabled:
             return self.graphs.retry_without_graphs(iteration)
         headroom = max(part.row_count / max(1, len(part)) for part in self.model.parts)
         gaussians = GaussianCount(len(self.model), headroom)
-        return self.graphs.run(recording, self._layout(), gaussians, iteration)
+        return self.graphs.run(recording, layout, gaussians, iteration)
 
     def _learn(
         self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
@@ -173,10 +175,9 @@ class Trainer:
         """The number of iterations so far that fitted an image."""
         return self.step - (scans_before(self.step, self.settings.scans.share) if self.scans else 0)
 
-    def _layout(self) -> Hashable:
-        """Changes when captured iterations become invalid: image reduction, SH degree, and addresses of parameters."""
-        places = [(parameter.data_ptr(), parameter.numel()) for parameter in self.model.parameters()]
-        return self.images.factor(self.step), self.sh_degree(), *places
+    def _addresses(self) -> tuple[tuple[int, int], ...]:
+        """The addresses and sizes of all parameters. Captured iterations become invalid when they change."""
+        return tuple((parameter.data_ptr(), parameter.numel()) for parameter in self.model.parameters())
 
     def densifies(self) -> bool:
         """Whether this iteration may add, move or remove Gaussians."""

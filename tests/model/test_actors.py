@@ -9,7 +9,7 @@ from helpers.hand_made import about_z, actors_of, looking_at, motion_through, tr
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.placement import ObjectPoses
-from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
+from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix
 from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -69,6 +69,13 @@ def test_a_quaternions_matrix_is_that_of_its_rotation():
     rotations = Rotation.random(20, random_state=4)
     found = rotation_matrix(torch.from_numpy(rotations.as_quat(scalar_first=True)))
     np.testing.assert_allclose(found, rotations.as_matrix(), atol=1e-12)
+
+
+def test_vectors_rotated_back_equal_scipys_inverse():
+    rotations, rng = Rotation.random(20, random_state=3), np.random.default_rng(4)
+    vectors = rng.normal(size=(20, 3))
+    found = rotated_back(torch.from_numpy(rotations.as_quat(scalar_first=True)), torch.from_numpy(vectors))
+    np.testing.assert_allclose(found, rotations.inv().apply(vectors), atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -2.0, np.pi])

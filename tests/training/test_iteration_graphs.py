@@ -13,7 +13,7 @@ from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.cuda_graph import iteration_graphs
-from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, can_capture
+from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, Recording, can_capture
 
 CPU = torch.device("cpu")
 HUNDRED = GaussianCount(100, 1.0)
@@ -28,23 +28,24 @@ class FakeGraphs:
         monkeypatch.setattr(IterationGraphs, "_capture", lambda _, *arguments: self.capture(*arguments))
         monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
 
-    def capture(self, image, gaussians, iteration):
+    def capture(self, recording, gaussians, iteration):
+        image = recording.index
         self.log.append(("captured", image))
-        self.capacities.append([need * gaussians for need in self.graphs._needs[image]])
+        self.capacities.append([need * gaussians for need in self.graphs._needs[recording]])
         replay = partial(self.log.append, ("replayed", image))
-        self.graphs._graphs[image] = CudaGraph(
+        self.graphs._graphs[recording] = CudaGraph(
             replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), [self.needed],
             torch.tensor(0),
         )  # fmt: skip
-        return self.graphs._graphs[image]
+        return self.graphs._graphs[recording]
 
-    def run(self, image, layout=0, gaussians=HUNDRED):
+    def run(self, image, layout=0, gaussians=HUNDRED, kind="image"):
         def iteration():
             self.log.append(("run", image))
             capacity_for(torch.tensor(self.needed))
             return {"l1": torch.tensor(float(image))}
 
-        terms = self.graphs.run(image, layout, gaussians, iteration)
+        terms = self.graphs.run(Recording(kind, image), layout, gaussians, iteration)
         assert float(terms["l1"]) == image
         logged = [action for action, of in self.log if of == image]
         self.log.clear()
@@ -67,13 +68,22 @@ def test_another_layout_captures_anew(monkeypatch):
     assert [fake.run(0, layout=1) for _ in range(2)] == [["captured", "replayed"], ["replayed"]]
 
 
+def test_another_layout_of_images_keeps_the_graphs_of_scans(monkeypatch):
+    fake = FakeGraphs(monkeypatch)
+    for image, kind in ((0, "image"), (0, "image"), (1, "scan"), (1, "scan")):
+        fake.run(image, kind=kind)
+    assert fake.run(0, layout=1) == ["captured", "replayed"]
+    assert fake.run(1, kind="scan") == ["replayed"]
+    assert fake.run(1, layout=1, kind="scan") == ["captured", "replayed"]
+
+
 def test_capacities_leave_headroom_for_growth(monkeypatch):
     fake = FakeGraphs(monkeypatch)
     fake.run(0, gaussians=GaussianCount(100, 2.0))
     fake.run(0, gaussians=GaussianCount(120, 1.5))
     assert [round(room) for (room,) in fake.capacities] == [5400]
     fake.needed = 4200
-    fake.graphs._graphs[0].needed[0] = fake.needed
+    fake.graphs._graphs[Recording("image", 0)].needed[0] = fake.needed
     fake.run(0, gaussians=GaussianCount(140, 1.2))
     fake.run(0, layout=1, gaussians=GaussianCount(200, 2.0))
     assert [round(room) for (room,) in fake.capacities] == [5400, 2 * 200 * 4200 // 140], (
@@ -96,8 +106,8 @@ def test_overflowed_graphs_are_captured_anew(monkeypatch):
         fake.run(image)
     fake.graphs.check()
     assert fake.run(0) == ["replayed"]
-    fake.graphs._graphs[0].missing.add_(1)
-    fake.graphs._graphs[0].needed[0] = 7000
+    fake.graphs._graphs[Recording("image", 0)].missing.add_(1)
+    fake.graphs._graphs[Recording("image", 0)].needed[0] = 7000
     fake.graphs.check()
     assert fake.run(0) == ["captured", "replayed"]
     assert [round(room) for (room,) in fake.capacities] == [3000, 3000, 7000]
@@ -110,10 +120,10 @@ def test_the_memory_pool_is_released_with_the_last_graph(monkeypatch):
     fake.graphs._pool = (0, 1)
     for image in (0, 0, 1, 1):
         fake.run(image)
-    fake.graphs._graphs[0].missing.add_(1)
+    fake.graphs._graphs[Recording("image", 0)].missing.add_(1)
     fake.graphs.check()
     assert fake.graphs._pool == (0, 1)
-    fake.graphs._graphs[1].missing.add_(1)
+    fake.graphs._graphs[Recording("image", 1)].missing.add_(1)
     fake.graphs.check()
     assert fake.graphs._pool is None
 

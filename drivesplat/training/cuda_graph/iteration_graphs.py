@@ -29,6 +29,14 @@ and four times as many are cached."""
 
 
 @dataclass(frozen=True)
+class Recording:
+    """What an iteration fits: the `index` of an image or a LiDAR scan among those of its `kind`."""
+
+    kind: str
+    index: Hashable
+
+
+@dataclass(frozen=True)
 class GaussianCount:
     """The number of Gaussians `now`, and the factor `headroom` by which it can grow before tensors are reallocated."""
 
@@ -51,23 +59,24 @@ class IterationGraphs:
 
     enabled: bool
     device: torch.device
-    _layout: Hashable = None
-    _needs: dict[Hashable, list[float]] = field(default_factory=dict)
+    _layouts: dict[str, Hashable] = field(default_factory=dict)
+    """By kind of recording, the layout of its graphs."""
+    _needs: dict[Recording, list[float]] = field(default_factory=dict)
     """By recording, the entries per Gaussian that each of its lists last needed."""
-    _graphs: dict[Hashable, CudaGraph[Terms]] = field(default_factory=dict)
+    _graphs: dict[Recording, CudaGraph[Terms]] = field(default_factory=dict)
     _count: int = 1
     _pool: MemoryPool | None = None
 
     def run(
-        self, recording: Hashable, layout: Hashable, gaussians: GaussianCount, iteration: Callable[[], Terms]
+        self, recording: Recording, layout: Hashable, gaussians: GaussianCount, iteration: Callable[[], Terms]
     ) -> Terms:
-        """Runs an iteration with a recording, by its graph where there is one. Graphs are invalid once `layout`
-        changes."""
+        """Runs an iteration with a recording, by its graph where there is one. The graphs of a kind of recordings are
+        invalid once their `layout` changes."""
         if not self.enabled:
             return iteration()
-        if layout != self._layout:
-            self._drop(list(self._graphs))
-            self._layout = layout
+        if layout != self._layouts.get(recording.kind):
+            self._drop([other for other in self._graphs if other.kind == recording.kind])
+            self._layouts[recording.kind] = layout
         self._count = max(1, gaussians.now)
         graph = self._graphs.get(recording)
         if graph is None and recording in self._needs:
@@ -107,7 +116,7 @@ class IterationGraphs:
         self._drop(list(self._graphs))
         return self.enabled
 
-    def _drop(self, recordings: list[Hashable]) -> None:
+    def _drop(self, recordings: list[Recording]) -> None:
         """Drops graphs and remembers the entries that their lists last needed. Waits for the device."""
         if not recordings:
             return
@@ -126,7 +135,7 @@ class IterationGraphs:
         self._pool = None
 
     def _capture(
-        self, recording: Hashable, gaussians: float, iteration: Callable[[], Terms]
+        self, recording: Recording, gaussians: float, iteration: Callable[[], Terms]
     ) -> CudaGraph[Terms] | None:
         """The graph of an iteration with lists for so many Gaussians; the capture does not run it. Where the GPU or its
         driver refuses, returns None and disables graphs."""
