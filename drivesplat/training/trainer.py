@@ -12,7 +12,13 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, Recording, Terms, can_capture
+from drivesplat.training.cuda_graph.iteration_graphs import (
+    GaussianCount,
+    IterationGraphs,
+    Recording,
+    Terms,
+    can_capture,
+)
 from drivesplat.training.densify import Densifier
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
