@@ -18,7 +18,7 @@ import numpy as np
 from drivesplat.export.nerfstudio import transforms_record
 from drivesplat.export.sampled_motion import SampledMotion
 from drivesplat.export.splat_ply import note_of, write_splat_ply
-from drivesplat.export.trained_parts import SampledGroup, digests, middle_timestamp, trained_gaussians, trained_groups
+from drivesplat.export.trained_parts import SampledGroup, digests, shown_timestamp, trained_gaussians, trained_groups
 from drivesplat.export.unique_names import unique_names
 from drivesplat.io.storage import Provenance, write_json
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
@@ -52,8 +52,8 @@ PART_CONVENTIONS = {
     "timestamps": "Microseconds of the dataset's clock: first_image plus the seconds.",
     "present": "Intervals in seconds in which the object is present; at all other times it is absent.",
     "samples": "Thirty a second, at every image of cameras.json and at the annotations, while the object is present.",
-    "colors": "Colours that vary with time are those at colors_timestamp, the time of the middle image, "
-    "which is also that of splat.ply.",
+    "colors": "Colours that vary with time are those at colors_timestamp, which is also the time of splat.ply.",
+    "deforms": "Whether the object's Gaussians move in its frame; their file has the shape at colors_timestamp.",
     "size": "Length, width, height of the annotated box in metres; null, like category, if the scene "
     "has no such track.",
 }
@@ -77,23 +77,24 @@ def export_splat(
     job: SplatJob,
     provenance: Provenance,
 ) -> None:
-    """Writes all Gaussians of a checkpoint: together at the time of the middle image, and group by group;
+    """Writes all Gaussians of a checkpoint: together at the time that `job` shows, and group by group;
     and the recorded cameras. PLYs have spherical harmonics of at least `job.sh_degree`.
 
     PLY headers contain only the digests of `provenance`, since viewers limit their length; JSON files contain all.
     """
     model = trained_model(checkpoint)
     degree = job.sh_degree or 0
-    gaussians = with_sh_degree(trained_gaussians(model, scene), degree)
+    gaussians = with_sh_degree(trained_gaussians(model, scene, job.time_s), degree)
+    timestamps = np.array([frame.timestamp for frame in scene.frames])
     groups = {
         name: replace(group, gaussians=with_sh_degree(group.gaussians, degree))
-        for name, group in trained_groups(model, scene, np.array([f.timestamp for f in scene.frames])).items()
+        for name, group in trained_groups(model, scene, timestamps, job.time_s).items()
     }
     note = {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)}
     write_splat_ply(files.splat, gaussians, note)
     write_json(files.cameras, {**cameras_record(scene, record), "provenance": provenance})
     write_json(files.transforms, {**transforms_record(scene, record), "provenance": provenance})
-    write_parts(files.parts, groups, scene, provenance)
+    write_parts(files.parts, groups, scene, provenance, job.time_s)
     log.info("%d Gaussians, %d groups, %d images", len(gaussians), len(groups), len(scene.frames))
 
 
@@ -129,8 +130,14 @@ def _image(frame: Frame, name: str, size: tuple[int, int], K: np.ndarray, split:
     }
 
 
-def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Scene, provenance: Provenance) -> None:
-    """Writes every group as a PLY beside `path`, then their record to `path`.
+def write_parts(
+    path: str | Path,
+    groups: Mapping[str, SampledGroup],
+    scene: Scene,
+    provenance: Provenance,
+    time_s: float | None = None,
+) -> None:
+    """Writes every group as a PLY beside `path`, then their record to `path`. `time_s`: see `shown_timestamp`.
 
     PLYs of groups of earlier calls that are not written again are removed; other files stay.
     """
@@ -140,15 +147,17 @@ def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Sce
         note = {"scene": scene.name, "piece": name, "frame": _frame(group), **digests(provenance)}
         write_splat_ply(folder / files[name], group.gaussians, note)
     _remove_others(folder, set(files.values()))
-    write_json(path, {**_parts_record(groups, files, scene), "provenance": provenance})
+    write_json(path, {**_parts_record(groups, files, scene, time_s), "provenance": provenance})
 
 
-def _parts_record(groups: Mapping[str, SampledGroup], files: Mapping[str, str], scene: Scene) -> dict[str, Any]:
+def _parts_record(
+    groups: Mapping[str, SampledGroup], files: Mapping[str, str], scene: Scene, time_s: float | None
+) -> dict[str, Any]:
     first_image = min(frame.timestamp for frame in scene.frames)
     return {
         **_scene_header(scene, PART_CONVENTIONS),
         "first_image": first_image,
-        "colors_timestamp": middle_timestamp(scene),
+        "colors_timestamp": shown_timestamp(scene, time_s),
         "parts": [
             {
                 "name": name,
@@ -156,6 +165,7 @@ def _parts_record(groups: Mapping[str, SampledGroup], files: Mapping[str, str], 
                 "gaussians": len(group.gaussians),
                 "sh_degree": group.gaussians.sh_degree,
                 "frame": _frame(group),
+                "deforms": group.shapes is not None,
                 "category": group.track.category if group.track else None,
                 "size": group.track.size.tolist() if group.track else None,
                 "motion": _motion(group.motion, first_image) if group.motion else None,

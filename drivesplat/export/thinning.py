@@ -8,7 +8,6 @@ the median is robust even if more than a tenth of the Gaussians are huge.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -44,7 +43,4 @@ def thinned_groups(groups: Mapping[str, SampledGroup], count: int) -> dict[str, 
     """The groups with their share of the `count` Gaussians with the largest coverage, absent objects included."""
     sets = [group.gaussians for group in groups.values()]
     kept = largest_coverage(concatenate(sets), count).split([len(gaussians) for gaussians in sets])
-    return {
-        name: replace(group, gaussians=group.gaussians[chosen])
-        for (name, group), chosen in zip(groups.items(), kept, strict=True)
-    }
+    return {name: group.of_rows(chosen) for (name, group), chosen in zip(groups.items(), kept, strict=True)}

@@ -1,16 +1,19 @@
-"""The Gaussians of a trained model for exports: all at one time, or rigid group by rigid group with their motions.
+"""The Gaussians of a trained model for exports: all at one time, or group by group with their motions and shapes.
 
-Colours that vary with time are those of the drive's middle image. Gaussians with NaN or Inf are dropped, since programs
-treat them differently.
+Colours that vary with time are those of the time that static exports show. Gaussians with NaN or Inf are dropped, since
+programs treat them differently.
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
-from drivesplat.export.sampled_motion import SampledMotion, sample_motion
+from drivesplat.errors import ConfigError
+from drivesplat.export.sampled_motion import SampledMotion, SampledShapes, sample_motion, shape_seconds
 from drivesplat.io.storage import Provenance
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
@@ -22,39 +25,68 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class SampledGroup:
     """Gaussians in world coordinates or, with a `motion`, in the frame of the moving object; its `track` in the scene,
-    if there is one."""
+    if there is one; and the `shapes` of Gaussians that deform, which have that of the shown time."""
 
     gaussians: Gaussians
     motion: SampledMotion | None = None
     track: Track | None = None
+    shapes: SampledShapes | None = None
+
+    def of_rows(self, chosen: Bool[Tensor, " n"]) -> "SampledGroup":
+        """The same with a part of its Gaussians, by mask."""
+        shapes = None if self.shapes is None else self.shapes.of_rows(chosen.cpu().numpy())
+        return replace(self, gaussians=self.gaussians[chosen], shapes=shapes)
 
 
-def middle_timestamp(scene: Scene) -> int:
-    """The timestamp (microseconds) of the middle one of all images: the time of static exports."""
-    return int(np.sort([frame.timestamp for frame in scene.frames])[len(scene.frames) // 2])
+def shown_timestamp(scene: Scene, time_s: float | None) -> int:
+    """The timestamp (microseconds) that static exports show: `time_s` seconds after the first image, or with None that
+    of the middle one of all images. Raises ConfigError for a time after the last image."""
+    timestamps = np.sort([frame.timestamp for frame in scene.frames])
+    if time_s is None:
+        return int(timestamps[len(timestamps) // 2])
+    shown = int(timestamps[0]) + round(time_s * 1e6)
+    if shown > timestamps[-1]:
+        raise ConfigError(
+            f"export.time_s is {time_s}, but the last image of scene {scene.name} is at "
+            f"{scene.seconds(timestamps[-1]):.2f} s: choose a time within the drive"
+        )
+    return shown
 
 
 @torch.no_grad()
-def trained_gaussians(model: SplatModel, scene: Scene) -> Gaussians:
-    """All Gaussians of a model in world coordinates at the time of the middle image, except those of absent objects."""
-    gaussians = model.gaussians_at(scene.seconds(middle_timestamp(scene)))
-    return _finite(gaussians[(gaussians.opacities != 0) | ~model.moving()], "all parts together")
+def trained_gaussians(model: SplatModel, scene: Scene, time_s: float | None = None) -> Gaussians:
+    """All Gaussians of a model in world coordinates at the shown time (`shown_timestamp`), except those of absent
+    objects."""
+    gaussians = model.gaussians_at(scene.seconds(shown_timestamp(scene, time_s)))
+    return gaussians[_finite(gaussians, "all parts together") & ((gaussians.opacities != 0) | ~model.moving())]
 
 
 @torch.no_grad()
-def trained_groups(model: SplatModel, scene: Scene, timestamps: np.ndarray) -> dict[str, SampledGroup]:
+def trained_groups(
+    model: SplatModel, scene: Scene, timestamps: np.ndarray, time_s: float | None = None
+) -> dict[str, SampledGroup]:
     """The rigid groups of a model by name, objects in their own frames, present or not.
 
-    Their motions are sampled at `timestamps` (m,) of images (microseconds), among others.
+    Their motions are sampled at `timestamps` (m,) of images (microseconds), among others. `time_s` is the shown time
+    (`shown_timestamp`).
     """
-    middle = scene.seconds(middle_timestamp(scene))
+    shown = scene.seconds(shown_timestamp(scene, time_s))
     recorded = (timestamps - min(frame.timestamp for frame in scene.frames)) * 1e-6
     result: dict[str, SampledGroup] = {}
-    for name, group in model.rigid_groups(middle).items():
-        motion = None if group.motion is None else sample_motion(group.motion, recorded, middle)
-        track = None if group.motion is None else scene.track(name)
-        result[name] = SampledGroup(_finite(group.gaussians, name), motion, track)
+    for name, group in model.rigid_groups(shown).items():
+        found = SampledGroup(group.gaussians)
+        if group.motion is not None:
+            motion = sample_motion(group.motion, recorded, shown)
+            found = replace(found, motion=motion, track=scene.track(name), shapes=sampled_shapes(model, name, motion))
+        result[name] = found.of_rows(_finite(group.gaussians, name))
     return result
+
+
+def sampled_shapes(model: SplatModel, track_id: str, motion: SampledMotion) -> SampledShapes | None:
+    """The shapes of an object of a model while it is present; None for a rigid one."""
+    seconds = shape_seconds(motion)
+    shapes = model.shapes(track_id, seconds.tolist())
+    return None if shapes is None else SampledShapes(seconds, *(values.cpu().numpy() for values in shapes))
 
 
 def digests(provenance: Provenance) -> dict[str, str]:
@@ -62,10 +94,11 @@ def digests(provenance: Provenance) -> dict[str, str]:
     return {name: provenance[name] for name in ("settings_sha256", "code_sha256", "inputs_sha256")}
 
 
-def _finite(gaussians: Gaussians, name: str) -> Gaussians:
+def _finite(gaussians: Gaussians, name: str) -> Bool[Tensor, " n"]:
+    """The mask of Gaussians without NaN or Inf; a warning names the others' number."""
     values = [value.isfinite().reshape(len(gaussians), -1).all(dim=1) for value in gaussians.tensors.values()]
     finite = torch.stack(values).all(dim=0)
-    if finite.all():
-        return gaussians
-    log.warning("%s: %d of %d Gaussians contain NaN or Inf and are dropped", name, int((~finite).sum()), len(finite))
-    return gaussians[finite]
+    if not finite.all():
+        dropped = int((~finite).sum())
+        log.warning("%s: %d of %d Gaussians contain NaN or Inf and are dropped", name, dropped, len(finite))
+    return finite

@@ -5,10 +5,11 @@ The stage: metres, z up, the world of `Scene` with its origin in customLayerData
 first image. Its prims:
 
 - one for every static group, such as /World/background
-- /World/actors/{track} for every object: Gaussians in the object's frame, transform and visibility over time
+- /World/actors/{track} for every object: Gaussians in the object's frame, transform and visibility over time, and for
+  an object that deforms also positions and orientations of its Gaussians
 - /World/camera with the recorded path
 
-Colours are those of the drive's middle image at all times. The sky consists of no Gaussians and is not included; the
+Colours are those of `export.time_s` at all times. The sky consists of no Gaussians and is not included; the
 schema has no attribute for antialiased training.
 """
 
@@ -50,7 +51,7 @@ def export_usd(
     `job.eval_camera`. Raises DatasetError if the scene lacks that camera."""
     model = trained_model(checkpoint)
     cameras = recorded_cameras(scene, job.eval_camera)
-    groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera))
+    groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera), job.time_s)
     kept = thinned_groups(groups, job.gaussians)
     note = {"scene": scene.name, "dataset": scene.dataset, "origin": Gf.Vec3d(*scene.origin), **digests(provenance)}
     write_usdz(path, splat_stage(kept, cameras, note))

@@ -2,7 +2,8 @@
 
 The schema (usd-core 26.11) requires linear values: opacities in [0, 1], scales in metres, unit quaternions, and for
 every Gaussian its RGB coefficients of spherical harmonics in the order of 3D Gaussian Splatting, all in the local space
-of the prim: an object's Gaussians are constant in its frame, and the prim's transform moves them.
+of the prim: an object's Gaussians are constant in its frame, and the prim's transform moves them. Those of an object
+that deforms have positions and orientations over time.
 """
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from pxr import Gf, Kind, Usd, UsdGeom, UsdVol, Vt
 from torch import Tensor
 
-from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
+from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion, SampledShapes
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians
 
@@ -34,6 +35,8 @@ def define_group(stage: Usd.Stage, prim_path: str, name: str, group: SampledGrou
     splat.GetPrim().SetDisplayName(" ".join([about.get("category", "object"), name]))
     _set_transforms(splat, group.motion)
     _set_visibility(splat, group.motion)
+    if group.shapes is not None and len(group.gaussians):
+        _set_shapes(splat, group.gaussians, group.shapes)
 
 
 def usd_matrix(transform: np.ndarray) -> Gf.Matrix4d:
@@ -44,8 +47,7 @@ def usd_matrix(transform: np.ndarray) -> Gf.Matrix4d:
 def _set_gaussians(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussians) -> None:
     quats = torch.nn.functional.normalize(gaussians.quats, dim=-1)
     splat.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.means)))
-    # the memory layout of Gf.Quatf is x, y, z, w
-    splat.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(_numpy(quats.roll(-1, dims=-1))))
+    splat.CreateOrientationsAttr(_orientations(quats))
     splat.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.scales)))
     splat.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(_numpy(gaussians.opacities)))
     splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
@@ -54,13 +56,29 @@ def _set_gaussians(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussi
     splat.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
     splat.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)
     if len(gaussians):
-        splat.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_numpy(_extent(gaussians))))
+        splat.CreateExtentAttr(_extent(gaussians.means, gaussians.scales))
 
 
-def _extent(gaussians: Gaussians) -> Float[Tensor, "2 3"]:
-    """The corners of a box around the Gaussians in their own frame, which usd-core does not compute for this schema."""
-    reach = EXTENT_SIGMAS * gaussians.scales.amax(dim=-1, keepdim=True)
-    return torch.stack([(gaussians.means - reach).amin(dim=0), (gaussians.means + reach).amax(dim=0)])
+def _set_shapes(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussians, shapes: SampledShapes) -> None:
+    """Positions, orientations and extent over time; their default values are those of the default time."""
+    positions, orientations, extent = splat.GetPositionsAttr(), splat.GetOrientationsAttr(), splat.GetExtentAttr()
+    codes = (shapes.seconds * TIME_CODES_PER_SECOND).tolist()
+    for code, means, quats in zip(codes, map(torch.from_numpy, shapes.means), shapes.quats, strict=True):
+        positions.Set(Vt.Vec3fArray.FromNumpy(_numpy(means)), code)
+        orientations.Set(_orientations(torch.from_numpy(quats)), code)
+        extent.Set(_extent(means, gaussians.scales), code)
+
+
+def _orientations(quats: Float[Tensor, "n 4"]) -> Vt.QuatfArray:
+    """Unit quaternions w, x, y, z; the memory layout of Gf.Quatf is x, y, z, w."""
+    return Vt.QuatfArray.FromNumpy(_numpy(quats.roll(-1, dims=-1)))
+
+
+def _extent(means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Vt.Vec3fArray:
+    """The corners of a box around Gaussians in their own frame, which usd-core does not compute for this schema."""
+    reach = EXTENT_SIGMAS * scales.amax(dim=-1, keepdim=True)
+    corners = torch.stack([(means - reach).amin(dim=0), (means + reach).amax(dim=0)])
+    return Vt.Vec3fArray.FromNumpy(_numpy(corners))
 
 
 def _set_transforms(xformable: UsdGeom.Xformable, motion: SampledMotion) -> None:

@@ -46,11 +46,11 @@ def export_viewer(
     """Writes the page with the `job.gaussians` Gaussians of a checkpoint that have the largest coverage, viewed from
     the middle key frame of `job.eval_camera`.
 
-    Objects move as recorded or as one of `edits` says, in the colours of the drive's middle image. Raises DatasetError
+    Objects move as recorded or as one of `edits` says, in the colours of the shown time. Raises DatasetError
     if the scene has no key frame of that camera or one of their images cannot be read.
     """
     model, recorded = trained_model(checkpoint), recorded_path(scene, job.eval_camera)
-    groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera))
+    groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera), job.time_s)
     kept = thinned_groups(groups, job.gaussians)
     content = ViewerContent(
         kept, model.sky, model.antialiased, recorded,

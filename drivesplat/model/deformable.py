@@ -22,7 +22,7 @@ from drivesplat.model.deformation import Field, Undeformed
 from drivesplat.model.deformation_network import NetworkField
 from drivesplat.model.lattice import LatticeField
 from drivesplat.model.parameters import make_parameters
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.part import ActorPlacement, Shapes
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.train import DeformableSettings, GaussianSettings
 
@@ -91,6 +91,16 @@ class Deformable(Actors):
         turns = normalize(torch.cat([torch.ones_like(moved.turns[:, :1]), moved.turns], dim=1), dim=1)
         quats = (left_factor(turns) @ p["quats"][..., None])[..., 0]
         return LocalGaussians(p["means"] + moved.shifts, quats, p["scales"], p["opacities"])
+
+    @torch.no_grad()
+    def shapes(self, track_id: str, times: Sequence[float]) -> Shapes | None:
+        rows = self.of_track(track_id)
+        if rows is None:
+            return None
+        self.precompute(times)
+        locals_ = [self.local(self.time_state(time)) for time in times]
+        quats = normalize(torch.stack([local.quats[rows] for local in locals_]), dim=-1)
+        return Shapes(torch.stack([local.means[rows] for local in locals_]), quats)
 
     def learning_rates(self) -> dict[str, float]:
         own = {"stride": self._gait.lr_stride, "phase": self._gait.lr_phase}

@@ -7,6 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -60,10 +61,17 @@ class PartDefinition:
 @dataclass(frozen=True)
 class RigidGroup:
     """Gaussians that move as one rigid body: in world coordinates where `motion` is None, else in the frame of the
-    moving object (their spherical harmonics too)."""
+    moving object (their spherical harmonics too). Those of an object that deforms have the shape of one time."""
 
     gaussians: Gaussians
     motion: Motion | None
+
+
+class Shapes(NamedTuple):
+    """The centres (metres) and unit quaternions (w, x, y, z) of an object's n Gaussians in its frame at t times."""
+
+    means: Float[Tensor, "t n 3"]
+    quats: Float[Tensor, "t n 4"]
 
 
 class Part(nn.Module, ABC):
@@ -158,6 +166,10 @@ class Part(nn.Module, ABC):
         """Its Gaussians with the colours of a time as rigid groups: one static group, or one for every track. Names are
         unique in a model."""
         return {self.name: RigidGroup(self.at(time), None)}
+
+    def shapes(self, track_id: str, times: Sequence[float]) -> Shapes | None:
+        """The shapes of a track's Gaussians at `times`, in the order of its rigid group; None for what is rigid."""
+        return None
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
         """Its own weighted terms of the training loss, by name."""

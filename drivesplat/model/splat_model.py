@@ -14,7 +14,7 @@ from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Sky
+from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.view import View, depth_at_lines, where_seen
 from drivesplat.rasterization import Rendering, rasterize
@@ -121,6 +121,11 @@ class SplatModel(nn.Module):
                 )
             found |= groups
         return found
+
+    def shapes(self, track_id: str, times: Sequence[float]) -> Shapes | None:
+        """The shapes of an object's Gaussians at `times`: see `Part.shapes`."""
+        found = (part.shapes(track_id, times) for part in self.parts)
+        return next((shapes for shapes in found if shapes is not None), None)
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """The mask of a track's rows of `gaussians_at`; None where no part knows the track as an object."""

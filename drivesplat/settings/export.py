@@ -27,6 +27,9 @@ class ExportSettings(Settings):
     sh_degree: int | None = Field(None, ge=0, le=3)
     """Minimum degree of spherical harmonics in PLY, spz and sog files, for viewers that insist on 3: higher
     coefficients are 0. null: the degree of the training."""
+    time_s: float | None = Field(None, ge=0)
+    """The time in seconds since the first image that splat.ply, spz and sog files show, and whose colours, and shapes
+    of people, other exports have where they show no others. null: that of the middle image."""
     usd_gaussians: int = Field(1_000_000, ge=1)
     """Maximum number of Gaussians in scene.usdz. Those with the largest opacity times area are kept."""
     viewer_gaussians: int = Field(300_000, ge=1)
@@ -52,6 +55,7 @@ class ExportJob(Settings):
 
     eval_camera: str
     gaussians: int
+    time_s: float | None = None
 
 
 class ViewerJob(ExportJob):
@@ -73,6 +77,7 @@ class SplatJob(Settings):
     """All settings that determine one splat.ply with its parts, or one splat.spz."""
 
     sh_degree: int | None = None
+    time_s: float | None = None
 
 
 class DriveJob(Settings):

@@ -189,6 +189,7 @@ def _viewer(at: Place) -> dict[str, Any]:
     export, editable = at.config.export, at.config.all_methods[at.method].moving_parts
     return {
         "gaussians": export.viewer_gaussians,
+        "time_s": export.time_s,
         "image_width": export.viewer_images,
         "edits": scene_edits(at.config, at.scene) if editable else {},
         "methods": tuple(sorted(at.config.methods)),
@@ -248,8 +249,11 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),
-    "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree}),
-    "export_usd": (ExportJob, lambda at: {"gaussians": at.config.export.usd_gaussians}),
+    "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree, "time_s": at.config.export.time_s}),
+    "export_usd": (
+        ExportJob,
+        lambda at: {"gaussians": at.config.export.usd_gaussians, "time_s": at.config.export.time_s},
+    ),
     "export_viewer": (ViewerJob, _viewer),
     "export_colmap": (Settings, _nothing),
     "export_spz": (Settings, _nothing),

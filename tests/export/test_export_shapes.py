@@ -1,0 +1,137 @@
+"""Objects that deform, in exports: the shapes that the model has, at the times that were asked for."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import motion_through, round_gaussians, track_of
+from helpers.hand_made_traffic import TURNING, with_turning_track
+from pxr import Gf, Usd, UsdVol
+
+from drivesplat.errors import ConfigError
+from drivesplat.export.sampled_motion import SHAPES_PER_SECOND, SampledMotion, shape_seconds
+from drivesplat.export.splat_asset import write_parts
+from drivesplat.export.thinning import thinned_groups
+from drivesplat.export.trained_parts import shown_timestamp, trained_gaussians, trained_groups
+from drivesplat.export.usd import splat_stage, write_usdz
+from drivesplat.io.storage import read_json
+from drivesplat.model.deformable import Deformable
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.deformable import LatticeSettings
+from drivesplat.settings.train import DeformableSettings, GaussianSettings
+
+SIZE, TIMES = (0.8, 0.6, 1.8), 0.5 * np.arange(9)
+NO_TIMES = np.array([], dtype=np.int64)
+PROVENANCE = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64, "stages": {}}
+
+
+@pytest.fixture(scope="module")
+def people() -> Deformable:
+    """One who walks along x for four seconds, 30 Gaussians with random deformations."""
+    rng = np.random.default_rng(0)
+    walker = track_of(motion_through(TIMES, [[1.5 * t, 2.0, 0.9] for t in TIMES], 0.0 * TIMES), TURNING, SIZE)
+    settings = DeformableSettings(lattice=LatticeSettings(nodes=(3, 4, 5)))
+    points, colors = rng.uniform(-0.4, 0.4, (30, 3)) * SIZE, rng.uniform(0.0, 1.0, (30, 3))
+    part = Deformable.from_points([walker], [points], [colors], settings, GaussianSettings())
+    with torch.no_grad():
+        part.shared["lattice"] += 0.1 * torch.from_numpy(rng.normal(size=part.shared["lattice"].shape)).float()
+    return part
+
+
+@pytest.fixture(scope="module")
+def model(people) -> SplatModel:
+    return SplatModel([round_gaussians([[1.0, 2.0, 3.0]], sizes=0.5), people], None)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene):
+    return with_turning_track(tiny_scene)
+
+
+def in_box(people: Deformable, second: float) -> np.ndarray:
+    return people.local(people.time_state(second)).means.detach().numpy()
+
+
+def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, scene):
+    shapes = trained_groups(model, scene, NO_TIMES)[TURNING].shapes
+    assert shapes is not None and shapes.means.shape == (len(shapes.seconds), 30, 3)
+    for second, means in zip(shapes.seconds, shapes.means, strict=True):
+        np.testing.assert_allclose(means, in_box(people, float(second)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(shapes.quats, axis=-1), 1.0, atol=1e-6)
+    assert np.abs(shapes.means - shapes.means[0]).max() > 0.05
+
+
+def test_what_is_rigid_has_no_shapes(model, scene):
+    assert trained_groups(model, scene, NO_TIMES)["background"].shapes is None
+    assert model.shapes("nobody", [0.0]) is None
+
+
+def test_shapes_are_sampled_while_the_object_is_present():
+    spans = ((0.05, 0.3), (1.0, 1.2))
+    seconds = shape_seconds(SampledMotion(np.zeros(1), np.eye(4)[None], spans, 0.0))
+    assert all(end in seconds for span in spans for end in span)
+    assert all(any(first <= second <= last for first, last in spans) for second in seconds)
+    within = seconds[seconds < 0.5]
+    assert np.diff(within).max() < 1.0 / SHAPES_PER_SECOND + 1e-5
+
+
+def test_thinning_leaves_each_gaussian_its_own_shapes(model, scene):
+    groups = trained_groups(model, scene, NO_TIMES)
+    kept = thinned_groups(groups, 12)[TURNING]
+    whole = groups[TURNING]
+    rows = [int((whole.gaussians.means == mean).all(dim=1).nonzero()) for mean in kept.gaussians.means]
+    assert 0 < len(rows) < 30
+    np.testing.assert_array_equal(kept.shapes.means, whole.shapes.means[:, rows])
+    np.testing.assert_array_equal(kept.shapes.quats, whole.shapes.quats[:, rows])
+
+
+def test_a_gaussian_that_is_not_finite_is_dropped_with_its_shapes(people, scene):
+    broken = Deformable({name: value.detach().clone() for name, value in people.params.items()},
+                        people.timeline.tracks, people._settings, GaussianSettings())  # fmt: skip
+    with torch.no_grad():
+        broken.params["opacities"][4] = torch.nan
+    group = trained_groups(SplatModel([broken], None), scene, NO_TIMES)[TURNING]
+    assert len(group.gaussians) == 29 and group.shapes.means.shape[1] == 29
+
+
+def test_usd_plays_positions_orientations_and_extents(model, people, scene, tmp_path):
+    groups = trained_groups(model, scene, NO_TIMES)
+    write_usdz(tmp_path / "a.usdz", splat_stage(groups, [(0.0, Gf.Camera())], {}))
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
+    splat = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"/World/actors/_{TURNING}"))
+    shapes = groups[TURNING].shapes
+    for i in range(0, len(shapes.seconds), 7):
+        code = Usd.TimeCode(float(shapes.seconds[i]) * 30.0)
+        positions = np.array(splat.GetPositionsAttr().Get(code))
+        np.testing.assert_allclose(positions, in_box(people, float(shapes.seconds[i])), atol=1e-5)
+        real = np.array([quat.GetReal() for quat in splat.GetOrientationsAttr().Get(code)])
+        np.testing.assert_allclose(real, shapes.quats[i, :, 0], atol=1e-5)
+        low, high = np.array(splat.GetExtentAttr().Get(code))
+        assert (low < positions).all() and (positions < high).all()
+    shown = scene.seconds(shown_timestamp(scene, None))
+    np.testing.assert_allclose(np.array(splat.GetPositionsAttr().Get()), in_box(people, shown), atol=1e-5)
+    still = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/background"))
+    assert still.GetPositionsAttr().GetNumTimeSamples() == 0
+
+
+def test_a_ply_shows_the_time_that_was_asked_for(model, people, scene):
+    for second in (0.25, 1.0):
+        own = trained_groups(model, scene, NO_TIMES, second)[TURNING].gaussians
+        np.testing.assert_allclose(own.means.numpy(), in_box(people, second), atol=1e-6)
+        together = trained_gaussians(model, scene, second)
+        expected = people.at(second).means.detach()
+        np.testing.assert_allclose(together.means[-30:].detach().numpy(), expected.numpy(), atol=1e-5)
+
+
+def test_the_record_of_parts_tells_what_deforms_and_when(model, scene, tmp_path):
+    groups = trained_groups(model, scene, NO_TIMES, 1.0)
+    write_parts(tmp_path / "parts.json", groups, scene, PROVENANCE, 1.0)
+    record = read_json(tmp_path / "parts.json", "export")
+    assert {part["name"]: part["deforms"] for part in record["parts"]} == {"background": False, TURNING: True}
+    assert record["colors_timestamp"] == record["first_image"] + 1_000_000
+
+
+def test_a_time_after_the_last_image_is_refused(scene):
+    last = scene.seconds(max(frame.timestamp for frame in scene.frames))
+    assert shown_timestamp(scene, last) == max(frame.timestamp for frame in scene.frames)
+    with pytest.raises(ConfigError, match=r"export\.time_s is 1000\.0, but the last image of scene"):
+        shown_timestamp(scene, 1000.0)
