@@ -548,12 +548,12 @@ def test_people_are_captured_and_learn_what_they_learn_without_graphs(field, cap
     assert captured.model.parts[1].shared["lattice" if field == "lattice" else "weight2"].abs().max() > 1e-4
 
 
-@pytest.mark.parametrize("own", [{}, {"own": True, "geometry": 0.1}, {"geometry": 0.0}])
-def test_scans_are_captured_and_learn_what_they_learn_without_graphs(own, caplog):
+@pytest.mark.parametrize("limits", [{}, {"fine_tune": 0.3, "geometry": 0.1}, {"geometry": 0.0}])
+def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, caplog):
     """Of a sensor that moves while it turns, so that both halves of a revolution are rendered."""
     moving = {"linear": np.array([3.0, 0.5, 0.0]), "angular": np.array([0.0, 0.0, 0.3])}
     recorded = [replace(scan_of_a_wall(x), seconds=x, **moving) for x in (0.5, 1.0)]
-    half = ScanTrainingSettings(share=0.5, **own)
+    half = ScanTrainingSettings(share=0.5, **limits)
     captured, mine = trained_with(True, recorded=recorded, scans=half)
     eager, theirs = trained_with(False, recorded=recorded, scans=half)
     assert not caplog.records, "nothing was refused"

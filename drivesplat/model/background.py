@@ -60,6 +60,7 @@ class Background(Part):
         return replace(
             gaussians,
             means=p["means"] + p["lidar_means"],
+            quats=p["quats"] + p["lidar_quats"],
             scales=torch.exp(p["scales"] + p["lidar_scales"]),
             opacities=torch.sigmoid(p["opacities"] + p["lidar_opacities"]),
         )

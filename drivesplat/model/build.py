@@ -121,7 +121,7 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
         record.scene_scale,
         init.classes,
         init.echo,
-        init.echo is not None and settings.scans.own,
+        init.echo is not None and settings.scans.fine_tune > 0,
     )
 
 

@@ -3,7 +3,7 @@
 `means` (n, 3) metres, `scales` (n, 3) log metres, `quats` (n, 4) w, x, y, z, `opacities` (n,) logits, `sh0` and `shN`
 spherical harmonics of degree 0 and of the degrees above; with semantic classes also `classes` (n, c) logits; with LiDAR
 also `echoes` (n, 4, 2), see `drivesplat.model.gaussians.Gaussians`, their directions in the frame of the Gaussians, and
-where a LiDAR sees Gaussians elsewhere than cameras do, OFFSETS of `means`, `scales` and `opacities`.
+where a LiDAR sees Gaussians elsewhere than cameras do, OFFSETS of their geometry.
 """
 
 import math
@@ -16,7 +16,12 @@ from torch import Tensor, nn
 from drivesplat.kernels.spherical_harmonics import SH_C0
 from drivesplat.settings.train import GaussianSettings
 
-OFFSETS = {"means": "lidar_means", "scales": "lidar_scales", "opacities": "lidar_opacities"}
+OFFSETS = {
+    "means": "lidar_means",
+    "quats": "lidar_quats",
+    "scales": "lidar_scales",
+    "opacities": "lidar_opacities",
+}
 """The parameters that a LiDAR adds to others, by the names of these."""
 
 
@@ -35,17 +40,19 @@ def init_params(
     spacing = np.sqrt(np.mean(distances**2, axis=1)) if neighbours > 1 else np.ones(len(positions))
     scales = torch.from_numpy(np.log(np.maximum(spacing * settings.init_scale, 1e-4))).float()
     count = len(positions)
-    shapes = {"lidar_means": (3,), "lidar_scales": (3,), "lidar_opacities": ()} if offsets else {}
-    return {
+    geometry = {
         "means": torch.from_numpy(np.asarray(positions)).float(),
         "scales": scales[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         "opacities": torch.full((count,), math.log(settings.init_opacity / (1.0 - settings.init_opacity))),
+    }
+    return {
+        **geometry,
         "sh0": ((torch.from_numpy(np.asarray(colors)).float() - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3),
         **({"classes": torch.zeros(count, classes)} if classes else {}),
         **({} if echo is None else {"echoes": _echoes(count, echo)}),
-        **{name: torch.zeros(count, *shape) for name, shape in shapes.items()},
+        **({name: torch.zeros_like(geometry[of]) for of, name in OFFSETS.items()} if offsets else {}),
     }
 
 

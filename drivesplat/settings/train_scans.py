@@ -19,10 +19,10 @@ class ScanTrainingSettings(Settings):
     geometry: float = Field(1.0, ge=0, le=1)
     """Factor of the gradient by which scans move and shape Gaussians. 0 = they fit intensities and returns alone, and
     images are rendered as without LiDAR."""
-    own: bool = False
-    """Background Gaussians have offsets of position, size and opacity for LiDAR, on which `geometry` has no effect."""
-    own_weight: float = Field(0.01, ge=0)
-    """Loss weight of the mean square of these offsets (metres, logarithms and logits)."""
+    fine_tune: float = Field(0.0, ge=0, lt=1)
+    """Fraction of the iterations, the last ones, that all fit scans and change no image: they fit offsets of position,
+    rotation, size and opacity of background Gaussians that only the LiDAR sees, intensities and returns. 0 = no such
+    offsets."""
     range_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute error of ranges (metres), without the worst 5 % of the rays."""
     intensity_weight: float = Field(1.0, ge=0)

@@ -10,11 +10,14 @@ from torch import Tensor, nn
 
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.adam import adam_step
+from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
 DECAY = 0.01
-"""Final learning rate of positions and cameras, as a fraction of the initial rate."""
+"""Final learning rate of positions and cameras, and of all that is fine-tuned, as a fraction of the initial rate."""
+FINE_TUNED_MEANS = 0.1
+"""Initial learning rate of the LiDAR's offsets of positions, as a fraction of that of positions."""
 
 
 class Adam(torch.optim.Adam):
@@ -129,10 +132,9 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
-def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
-    """Sets the learning rates of `step`. Those of positions and cameras decay exponentially, and that of exposures is 0
-    until they start; the others are constant."""
-    done = step / settings.iterations
+def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float, settings: TrainSettings) -> None:
+    """Sets the learning rates after the fraction `done` of the training. Those of positions and cameras decay
+    exponentially, and that of exposures is 0 until they start; the others are constant."""
     decay = DECAY**done
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         if "means" in group:
@@ -142,3 +144,14 @@ def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, step: int
         for camera, optimizer in optimizers.beside_parts.get(name, {}).items():
             rate = model.beside_parts[name].learning_rates()[camera] if done >= start else 0.0
             optimizer.param_groups[0]["lr"] = rate * decay
+
+
+def set_fine_tuning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float) -> None:
+    """Sets the learning rates of what only the LiDAR sees, after the fraction `done` of its fine-tuning. All of them
+    decay exponentially."""
+    for part, group in zip(model.parts, optimizers.parts, strict=True):
+        rates = part.learning_rates()
+        for name in ("echoes", *OFFSETS.values()):
+            if name in group:
+                begin = FINE_TUNED_MEANS if name == OFFSETS["means"] else 1.0
+                group[name].param_groups[0]["lr"] = rates[name] * begin * DECAY**done

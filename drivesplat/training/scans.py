@@ -1,4 +1,4 @@
-"""Training with LiDAR scans: the recorded scans on the device, the iterations that fit them, and their loss."""
+"""Training with LiDAR scans: the recorded scans on the device, their order, and their loss."""
 
 import dataclasses
 import math
@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drivesplat.lidar.sweeps import thin
-from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
@@ -93,19 +92,9 @@ def _logit(probability: float) -> float:
     return math.log(within / (1.0 - within))
 
 
-def scans_before(step: int, share: float) -> int:
-    """The number of the first `step` iterations that fit a scan, evenly spread."""
-    return math.floor(step * share)
-
-
-def fits_scan(step: int, share: float) -> bool:
-    """Whether an iteration fits a scan in place of an image."""
-    return scans_before(step + 1, share) > scans_before(step, share)
-
-
-def scan_index(count: int, step: int, share: float, seed: int) -> int:
-    """The index of the scan of an iteration: a new seeded permutation every epoch."""
-    return view_index(count, scans_before(step, share), seed + SCANS_SEED)
+def scan_index(count: int, scans_before: int, seed: int) -> int:
+    """The index of the scan of an iteration, after so many that fitted scans: a new seeded permutation every epoch."""
+    return view_index(count, scans_before, seed + SCANS_SEED)
 
 
 def scan_terms(
@@ -126,13 +115,7 @@ def scan_terms(
         terms["scan_intensity"] = weights.intensity_weight * (errors * returned).sum() / count
     if picture.alpha_before is not None:
         terms["scan_sight"] = weights.sight_weight * (picture.alpha_before * returned).sum() / count
-    return {**terms, **_offsets(model, weights.own_weight), **regularization(picture.gaussians, model, settings)}
-
-
-def _offsets(model: SplatModel, weight: float) -> dict[str, Float[Tensor, ""]]:
-    """The weighted size of what LiDAR adds to parameters of Gaussians, if anything."""
-    own = [part.params[name] for part in model.parts for name in OFFSETS.values() if name in part.params]
-    return {"scan_own": weight * torch.stack([values.square().mean() for values in own]).sum()} if own else {}
+    return {**terms, **regularization(picture.gaussians, model, settings)}
 
 
 def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan: TrainingScan) -> Float[Tensor, ""]:

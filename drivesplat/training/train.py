@@ -192,7 +192,8 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):
-            with_picture = _due(trainer.step + 1, settings.image_every, settings)
+            last_image = trainer.step + 1 == trainer.scan_schedule.fine_tuning_from
+            with_picture = last_image or _due(trainer.step + 1, settings.image_every, settings)
             terms, picture, view = trainer.fit_one(with_picture)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
@@ -217,6 +218,7 @@ def _due(step: int, every: int, settings: TrainSettings) -> bool:
 def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> None:
     """Ends an iteration: densifies each part and fades Gaussians in empty space."""
     trainer, settings = run.trainer, run.trainer.settings
+    fine_tunes = trainer.fine_tunes
     if trainer.densifies():
         run.check()  # NaN in a strategy triggers a GPU assertion, after which the process cannot continue
         trainer.graphs.check()
@@ -225,7 +227,7 @@ def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> No
     trainer.densify(picture)
     if len(trainer.model) == 0:
         run.check()
-    if empty.known and trainer.step % settings.floaters.every == 0:
+    if empty.known and not fine_tunes and trainer.step % settings.floaters.every == 0:
         for part in (part for part in trainer.model.parts if not part.moves):
             fade_floaters(part, empty)
 

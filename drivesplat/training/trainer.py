@@ -1,6 +1,6 @@
 """The state of a training and its iteration: render one image, compare it, take a step."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
+from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
@@ -23,8 +24,15 @@ from drivesplat.training.densify import Densifier
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
-from drivesplat.training.optimizers import DeviceSchedule, ModelOptimizers, make_optimizers, set_learning_rates
-from drivesplat.training.scans import TrainingScan, fits_scan, scan_index, scan_terms, scans_before
+from drivesplat.training.optimizers import (
+    DeviceSchedule,
+    ModelOptimizers,
+    make_optimizers,
+    set_fine_tuning_rates,
+    set_learning_rates,
+)
+from drivesplat.training.scan_schedule import ScanSchedule
+from drivesplat.training.scans import TrainingScan, scan_index, scan_terms
 from drivesplat.training.views import TrainingView
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
@@ -47,6 +55,7 @@ class Trainer:
     clock: Clock
     graphs: IterationGraphs
     schedule: DeviceSchedule
+    scan_schedule: ScanSchedule
     scans: list[TrainingScan] = field(default_factory=list)
     step: int = 0
 
@@ -70,7 +79,7 @@ class Trainer:
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
         return cls(
             model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
-            list(scans),
+            ScanSchedule.of(settings, len(views), len(scans)), list(scans),
         )  # fmt: skip
 
     @property
@@ -83,18 +92,24 @@ class Trainer:
     @property
     def fits_scan(self) -> bool:
         """Whether the next iteration fits a scan, unless a picture is wanted of it and there are images."""
-        return bool(self.scans) and fits_scan(self.step, self.settings.scans.share)
+        return self.scan_schedule.fits_scan(self.step)
+
+    @property
+    def fine_tunes(self) -> bool:
+        """Whether the next iteration fine-tunes what only the LiDAR sees: it fits a scan and changes no image."""
+        return self.scan_schedule.fine_tunes(self.step)
 
     def fit_one(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView | None]:
         """The first half of an iteration: render a view or a scan, compare, step. Returns its loss terms, the picture
         and the view, both None after a scan. Without `with_picture` the iteration may be that of a scan or a replayed
-        CUDA graph, and the picture is None; without images every iteration is that of a scan."""
-        set_learning_rates(self.model, self.optimizers, self.step, self.settings)
+        CUDA graph, and the picture is None; without images, and where it fine-tunes, it is that of a scan."""
+        self._set_learning_rates()
         step, rates = self.schedule.update(self.step, self.optimizers)
-        if self.fits_scan and not (with_picture and self.images.views):
-            number = scan_index(len(self.scans), self.step, self.settings.scans.share, self.seed)
-            scan = Recording("scan", number)
-            terms = self._captured(scan, lambda: self._learn_scan(self.scans[number], step, rates), self._addresses())
+        if self.fits_scan and (self.fine_tunes or not (with_picture and self.images.views)):
+            number = scan_index(len(self.scans), self.scan_schedule.scans_before(self.step), self.seed)
+            scan, fine = Recording("scan", number), self.fine_tunes
+            layout = fine, *self._addresses()
+            terms = self._captured(scan, lambda: self._learn_scan(self.scans[number], step, rates, fine), layout)
             return terms, None, None
         with self.clock.stage("data"):
             number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
@@ -107,6 +122,14 @@ class Trainer:
         image = Recording("image", (self.images.factor(self.step), number))
         layout = self.images.factor(self.step), self.sh_degree(), *self._addresses()
         return self._captured(image, lambda: iteration()[0], layout), None, view
+
+    def _set_learning_rates(self) -> None:
+        first = self.scan_schedule.fine_tuning_from
+        if self.fine_tunes:
+            done = (self.step - first) / (self.settings.iterations - first)
+            set_fine_tuning_rates(self.model, self.optimizers, done)
+        else:
+            set_learning_rates(self.model, self.optimizers, self.step / first, self.settings)
 
     def _captured(self, recording: Recording, iteration: Callable[[], Terms], layout: Hashable) -> Terms:
         """Runs an iteration with an image or a scan, by its CUDA graph where there is one of the same `layout`."""
@@ -138,7 +161,9 @@ class Trainer:
             picture.info["means2d"].retain_grad()
         return self._follow(loss, terms, step, rates), picture
 
-    def _learn_scan(self, scan: TrainingScan, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
+    def _learn_scan(
+        self, scan: TrainingScan, step: int | Tensor, rates: Mapping[str, Tensor] | None, fine_tunes: bool
+    ) -> Terms:
         """An iteration with a scan, as `_learn`."""
         stage, settings = self.clock.stage, self.settings.scans
         self.model.zero_grad()
@@ -150,18 +175,21 @@ class Trainer:
             if not self.images.views:
                 terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
-        return self._follow(loss, terms, step, rates, settings.geometry)
+        return self._follow(loss, terms, step, rates, lambda: self._limit_gradients(fine_tunes))
 
     def _follow(
-        self, loss: Tensor, terms: Terms, step: int | Tensor, rates: Mapping[str, Tensor] | None, geometry: float = 1.0
+        self,
+        loss: Tensor,
+        terms: Terms,
+        step: int | Tensor,
+        rates: Mapping[str, Tensor] | None,
+        limit_gradients: Callable[[], None] = lambda: None,
     ) -> Terms:
-        """The step down the gradient of a loss, whose gradient for the geometry is multiplied by a factor; returns its
-        terms without gradients."""
+        """The step down the gradient of a loss, limited by `limit_gradients`; returns its terms without gradients."""
         stage = self.clock.stage
         with stage("backward"):
             loss.backward()
-            if geometry != 1.0:
-                self._scale_gradients(geometry)
+            limit_gradients()
         with stage("checks"):
             losses = {f"loss {name}": value for name, value in terms.items()}
             self.guard.watch(step, {**losses, **self._gradient_norms()})
@@ -169,17 +197,19 @@ class Trainer:
             self.optimizers.step(rates)
         return {name: value.detach() for name, value in terms.items()}
 
-    def _scale_gradients(self, factor: float) -> None:
-        """Multiplies the gradients of all parameters that images show; at 0 there are none."""
+    def _limit_gradients(self, fine_tunes: bool) -> None:
+        """Multiplies a scan's gradients of what images show by `scans.geometry`, and leaves the LiDAR's offsets
+        unchanged. Fine-tuning leaves unchanged what images show."""
+        factor = 0.0 if fine_tunes else self.settings.scans.geometry
         for part in self.model.parts:
-            shown = [part.params[name] for name in GEOMETRY] + list(part.shared.values())
-            for parameter in (parameter for parameter in shown if parameter.grad is not None):
-                parameter.grad = parameter.grad.mul_(factor) if factor else None
+            _scale_gradients([*(part.params[name] for name in GEOMETRY), *part.shared.values()], factor)
+            offsets = [part.params[name] for name in OFFSETS.values() if name in part.params]
+            _scale_gradients(offsets, 1.0 if fine_tunes else 0.0)
 
     @property
     def _image_step(self) -> int:
         """The number of iterations so far that fitted an image."""
-        return self.step - (scans_before(self.step, self.settings.scans.share) if self.scans else 0)
+        return self.scan_schedule.images_before(self.step)
 
     def _addresses(self) -> tuple[tuple[int, int], ...]:
         """The addresses and sizes of all parameters. Captured iterations become invalid when they change."""
@@ -187,12 +217,13 @@ class Trainer:
 
     def densifies(self) -> bool:
         """Whether this iteration may add, move or remove Gaussians."""
-        return any(densifier.due(self.step) for densifier in self.densifiers)
+        return not self.fine_tunes and any(densifier.due(self.step) for densifier in self.densifiers)
 
     def densify(self, picture: Picture | None) -> None:
-        """The second half of an iteration: each part adds, removes and relocates its Gaussians."""
+        """The second half of an iteration: each part adds, removes and relocates its Gaussians, unless it fine-tunes."""
         info = {} if picture is None else picture.info
-        for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
+        parts = zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True)
+        for densifier, optimizers, rows in () if self.fine_tunes else parts:
             densifier.after_step(self.step, optimizers, info, rows, self.images.factor(self.step) > 1)
         self.step += 1
 
@@ -214,3 +245,10 @@ class Trainer:
         """The name of a parameter of the model in messages: 'background means', 'sky texels'."""
         owner, *place, name = parameter.split(".")
         return f"{self.model.parts[int(place[0])].name if owner == 'parts' else owner} {name}"
+
+
+def _scale_gradients(parameters: Iterable[Tensor], factor: float) -> None:
+    """Multiplies gradients by a factor; at 0 there are none."""
+    for parameter in parameters:
+        if parameter.grad is not None and factor != 1.0:
+            parameter.grad = parameter.grad.mul_(factor) if factor else None

@@ -215,7 +215,7 @@ def test_a_checkpoint_holds_corrections_and_their_times(learned):
 
 def test_the_learning_rate_of_corrections_decays_and_they_are_logged(learned):
     optimizers = make_optimizers(learned)
-    set_learning_rates(learned, optimizers, 50, TrainSettings(iterations=100))
+    set_learning_rates(learned, optimizers, 0.5, TrainSettings())
     group = optimizers.beside_parts["camera_poses"]["FRONT"].param_groups[0]
     assert group["lr"] == pytest.approx(0.1 * LOOSE["learning_rate"])
     figures = learned.camera_poses.figures()

@@ -199,7 +199,7 @@ def test_exposures_start_late_and_their_learning_rate_decays():
     optimizers = make_optimizers(model)
     rates = []
     for step in (0, 9, 10, 50, 100):
-        set_learning_rates(model, optimizers, step, settings)
+        set_learning_rates(model, optimizers, step / 100, settings)
         rates.append(optimizers.beside_parts["exposure"]["BACK"].param_groups[0]["lr"])
     assert rates == pytest.approx([0.0, 0.0, 0.1 * 0.01**0.1, 0.01, 0.001])
 

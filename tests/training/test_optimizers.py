@@ -44,7 +44,7 @@ def test_a_step_together_is_every_optimizers_own(device):
         optimizers = make_optimizers(model)
         for step in range(7):
             give_gradients(model, step)
-            set_learning_rates(model, optimizers, step, settings)
+            set_learning_rates(model, optimizers, step / settings.iterations, settings)
             if together:
                 optimizers.step()
                 assert all(parameter.grad is None for parameter in model.parameters())
@@ -79,7 +79,7 @@ def test_steps_at_device_rates_equal_those_of_adam(kernels, monkeypatch):
         optimizers, schedule = make_optimizers(model), DeviceSchedule(torch.device(device))
         for step in range(7):
             give_gradients(model, step)
-            set_learning_rates(model, optimizers, step, settings)
+            set_learning_rates(model, optimizers, step / settings.iterations, settings)
             counted, rates = schedule.update(step, optimizers)
             optimizers.step(rates)
             assert int(counted) == step

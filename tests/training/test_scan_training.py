@@ -18,6 +18,7 @@ from helpers.trainings import (
     scan_of_a_wall,
     settings_of,
     untrained,
+    untrained_street,
 )
 from pydantic import ValidationError
 
@@ -29,13 +30,12 @@ from drivesplat.scene.scan import Scan
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training.run import TrainingInputs, prepare
+from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import (
-    fits_scan,
     initial_echo,
     load_scans,
     scan_index,
     scan_terms,
-    scans_before,
     with_scan_points,
 )
 from drivesplat.training.train import train
@@ -58,21 +58,43 @@ def terms_of(picture: ScanPicture, scan, **weights) -> dict[str, float]:
     return {name: float(value) for name, value in scan_terms(picture, scan, model, settings).items()}
 
 
+def scheduled(share: float, fine_tune: float = 0.0, images: int = 4, scans: int = 5) -> ScanSchedule:
+    """The schedule of 300 iterations."""
+    settings = settings_of(iterations=300, scans=ScanTrainingSettings(share=share, fine_tune=fine_tune))
+    return ScanSchedule.of(settings, images, scans)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.25, 1 / 3, 0.5, 0.9])
 def test_scans_are_spread_evenly_over_the_iterations(share):
-    fitted = [fits_scan(step, share) for step in range(300)]
-    assert sum(fitted) == math.floor(300 * share) == scans_before(300, share)
+    schedule = scheduled(share)
+    fitted = [schedule.fits_scan(step) for step in range(300)]
+    assert sum(fitted) == math.floor(300 * share) == schedule.scans_before(300) == 300 - schedule.images_before(300)
+    assert not any(schedule.fine_tunes(step) for step in range(300))
     for start in range(0, 300, 30):
         assert abs(sum(fitted[start : start + 30]) - 30 * share) <= 1
 
 
+def test_the_last_iterations_fine_tune_the_lidar():
+    schedule = scheduled(0.25, fine_tune=0.2)
+    assert [schedule.fine_tunes(step) for step in (0, 239, 240, 299)] == [False, False, True, True]
+    assert sum(schedule.fits_scan(step) for step in range(240)) == 60 and schedule.images_before(240) == 180
+    assert all(schedule.fits_scan(step) for step in range(240, 300))
+    assert (schedule.scans_before(300), schedule.images_before(300)) == (120, 180)
+
+
+@pytest.mark.parametrize("changes", [{"images": 0}, {"scans": 0}, {"share": 0.0}])
+def test_nothing_is_fine_tuned_without_images_or_without_scans(changes):
+    schedule = scheduled(**{"share": 0.25, "fine_tune": 0.2, **changes})
+    assert not any(schedule.fine_tunes(step) for step in range(300))
+    assert schedule.scans_before(300) == (75 if changes.get("images") == 0 else 0)
+
+
 def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
-    steps = [step for step in range(80) if fits_scan(step, 0.25)]
-    taken = [scan_index(5, step, 0.25, seed=3) for step in steps]
+    taken = [scan_index(5, before, seed=3) for before in range(20)]
     for epoch in range(0, 20, 5):
         assert sorted(taken[epoch : epoch + 5]) == [0, 1, 2, 3, 4]
-    assert taken == [scan_index(5, step, 0.25, seed=3) for step in steps]
-    assert taken != [scan_index(5, step, 0.25, seed=4) for step in steps]
+    assert taken == [scan_index(5, before, seed=3) for before in range(20)]
+    assert taken != [scan_index(5, before, seed=4) for before in range(20)]
 
 
 def test_every_image_is_taken_once_an_epoch_whatever_the_share():
@@ -170,40 +192,105 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
     assert picture.returned[scans[1].returned].median() > 0.7 > 0.5 > picture.returned[~scans[1].returned].median()
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_scans_leave_the_geometry_alone_where_they_are_told_to(own):
-    settings = settings_of(scans=ScanTrainingSettings(share=0.5, geometry=0.0, own=own))
-    scans = load_scans([scan_of_a_wall()], settings.scans, CPU)
-    model = with_echoes(settings, offsets=own)
-    trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=scans)
-    before = {name: value.detach().clone() for name, value in model.parts[0].params.items()}
-    trainer.step = 1
+def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[Trainer, dict[str, set[str]]]:
+    """A trainer after one of 10 iterations, which fitted a scan, and the names of the parameters that it changed, by
+    part."""
+    settings = settings_of(iterations=10, scans=ScanTrainingSettings(share=0.5, **scans))
+    still = with_echoes(settings, offsets=settings.scans.fine_tune > 0)
+    model = untrained_street(settings, echo=(0.0, 2.0)) if street else still
+    recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
+    trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=recorded)
+    before = {part.name: {k: v.detach().clone() for k, v in part.params.items()} for part in model.parts}
+    trainer.step = step
     assert trainer.fits_scan
-    terms, picture, view = trainer.fit_one(with_picture=False)
+    terms, picture, view = trainer.fit_one(with_picture=trainer.fine_tunes)
     assert picture is None and view is None and "scan_range" in terms
-    changed = {name for name, value in model.parts[0].params.items() if not torch.equal(value, before[name])}
-    assert changed == {"echoes", *(OFFSETS.values() if own else ())}
+    trainer.densify(picture)
+    changed = {
+        part.name: {k for k, v in part.params.items() if not torch.equal(v, before[part.name][k])}
+        for part in model.parts
+    }
+    return trainer, changed
+
+
+@pytest.mark.parametrize("fine_tune", [0.0, 0.2])
+def test_scans_leave_the_geometry_alone_where_they_are_told_to(fine_tune):
+    """The noise of MCMC moves Gaussians in any case."""
+    _, changed = changed_by_a_scan(1, geometry=0.0, fine_tune=fine_tune)
+    assert changed["background"] - {"means"} == {"echoes"}
+
+
+def test_fine_tuning_changes_what_the_lidar_alone_sees():
+    trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.2)
+    assert changed == {"background": {"echoes", *OFFSETS.values()}, "actors": {"echoes"}}
+    assert trainer.step == 9 and trainer.fine_tunes and not trainer.densifies()
+    _, before = changed_by_a_scan(7, fine_tune=0.2)
+    assert not before["background"] & {*OFFSETS.values()} and "scales" in before["background"]
+
+
+def test_the_rates_of_fine_tuning_decay():
+    settings = settings_of(iterations=100, scans=ScanTrainingSettings(share=0.5, fine_tune=0.2))
+    recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
+    trainer = Trainer.begin(with_echoes(settings, offsets=True), recorded_views(4), settings, 0, CPU, scans=recorded)
+    (group,) = trainer.optimizers.parts
+    rates = trainer.model.parts[0].learning_rates()
+
+    def share_of_rate(step: int, name: str) -> float:
+        trainer.step = step
+        trainer._set_learning_rates()
+        return group[name].param_groups[0]["lr"] / rates[name]
+
+    assert [share_of_rate(step, "means") for step in (0, 40)] == pytest.approx([1.0, 0.1]), "ends with the images"
+    assert [share_of_rate(step, "echoes") for step in (79, 80, 90)] == pytest.approx([1.0, 1.0, 0.1])
+    assert [share_of_rate(step, "lidar_scales") for step in (80, 90)] == pytest.approx([1.0, 0.1])
+    assert [share_of_rate(step, "lidar_means") for step in (80, 90)] == pytest.approx([0.1, 0.01])
+
+
+def test_fine_tuning_renders_scans_better_and_images_as_before():
+    """Before and after the last iterations of a training, which fine-tune."""
+    scans = ScanTrainingSettings(share=0.25, geometry=0.0, fine_tune=0.5, range_weight=1.0)
+    settings = settings_of(iterations=160, scans=scans)
+    recorded = load_scans([scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)], scans, CPU)
+    model, views = with_echoes(settings, offsets=True), recorded_views(4)
+    trainer = Trainer.begin(model, views, settings, 0, CPU, scans=recorded)
+
+    @torch.no_grad()
+    def image_and_error() -> tuple[torch.Tensor, float]:
+        picture, scan = model.scan(recorded[1].view), recorded[1]
+        return model.render(views[0].view).image, float((picture.range - scan.range)[scan.returned].abs().median())
+
+    while not trainer.fine_tunes:
+        _, picture, _ = trainer.fit_one(with_picture=False)
+        trainer.densify(picture)
+    image, error = image_and_error()
+    while trainer.step < settings.iterations:
+        _, picture, _ = trainer.fit_one(with_picture=True)
+        trainer.densify(picture)
+    again, better = image_and_error()
+    assert torch.equal(again, image) and better < 0.7 * error
 
 
 def test_a_factor_scales_the_gradients_of_what_images_show():
-    settings = settings_of(scans=ScanTrainingSettings(share=0.5, own=True))
-    model = with_echoes(settings, offsets=True)
-    trainer = Trainer.begin(model, [], settings, 0, CPU, scans=load_scans([scan_of_a_wall()], settings.scans, CPU))
-    shown = {"means", "quats", "scales", "opacities"}
-    for factor in (0.25, 0.0):
+    shown, offsets = {"means", "quats", "scales", "opacities"}, {*OFFSETS.values()}
+    for factor, fine_tunes in ((0.25, False), (0.0, False), (0.25, True)):
+        settings = settings_of(scans=ScanTrainingSettings(share=0.5, fine_tune=0.2, geometry=factor))
+        model = with_echoes(settings, offsets=True)
+        trainer = Trainer.begin(model, [], settings, 0, CPU, scans=load_scans([scan_of_a_wall()], settings.scans, CPU))
         for parameter in model.parts[0].params.values():
             parameter.grad = torch.ones_like(parameter)
-        trainer._scale_gradients(factor)
+        trainer._limit_gradients(fine_tunes)
         for name, parameter in model.parts[0].params.items():
-            if name in shown and not factor:
-                assert parameter.grad is None, "a step of Adam would move it on"
+            of_images = 0.0 if fine_tunes else factor
+            expected = of_images if name in shown else float(fine_tunes) if name in offsets else 1.0
+            if expected:
+                assert (parameter.grad == expected).all(), name
             else:
-                assert (parameter.grad == (factor if name in shown else 1.0)).all(), name
+                assert parameter.grad is None, "a step of Adam would move it on"
 
 
 def test_cameras_do_not_see_what_lidar_sees_elsewhere():
     """Offsets of all background Gaussians by 0.5 m along the rays: the wall is farther for the LiDAR alone."""
-    settings = settings_of(scans=ScanTrainingSettings(share=0.5, own=True), antialiased=False)
+    settings = settings_of(scans=ScanTrainingSettings(share=0.5, fine_tune=0.2), antialiased=False)
     model, (scan,) = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
     (view, *_) = recorded_views(1)
     image, range_before = model.render(view.view).image, model.scan(scan.view).range
@@ -212,20 +299,11 @@ def test_cameras_do_not_see_what_lidar_sees_elsewhere():
     assert torch.equal(model.render(view.view).image, image)
     met = range_before > 1.0
     assert 0.3 < (model.scan(scan.view).range - range_before)[met].median() < 0.7
+    again = rebuild_model(model.state_dict(), definitions(model), "none", settings)
+    assert torch.equal(again.scan(scan.view).range, model.scan(scan.view).range), "offsets survive a checkpoint"
     with torch.no_grad():
         model.parts[0].params["lidar_opacities"].fill_(-20.0)
     assert model.scan(scan.view).alpha.max() < 1e-3 and torch.equal(model.render(view.view).image, image)
-
-
-def test_offsets_shrink_by_their_weight_and_survive_a_checkpoint():
-    settings = settings_of(scans=ScanTrainingSettings(share=0.5, own=True, own_weight=2.0))
-    model, (scan,) = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
-    with torch.no_grad():
-        model.parts[0].params["lidar_scales"].fill_(-0.3)
-    terms = scan_terms(model.scan(scan.view), scan, model, settings)
-    assert float(terms["scan_own"].detach()) == pytest.approx(2.0 * 0.09)
-    again = rebuild_model(model.state_dict(), definitions(model), "none", settings)
-    assert torch.equal(again.scan(scan.view).range, model.scan(scan.view).range)
 
 
 def test_an_iteration_whose_picture_is_wanted_fits_an_image():

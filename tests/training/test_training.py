@@ -272,7 +272,7 @@ def test_positions_learn_ever_more_slowly(step, factor):
     model = untrained(settings_of())
     optimizers = make_optimizers(model)
     before = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
-    set_learning_rates(model, optimizers, step, settings_of(iterations=100))
+    set_learning_rates(model, optimizers, step / 100, settings_of(iterations=100))
     after = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
     assert after.pop("0.means") == pytest.approx(2e-3 * factor)
     assert after == {name: rate for name, rate in before.items() if name != "0.means"}
