@@ -21,8 +21,8 @@ class ScanTrainingSettings(Settings):
     images are rendered as without LiDAR."""
     fine_tune: float = Field(0.0, ge=0, lt=1)
     """Fraction of the iterations, the last ones, that all fit scans and change no image: they fit offsets of position,
-    rotation, size and opacity of background Gaussians that only the LiDAR sees, intensities and returns. 0 = no such
-    offsets."""
+    rotation, size and opacity of background Gaussians that only the LiDAR sees, intensities and returns. Densification
+    and all schedules of images end before them. 0 = no such offsets."""
     range_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute error of ranges (metres), without the worst 5 % of the rays."""
     intensity_weight: float = Field(1.0, ge=0)

@@ -16,8 +16,8 @@ from drivesplat.settings.train import TrainSettings
 
 DECAY = 0.01
 """Final learning rate of positions and cameras, and of all that is fine-tuned, as a fraction of the initial rate."""
-FINE_TUNED_MEANS = 0.1
-"""Initial learning rate of the LiDAR's offsets of positions, as a fraction of that of positions."""
+FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.3, 2.0
+"""Factors of the learning rates at which the fine-tuning of positions, and of all else, begins."""
 
 
 class Adam(torch.optim.Adam):
@@ -153,5 +153,5 @@ def set_fine_tuning_rates(model: SplatModel, optimizers: ModelOptimizers, done: 
         rates = part.learning_rates()
         for name in ("echoes", *OFFSETS.values()):
             if name in group:
-                begin = FINE_TUNED_MEANS if name == OFFSETS["means"] else 1.0
+                begin = FINE_TUNED_MEANS if name == OFFSETS["means"] else FINE_TUNED_OTHERS
                 group[name].param_groups[0]["lr"] = rates[name] * begin * DECAY**done

@@ -120,7 +120,7 @@ class TrainingRun:
             return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves)
         resume_state.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
-        log.info("resuming at iteration %d of %d", trainer.step, trainer.settings.iterations)
+        log.info("resuming at iteration %d of %d", trainer.step, trainer.iterations)
         now = time.monotonic()
         return cls(trainer, folders, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now, curves)
 
@@ -155,10 +155,9 @@ class TrainingRun:
 
     def psnrs(self) -> dict[str, float]:
         """The PSNRs of the curves where they are due, otherwise none."""
-        step, settings = self.trainer.step, self.trainer.settings
-        if not settings.psnr_every or not _due(step, settings.psnr_every, settings):
+        t, every = self.trainer, self.trainer.settings.psnr_every
+        if not every or not _due(t.step, every, t.iterations):
             return {}
-        t = self.trainer
         return t.graphs.retry_without_graphs(lambda: curve_psnrs(t.model, self.curves, t.sh_degree()))
 
     @property
@@ -166,7 +165,7 @@ class TrainingRun:
         """Whether to save the resume state now; after the last iteration the checkpoint is saved instead."""
         step, settings = self.trainer.step, self.trainer.settings
         old_enough = time.monotonic() - self.saved >= settings.checkpoint_apart_s
-        return step % settings.checkpoint_every == 0 and step < settings.iterations and old_enough
+        return step % settings.checkpoint_every == 0 and step < self.trainer.iterations and old_enough
 
     def summary(self) -> TrainingSummary:
         t, on_gpu = self.trainer, self.trainer.device.type == "cuda"
@@ -190,10 +189,9 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     sensors = trainer.sensor_positions
     empty = EmptySpace(*sensor_path(sensors), settings.floaters.radius, trainer.priors.free)
     reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
-    while trainer.step < settings.iterations:
+    while trainer.step < trainer.iterations:
         with trainer.clock.stage(ITERATION):
-            last_image = trainer.step + 1 == trainer.scan_schedule.fine_tuning_from
-            with_picture = last_image or _due(trainer.step + 1, settings.image_every, settings)
+            with_picture = _due(trainer.step + 1, settings.image_every, settings.iterations)
             terms, picture, view = trainer.fit_one(with_picture)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
@@ -210,9 +208,9 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer.end()
 
 
-def _due(step: int, every: int, settings: TrainSettings) -> bool:
-    """Whether something is done after iteration `step`: every so many iterations, and after the last."""
-    return step % every == 0 or step == settings.iterations
+def _due(step: int, every: int, iterations: int) -> bool:
+    """Whether something is done after iteration `step`: every so many iterations, and after the last of `iterations`."""
+    return step % every == 0 or step == iterations
 
 
 def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> None:
@@ -234,7 +232,7 @@ def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> No
 
 def _bound(trainer: Trainer, reach: float) -> None:
     """Now and then moves Gaussians beyond `reach` metres back."""
-    if math.isfinite(reach) and _due(trainer.step, BOUND_EVERY, trainer.settings):
+    if math.isfinite(reach) and _due(trainer.step, BOUND_EVERY, trainer.settings.iterations):
         for part in trainer.model.parts:
             bound_positions(part, reach)
 

@@ -41,7 +41,7 @@ GEOMETRY = ("means", "quats", "scales", "opacities")
 
 @dataclass
 class Trainer:
-    """The state of a training between two iterations."""
+    """The state of a training between two iterations. `settings.iterations` are those before it fine-tunes."""
 
     model: SplatModel
     images: TrainingImages
@@ -72,6 +72,8 @@ class Trainer:
         scans: Sequence[TrainingScan] = (),
     ) -> "Trainer":
         torch.manual_seed(seed)
+        schedule = ScanSchedule.of(settings, len(views), len(scans))
+        settings = settings.model_copy(update={"iterations": schedule.fine_tuning_from})
         optimizers, known = make_optimizers(model), priors.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
         capture = clock is UNTIMED and can_capture(settings, images, device, len(scans))
@@ -79,7 +81,7 @@ class Trainer:
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
         return cls(
             model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
-            ScanSchedule.of(settings, len(views), len(scans)), list(scans),
+            schedule, list(scans),
         )  # fmt: skip
 
     @property
@@ -88,6 +90,11 @@ class Trainer:
         recordings."""
         cameras = [view.view.camera_to_world[:3, 3] for view in self.images.views]
         return torch.stack(cameras or [scan.view.sensor_to_world[:3, 3] for scan in self.scans])
+
+    @property
+    def iterations(self) -> int:
+        """The number of all iterations, with those that fine-tune."""
+        return self.scan_schedule.iterations
 
     @property
     def fits_scan(self) -> bool:
@@ -124,12 +131,10 @@ class Trainer:
         return self._captured(image, lambda: iteration()[0], layout), None, view
 
     def _set_learning_rates(self) -> None:
-        first = self.scan_schedule.fine_tuning_from
         if self.fine_tunes:
-            done = (self.step - first) / (self.settings.iterations - first)
-            set_fine_tuning_rates(self.model, self.optimizers, done)
+            set_fine_tuning_rates(self.model, self.optimizers, self.scan_schedule.fine_tuned(self.step))
         else:
-            set_learning_rates(self.model, self.optimizers, self.step / first, self.settings)
+            set_learning_rates(self.model, self.optimizers, self.step / self.settings.iterations, self.settings)
 
     def _captured(self, recording: Recording, iteration: Callable[[], Terms], layout: Hashable) -> Terms:
         """Runs an iteration with an image or a scan, by its CUDA graph where there is one of the same `layout`."""
