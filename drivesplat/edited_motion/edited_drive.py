@@ -12,19 +12,21 @@ from drivesplat.edited_motion.edited_actors import EditedActor
 
 @dataclass(frozen=True)
 class InstanceMotion:
-    """Poses `object_to_world` (n, 4, 4) at `seconds` (n,) since the first image. The object is present only during
-    `spans`, each from its first to its last second."""
+    """Poses `object_to_world` (n, 4, 4) at `seconds` (n,) since the first image, and the distance `walked` (n,) in
+    metres by which limbs have advanced. The object is present only during `spans`, each from its first to its last
+    second."""
 
     seconds: np.ndarray
     object_to_world: np.ndarray
+    walked: np.ndarray
     spans: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class Instance:
     """An object of an edited drive with the Gaussians of the track `source`, scaled by `scale` about the centre of its
-    box, which then has `size` (3,) metres, and with RGB colours mapped by `color_matrix` (3, 3; None: as trained). It
-    moves by `motion`; None: it is as recorded."""
+    box, which then has `size` (3,) metres, with RGB colours mapped by `color_matrix` (3, 3; None: as trained), and with
+    a gait that is ahead by `phase` cycles. It moves by `motion`; None: it is as recorded."""
 
     id: str
     source: str
@@ -33,6 +35,7 @@ class Instance:
     scale: float
     motion: InstanceMotion | None
     color_matrix: np.ndarray | None = None
+    phase: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -59,5 +62,6 @@ def sampled_actor(actor: EditedActor, seconds: np.ndarray) -> InstanceMotion:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
     spans = tuple((float(seconds[first]), float(seconds[after - 1])) for first, after in edges.reshape(-1, 2))
     shown = seconds[present]
-    poses = actor.poses(shown) if len(shown) else np.zeros((0, 4, 4))
-    return InstanceMotion(shown, poses, spans)
+    if not len(shown):
+        return InstanceMotion(shown, np.zeros((0, 4, 4)), np.zeros(0), spans)
+    return InstanceMotion(shown, actor.poses(shown), actor.walked(shown), spans)

@@ -47,7 +47,7 @@ def _edited_drive(
         Instance(
             actor.id, actor.source, actor.category, actor.size, actor.scale,
             sampled_actor(actor, seconds) if actor.edited else None,
-            actor.color_matrix,
+            actor.color_matrix, actor.phase,
         )
         for actor in edited
     )  # fmt: skip

@@ -1,8 +1,8 @@
 """The stage `export_viewer`: a trained model as viewer.html, one page that needs a browser and no network.
 
 The page uses the WebGL 2 code in `viewer_page/`, which projects, culls and colours as gsplat does, including spherical
-harmonics, moves the rigid groups over time, and shows the learned sky. The page contains no addresses, and its content
-security policy prevents requests.
+harmonics, moves and deforms the groups over time, and shows the learned sky. The page contains no addresses, and its
+content security policy prevents requests.
 
 The payload is base64 of zlib-compressed little-endian arrays, each at a multiple of 4 bytes, listed in the JSON of
 #scene (`viewer_scene`).
@@ -15,6 +15,7 @@ from pathlib import Path
 
 from drivesplat.edited_motion.edited_drive import EditedDrive
 from drivesplat.export import viewer_page as template
+from drivesplat.export.modes import fitted_modes
 from drivesplat.export.thinning import thinned_groups
 from drivesplat.export.trained_parts import trained_groups
 from drivesplat.export.viewer_images import key_frame_images
@@ -56,7 +57,7 @@ def export_viewer(
         kept, model.sky, model.antialiased, recorded,
         edits=edits,
         images=key_frame_images(scene, record, job.eval_camera, job.image_width),
-        method=method, methods=job.methods,
+        method=method, methods=job.methods, modes=fitted_modes(model, kept),
     )  # fmt: skip
     page = viewer_page(content, f"{scene.name} · {method}", provenance)
     with atomic_write(path) as file:

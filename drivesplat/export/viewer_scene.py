@@ -1,12 +1,12 @@
-"""The content of viewer.html: Gaussians by rigid group, their motions, the recorded camera, and the sky as arrays.
+"""The content of viewer.html: Gaussians by group, their motions and modes, the recorded camera, and the sky as arrays.
 
 Coefficients of spherical harmonics beyond the first are `sh_range` t |t| with t the stored byte over 127, finest where
-most of them are: near zero.
+most of them are: near zero. So are modes, with `modes_range`.
 """
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.edited_motion.edited_drive import EditedDrive, Instance, InstanceMotion
+from drivesplat.export.modes import Gait, Modes
 from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians, concatenate
@@ -39,8 +40,8 @@ class RecordedPath:
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """What a page shows: rigid groups, a sky (None: black), the recorded camera, edited drives, the recorded `images`
-    (records of `viewer_images`), and the methods of which it has pages beside it."""
+    """What a page shows: groups, a sky (None: black), the recorded camera, edited drives, the recorded `images` (records
+    of `viewer_images`), the methods that have pages beside it, and the `modes` of groups that deform."""
 
     groups: Mapping[str, SampledGroup]
     sky: Sky | None
@@ -50,6 +51,7 @@ class ViewerContent:
     images: Sequence[dict[str, Any]] = ()
     method: str = ""
     methods: Sequence[str] = ()
+    modes: Mapping[str, Modes] = field(default_factory=dict)
 
 
 def recorded_path(scene: Scene, camera: str) -> RecordedPath:
@@ -72,9 +74,7 @@ def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
     `means` (n, 3) float32 and `scales` (n, 3) float16 in metres, unit `quats` (n, 4) float16, `opacities` (n,) uint8,
     `sh0` (n, 3) float16, `shN` (n, k - 1, 3) int8.
     """
-    shN = gaussians.shN.float()
-    sh_range = float(shN.detach().abs().max()) if shN.numel() else 0.0
-    roots = torch.sign(shN) * torch.sqrt(shN.abs() / (sh_range or 1.0))
+    shN, sh_range = _roots(gaussians.shN.detach().cpu().numpy())
     largest = torch.finfo(torch.float16).max
     arrays = {
         "means": gaussians.means.float(),
@@ -82,75 +82,111 @@ def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
         "quats": torch.nn.functional.normalize(gaussians.quats.float(), dim=-1).half(),
         "opacities": torch.round(gaussians.opacities * 255.0).to(torch.uint8),
         "sh0": gaussians.sh0[:, 0].clamp(-largest, largest).half(),
-        "shN": torch.round(roots * 127.0).to(torch.int8),
+        "shN": torch.from_numpy(shN),
     }
     return {name: array.detach().contiguous().numpy() for name, array in arrays.items()}, sh_range
 
 
-class PoseRows:
-    """Poses of many motions one after the other: `seconds` (m,) and `poses` (m, 3, 4)."""
+def _roots(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Values as bytes b, which stand for `largest` t |t| with t = b / 127, and that largest absolute value."""
+    largest = float(np.abs(values).max()) if values.size else 0.0
+    return np.round(127.0 * np.sign(values) * np.sqrt(np.abs(values) / (largest or 1.0))).astype(np.int8), largest
 
-    def __init__(self) -> None:
+
+class SampleRows:
+    """Samples of many motions one after the other: `seconds` (r,), `poses` (r, 3, 4) and, of those that deform by up to
+    `modes` modes, `weights` (r, modes), elsewhere 0."""
+
+    def __init__(self, modes: int = 0) -> None:
         self._seconds: list[np.ndarray] = [np.zeros(0)]
         self._poses: list[np.ndarray] = [np.zeros((0, 4, 4))]
+        self._weights: list[np.ndarray] = [np.zeros((0, modes))]
 
-    def add(self, seconds: np.ndarray, poses: np.ndarray) -> list[int]:
-        """Appends poses (n, 4, 4) at `seconds` (n,); returns the range of their rows."""
+    def add(self, seconds: np.ndarray, poses: np.ndarray, weights: np.ndarray | None = None) -> list[int]:
+        """Appends poses (n, 4, 4) and weights (n, m) at `seconds` (n,); returns the range of their rows."""
         first = sum(map(len, self._seconds))
+        padded = np.zeros((len(seconds), self._weights[0].shape[1]))
+        if weights is not None:
+            padded[:, : weights.shape[1]] = weights
         self._seconds.append(seconds)
         self._poses.append(poses)
+        self._weights.append(padded)
         return [first, first + len(seconds)]
 
     def arrays(self, name: str) -> dict[str, np.ndarray]:
-        """The rows as float32 arrays `{name}_seconds` and `{name}_poses`."""
-        seconds, poses = np.concatenate(self._seconds), np.concatenate(self._poses)[:, :3]
-        return {f"{name}_seconds": seconds.astype(np.float32), f"{name}_poses": poses.astype(np.float32)}
+        """The rows as float32 arrays `{name}_seconds`, `{name}_poses` and `{name}_weights`."""
+        poses = np.concatenate(self._poses)[:, :3]
+        columns = {"seconds": np.concatenate(self._seconds), "poses": poses, "weights": np.concatenate(self._weights)}
+        return {f"{name}_{key}": values.astype(np.float32) for key, values in columns.items()}
 
 
-def motion_record(motion: SampledMotion | InstanceMotion | None, rows: PoseRows) -> dict[str, Any]:
-    """The intervals `present` (seconds) and the range `samples` of rows of a motion; null for a static group."""
-    if motion is None:
-        return {"present": None, "samples": None}
-    samples = rows.add(motion.seconds, motion.object_to_world)
-    return {"present": [list(span) for span in motion.spans], "samples": samples}
+@dataclass(frozen=True)
+class MotionRecords:
+    """Makes the records of groups and of edited drives, with their samples in `rows` and those of cameras in
+    `camera_rows`; `modes` are those of groups that deform."""
+
+    rows: SampleRows
+    camera_rows: SampleRows
+    modes: Mapping[str, Modes]
+
+    def groups(self, groups: Mapping[str, SampledGroup]) -> list[dict[str, Any]]:
+        """A record for each group: the number of its `gaussians`, its motion, what its track says, and `modes`, the
+        first row of its modes (null: it is rigid)."""
+        deforming = [len(groups[name].gaussians) if name in self.modes else 0 for name in groups]
+        firsts = np.cumsum([0, *deforming])
+        return [
+            {
+                "name": name,
+                "category": group.track.category if group.track else None,
+                "size": group.track.size.tolist() if group.track else None,
+                "gaussians": len(group.gaussians),
+                "modes": int(first) if name in self.modes else None,
+                **self._motion(group.motion, name, None if group.motion is None else Gait(group.motion.seconds)),
+            }
+            for (name, group), first in zip(groups.items(), firsts[:-1], strict=True)
+        ]
+
+    def edits(self, drives: Sequence[EditedDrive], groups: Sequence[str]) -> list[dict[str, Any]]:
+        """A record for each edited drive: its `instances`, each with the number of its `group` and what differs from
+        it, and the range of rows of its `camera`; null: as recorded."""
+        return [
+            {
+                "name": drive.name,
+                "instances": [self._instance(instance, groups) for instance in drive.instances],
+                "camera": drive.camera and self.camera_rows.add(drive.camera.seconds, drive.camera.camera_to_world),
+            }
+            for drive in drives
+        ]
+
+    def _instance(self, instance: Instance, groups: Sequence[str]) -> dict[str, Any]:
+        record: dict[str, Any] = {"id": instance.id, "group": groups.index(instance.source)}
+        if instance.motion is None:
+            return record
+        moved = instance.motion
+        colors = None if instance.color_matrix is None else instance.color_matrix.ravel().tolist()
+        gait = Gait(moved.seconds, moved.walked, instance.scale, instance.phase)
+        return {
+            **record, "category": instance.category, "size": instance.size.tolist(), "scale": instance.scale,
+            "colors": colors, **self._motion(moved, instance.source, gait),
+        }  # fmt: skip
+
+    def _motion(self, motion: SampledMotion | InstanceMotion | None, group: str, gait: Gait | None) -> dict[str, Any]:
+        """The intervals `present` (seconds) and the range `samples` of rows of a motion; null for a static group."""
+        if motion is None:
+            return {"present": None, "samples": None}
+        weights = self.modes[group].weights(gait) if group in self.modes and gait and len(gait.seconds) else None
+        samples = self.rows.add(motion.seconds, motion.object_to_world, weights)
+        return {"present": [list(span) for span in motion.spans], "samples": samples}
 
 
-def group_records(groups: Mapping[str, SampledGroup], rows: PoseRows) -> list[dict[str, Any]]:
-    """A record for each group: the number of its `gaussians`, its motion, and what its track says."""
-    return [
-        {
-            "name": name,
-            "category": group.track.category if group.track else None,
-            "size": group.track.size.tolist() if group.track else None,
-            "gaussians": len(group.gaussians),
-            **motion_record(group.motion, rows),
-        }
-        for name, group in groups.items()
-    ]
-
-
-def edit_records(
-    drives: Sequence[EditedDrive], groups: Sequence[str], rows: PoseRows, camera_rows: PoseRows
-) -> list[dict[str, Any]]:
-    """A record for each edited drive: its `instances`, each with the number of its `group` and what differs from it,
-    and the range of rows of its `camera`; null: as recorded."""
-    return [
-        {
-            "name": drive.name,
-            "instances": [_instance_record(instance, groups, rows) for instance in drive.instances],
-            "camera": drive.camera and camera_rows.add(drive.camera.seconds, drive.camera.camera_to_world),
-        }
-        for drive in drives
-    ]
-
-
-def _instance_record(instance: Instance, groups: Sequence[str], rows: PoseRows) -> dict[str, Any]:
-    record: dict[str, Any] = {"id": instance.id, "group": groups.index(instance.source)}
-    if instance.motion is None:
-        return record
-    colors = None if instance.color_matrix is None else instance.color_matrix.ravel().tolist()
-    changed = {"category": instance.category, "size": instance.size.tolist(), "scale": instance.scale, "colors": colors}
-    return {**record, **changed, **motion_record(instance.motion, rows)}
+def modes_array(groups: Sequence[str], modes: Mapping[str, Modes], count: int) -> tuple[np.ndarray, float]:
+    """The modes of all groups that deform, in order, as bytes (n, count, 2, 3): the shift (metres) and the turn of each
+    Gaussian in every mode, 0 beyond those of its group; and the largest absolute value."""
+    found = [np.zeros((0, count, 2, 3))]
+    for own in (modes[name] for name in groups if name in modes):
+        stacked = np.stack([own.shifts, own.turns], axis=2).transpose(1, 0, 2, 3)  # (n, m, 2, 3)
+        found.append(np.pad(stacked, ((0, 0), (0, count - own.count), (0, 0), (0, 0))))
+    return _roots(np.concatenate(found))
 
 
 def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any], bytes]:
@@ -158,17 +194,21 @@ def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any],
     groups, path = content.groups, content.path
     gaussians = concatenate([group.gaussians for group in groups.values()])
     arrays, sh_range = splat_arrays(gaussians)
-    motions, cameras = PoseRows(), PoseRows()
-    records = group_records(groups, motions)
-    camera = cameras.add(path.seconds, path.camera_to_world)
-    edits = edit_records(content.edits, [*groups], motions, cameras)
-    sky = {"sky": sky_faces(content.sky, sky_size)}
-    layout, payload = packed({**arrays, **motions.arrays("motion"), **cameras.arrays("camera"), **sky})
+    count = max((modes.count for modes in content.modes.values()), default=0)
+    modes, modes_range = modes_array([*groups], content.modes, count)
+    motions, cameras = SampleRows(count), SampleRows()
+    made = MotionRecords(motions, cameras, content.modes)
+    records, camera = made.groups(groups), cameras.add(path.seconds, path.camera_to_world)
+    edits = made.edits(content.edits, [*groups])
+    others = {"modes": modes, "sky": sky_faces(content.sky, sky_size)}
+    layout, payload = packed({**arrays, **motions.arrays("motion"), **cameras.arrays("camera"), **others})
     record = {
         "count": len(gaussians),
         "coefficients": 1 + gaussians.shN.shape[1],
         "antialiased": content.antialiased,
         "sh_range": sh_range,
+        "modes": count,
+        "modes_range": modes_range,
         "sky_size": sky_size,
         "has_sky": content.sky is not None,
         "start": {**start_pose(path.start), "second": path.start_second},

@@ -102,6 +102,20 @@ class Deformable(Actors):
         quats = normalize(torch.stack([local.quats[rows] for local in locals_]), dim=-1)
         return Shapes(torch.stack([local.means[rows] for local in locals_]), quats)
 
+    @torch.no_grad()
+    def shape_weights(
+        self, times: Sequence[float], placements: Sequence[ActorPlacement]
+    ) -> Float[Tensor, "t k"] | None:
+        if not placements or placements[0].source not in self._known:
+            return None
+        self.precompute(times)
+        states = [
+            self._state_with(self.time_state(time), [placement])
+            for time, placement in zip(times, placements, strict=True)
+        ]
+        basis = torch.stack([self.basis(state)[self._known.index(placements[0].source)] for state in states])
+        return torch.cat([torch.ones_like(basis[:, :1]), basis], dim=1)
+
     def learning_rates(self) -> dict[str, float]:
         own = {"stride": self._gait.lr_stride, "phase": self._gait.lr_phase}
         return {**super().learning_rates(), **own, **dict.fromkeys(self._field_names, self._field.learning_rate)}

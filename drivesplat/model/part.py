@@ -171,6 +171,13 @@ class Part(nn.Module, ABC):
         """The shapes of a track's Gaussians at `times`, in the order of its rigid group; None for what is rigid."""
         return None
 
+    def shape_weights(
+        self, times: Sequence[float], placements: Sequence[ActorPlacement]
+    ) -> Float[Tensor, "t k"] | None:
+        """The k values in which the shape of a track is linear, or nearly so, at `times`, each with its placement of
+        that track; the first is 1. None for what is rigid."""
+        return None
+
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
         """Its own weighted terms of the training loss, by name."""
         return {}

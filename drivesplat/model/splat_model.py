@@ -127,6 +127,13 @@ class SplatModel(nn.Module):
         found = (part.shapes(track_id, times) for part in self.parts)
         return next((shapes for shapes in found if shapes is not None), None)
 
+    def shape_weights(
+        self, times: Sequence[float], placements: Sequence[ActorPlacement]
+    ) -> Float[Tensor, "t k"] | None:
+        """What the shape of an object depends on at `times`: see `Part.shape_weights`."""
+        found = (part.shape_weights(times, placements) for part in self.parts)
+        return next((weights for weights in found if weights is not None), None)
+
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """The mask of a track's rows of `gaussians_at`; None where no part knows the track as an object."""
         found = [part.of_track(track_id) for part in self.parts]

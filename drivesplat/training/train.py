@@ -209,7 +209,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
 
 
 def _due(step: int, every: int, iterations: int) -> bool:
-    """Whether something is done after iteration `step`: every so many iterations, and after the last of `iterations`."""
+    """Whether something is done after iteration `step` of so many: every now and then, and after the last."""
     return step % every == 0 or step == iterations
 
 

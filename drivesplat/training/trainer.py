@@ -225,7 +225,7 @@ class Trainer:
         return not self.fine_tunes and any(densifier.due(self.step) for densifier in self.densifiers)
 
     def densify(self, picture: Picture | None) -> None:
-        """The second half of an iteration: each part adds, removes and relocates its Gaussians, unless it fine-tunes."""
+        """The second half of an iteration: unless it fine-tunes, each part adds, removes and relocates Gaussians."""
         info = {} if picture is None else picture.info
         parts = zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True)
         for densifier, optimizers, rows in () if self.fine_tunes else parts:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from helpers.hand_made import motion_through, round_gaussians, track_of
+from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import TURNING, with_turning_track
+from helpers.walkers import walker
 from pxr import Gf, Usd, UsdVol
 
 from drivesplat.errors import ConfigError
@@ -16,25 +17,15 @@ from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.io.storage import read_json
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.settings.deformable import LatticeSettings
-from drivesplat.settings.train import DeformableSettings, GaussianSettings
+from drivesplat.settings.train import GaussianSettings
 
-SIZE, TIMES = (0.8, 0.6, 1.8), 0.5 * np.arange(9)
 NO_TIMES = np.array([], dtype=np.int64)
 PROVENANCE = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64, "stages": {}}
 
 
 @pytest.fixture(scope="module")
 def people() -> Deformable:
-    """One who walks along x for four seconds, 30 Gaussians with random deformations."""
-    rng = np.random.default_rng(0)
-    walker = track_of(motion_through(TIMES, [[1.5 * t, 2.0, 0.9] for t in TIMES], 0.0 * TIMES), TURNING, SIZE)
-    settings = DeformableSettings(lattice=LatticeSettings(nodes=(3, 4, 5)))
-    points, colors = rng.uniform(-0.4, 0.4, (30, 3)) * SIZE, rng.uniform(0.0, 1.0, (30, 3))
-    part = Deformable.from_points([walker], [points], [colors], settings, GaussianSettings())
-    with torch.no_grad():
-        part.shared["lattice"] += 0.1 * torch.from_numpy(rng.normal(size=part.shared["lattice"].shape)).float()
-    return part
+    return walker()
 
 
 @pytest.fixture(scope="module")

@@ -60,7 +60,7 @@ def aside() -> np.ndarray:
 def edits() -> list[EditedDrive]:
     """The car removed; and a copy of it, half as large, beside it from the second 0.5 on, seen from a metre aside."""
     seconds = np.linspace(0.5, 2.0, 46)
-    motion = InstanceMotion(seconds, np.stack([beside(second) for second in seconds]), ((0.5, 2.0),))
+    motion = InstanceMotion(seconds, np.stack([beside(second) for second in seconds]), seconds, ((0.5, 2.0),))
     camera = CameraMotion(np.array([0.0, 2.0]), np.stack([aside(), aside()]))
     copied = (
         Instance(CAR, CAR, "vehicle.car", SIZE, 1.0, None),
@@ -76,7 +76,8 @@ SWAPPED = np.array([[0.0, 0.8, 0.0], [0.1, 0.0, 0.7], [0.9, 0.0, 0.0]])
 
 def standing() -> InstanceMotion:
     """The car as it is at the second 1."""
-    return InstanceMotion(np.array([0.0, 2.0]), np.stack([car_pose(1.0), car_pose(1.0)]), ((0.0, 2.0),))
+    ends = np.array([0.0, 2.0])
+    return InstanceMotion(ends, np.stack([car_pose(1.0), car_pose(1.0)]), np.zeros(2), ((0.0, 2.0),))
 
 
 def halved(gaussians: Gaussians) -> Gaussians:

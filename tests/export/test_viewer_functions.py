@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drivesplat.export import viewer_page
 
@@ -43,7 +44,7 @@ def test_rows_are_sorted_far_to_near_instance_by_instance():
     rows = by_node(
         "camera", "order", axis=axis.tolist(), position=position.tolist(), centers=centers.ravel().tolist(),
         ranges=records,
-        expression="Array.from(depthOrder(new Float32Array(centers), 0.01)(axis, position, ranges))",
+        expression="Array.from(depthOrder({ centers: new Float32Array(centers) }, 0.01)(axis, position, ranges))",
     )  # fmt: skip
     depths = {}
     for begin, end, row, pose in ranges:
@@ -55,6 +56,31 @@ def test_rows_are_sorted_far_to_near_instance_by_instance():
     np.testing.assert_array_equal(np.diff([depths[row] for row in rows]) <= 1e-5, True)
 
 
+def test_rows_of_what_deforms_are_sorted_where_their_modes_shift_them():
+    """The second group of two, twice, with other weights each; the third instance is rigid."""
+    rng = np.random.default_rng(1)
+    centers, modes = rng.uniform(-3.0, 3.0, (30, 3)), rng.integers(-127, 128, (20, 2, 2, 3))
+    pose = np.hstack([Rotation.from_euler("zyx", [0.4, -0.2, 0.1]).as_matrix(), [[1.0], [0.0], [6.0]]])
+    weights = [[0.5, -1.5], [-1.0, 0.25], None]
+    axis, first = np.array([0.0, 0.0, 1.0]), 8  # rows of modes of other groups
+    records = [
+        {"begin": 18, "end": 30, "row": 12 * i, "pose": pose.ravel().tolist(), "modes": first, "weights": own}
+        for i, own in enumerate(weights)
+    ]
+    shapes = {"centers": centers.ravel().tolist(), "modes": modes.ravel().tolist(), "largest": 2.0}
+    rows = by_node(
+        "camera", "order", axis=axis.tolist(), position=[0.0, 0.0, 0.0], shapes=shapes, ranges=records,
+        expression="Array.from(depthOrder(shapes, 0.01)(axis, position, ranges))",
+    )  # fmt: skip
+    shifts = 2.0 * modes[first:, :, 0] * np.abs(modes[first:, :, 0]) / 127.0**2  # (12, 2, 3)
+    depths = np.concatenate([
+        ((centers[18:] + np.einsum("k,nkj->nj", own or [0.0, 0.0], shifts)) @ pose[:, :3].T + pose[:, 3]) @ axis
+        for own in weights
+    ])  # fmt: skip
+    assert sorted(rows) == np.flatnonzero(depths > 0.01).tolist()
+    assert (np.diff(depths[rows]) <= 1e-5).all()
+
+
 def test_while_the_worker_sorts_the_page_keeps_the_last_order_and_asks_for_the_newest():
     """A worker that answers when it is told to: of three further wishes made meanwhile, the last is sorted."""
     sequence = """(() => {
@@ -63,7 +89,7 @@ def test_while_the_worker_sorts_the_page_keeps_the_last_order_and_asks_for_the_n
       globalThis.Worker = function () { return worker; };
       globalThis.URL = { createObjectURL: () => "" };
       const ranges = [{ begin: 0, end: 1, row: 0, pose: STANDING }];
-      const sorter = sorterOf(new Float32Array(3), 0.01, (rows) => shown.push(rows));
+      const sorter = sorterOf({ centers: new Float32Array(3) }, 0.01, (rows) => shown.push(rows));
       const wish = (x) => sorter.later([0, 0, 1], [x, 0, -1], ranges);
       sorter.now([0, 0, 1], [0, 0, -1], ranges);
       wish(0); // as it is
@@ -133,7 +159,7 @@ def test_ids_are_shortened_as_far_as_they_stay_unique():
 
 def test_an_edit_keeps_what_is_static_and_replaces_what_moves():
     groups = [
-        {"name": "background", "gaussians": 5, "samples": None, "present": None},
+        {"name": "background", "gaussians": 5, "samples": None, "present": None, "modes": None},
         {"name": "car", "gaussians": 3, "samples": [0, 4], "present": [[0, 1]], "category": "vehicle.car"},
     ]
     edit = {"instances": [{"id": "car", "group": 1}, {"id": "twin", "group": 1, "scale": 2, "samples": [4, 9]}]}

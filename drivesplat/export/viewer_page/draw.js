@@ -66,22 +66,26 @@ function instanceTexture(gl, unit) {
 
 const SAME_COLORS = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
-// The poses and colour matrices of the instances, a line for each: filled anew for every picture.
-function poseTexture(gl, unit) {
+// The poses, colour matrices and weights of up to `modes` modes of the instances, a line for each: filled anew for every
+// picture.
+function poseTexture(gl, unit, modes) {
   const texture = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D, texture);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   return (ranges) => {
-    const values = new Float32Array(28 * ranges.length);
-    ranges.forEach(({ begin, row, pose, colors }, line) => {
+    const texels = 7 + Math.ceil(modes / 4);
+    const values = new Float32Array(4 * texels * ranges.length);
+    ranges.forEach(({ begin, row, pose, colors, modes: first, weights }, line) => {
+      if (!pose) return;
       const [red, green, blue] = [0, 3, 6].map((i) => (colors || SAME_COLORS).slice(i, i + 3));
-      if (pose) values.set([...pose, begin - row, 1, 0, 0, ...red, 0, ...green, 0, ...blue, 0], 28 * line);
+      const state = [begin - row, 1, row, weights ? first : -1];
+      values.set([...pose, ...state, ...red, 0, ...green, 0, ...blue, 0, ...(weights || [])], 4 * texels * line);
     });
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 7, ranges.length, 0, gl.RGBA, gl.FLOAT, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, texels, ranges.length, 0, gl.RGBA, gl.FLOAT, values);
   };
 }
 
@@ -95,6 +99,7 @@ function uploadTextures(gl, arrays, uniforms) {
     opacities: [1, [gl.R8, gl.RED, gl.UNSIGNED_BYTE]],
     sh0: [3, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT]],
     shN: [3, [gl.RGB8_SNORM, gl.RGB, gl.BYTE]],
+    modes: [3, [gl.RGB8_SNORM, gl.RGB, gl.BYTE]],
   };
   Object.entries(formats).forEach(([name, [channels, format]], unit) => {
     valueTexture(gl, unit, arrays[name], channels, format);
@@ -134,11 +139,13 @@ function painter(canvas, scene, arrays) {
   const [sky, splat] = [program(gl, SKY_VERTEX, SKY_FRAGMENT), program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT)];
   gl.useProgram(splat.made);
   const unit = uploadTextures(gl, arrays, splat.uniforms);
-  const [setDrive, setPoses] = [instanceTexture(gl, unit), poseTexture(gl, unit + 1)];
+  const [setDrive, setPoses] = [instanceTexture(gl, unit), poseTexture(gl, unit + 1, scene.modes)];
   gl.uniform1i(splat.uniforms.instance, unit);
   gl.uniform1i(splat.uniforms.poses, unit + 1);
   gl.uniform1f(splat.uniforms.shRange, scene.sh_range);
   gl.uniform1i(splat.uniforms.coefficients, scene.coefficients);
+  gl.uniform1f(splat.uniforms.modesRange, scene.modes_range);
+  gl.uniform1i(splat.uniforms.modeCount, scene.modes);
   gl.uniform1i(splat.uniforms.antialiased, scene.antialiased);
   gl.useProgram(sky.made);
   skyTexture(gl, unit + 2, arrays.sky, scene.sky_size);

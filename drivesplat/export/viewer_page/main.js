@@ -20,11 +20,14 @@ function driveOf(scene, edit) {
   return { edit, instances, ranges: rowRanges(scene.groups, instances), camera: cameraRows(scene, edit) };
 }
 
-// The ranges of a drive's instances with their poses at the state's second, null for those not shown; and these poses
-// without scale.
-function posed({ instances, ranges }, arrays, { second, hidden }) {
+// The ranges of a drive's instances with their poses at the state's second, null for those not shown, and the weights
+// of their `count` modes; and these poses without scale.
+function posed({ instances, ranges }, arrays, count, { second, hidden }) {
   const poses = instances.map((one) => (hidden.has(one.id) ? null : instancePose(one, arrays, second)));
-  const shown = instances.map(({ scale, colors }, i) => ({ pose: scaledPose(poses[i], scale), colors }));
+  const shown = instances.map((one, i) => ({
+    pose: scaledPose(poses[i], one.scale), colors: one.colors, modes: one.modes,
+    weights: poses[i] && instanceWeights(one, arrays, count, second),
+  }));
   return [ranges.map((range, i) => ({ ...range, ...shown[i] })), poses];
 }
 
@@ -57,7 +60,8 @@ async function openPage() {
     });
   };
   const change = (part) => { Object.assign(state, part); redraw(); };
-  const sorter = sorterOf(arrays.means.slice(), NEAR, (rows) => { paint.setOrder(rows); redraw(); });
+  const shapes = { centers: arrays.means.slice(), modes: arrays.modes, largest: scene.modes_range };
+  const sorter = sorterOf(shapes, NEAR, (rows) => { paint.setOrder(rows); redraw(); });
   const fillList = shownList(state, scene.has_sky, change);
   const update = timeBar(state, span, scene.key_frames, change);
   const show = () => {
@@ -69,7 +73,7 @@ async function openPage() {
     }
     if (state.following) state.view = cameraView(arrays, drive.camera, state.second);
     if (showImage(state, canvas)) fit();
-    const [ranges, poses] = posed(drive, arrays, state);
+    const [ranges, poses] = posed(drive, arrays, scene.modes, state);
     const seen = [rotationOf(state.view).map((row) => row[2]), state.view.position, ranges];
     if (another) {
       paint.setDrive(ranges);
@@ -95,7 +99,7 @@ async function openPage() {
   const byHand = (view) => { hideHint(); change({ view, following: false }); }; // the user's hand ends the ride
   const pick = (x, y) => {
     const ray = rayAt(state.view, pinhole(scene.start, canvas.clientWidth, canvas.clientHeight), x, y);
-    const found = pickedInstance(drive.instances, posed(drive, arrays, state)[1], state.view.position, ray);
+    const found = pickedInstance(drive.instances, posed(drive, arrays, scene.modes, state)[1], state.view.position, ray);
     showPicked(found, drive.instances.map(({ id }) => id), found && instanceSpeed(found, arrays, state.second));
   };
   const restart = () => byHand(startView(scene.start));

@@ -1,7 +1,7 @@
-// Where instances of rigid groups and the camera of a drive are at a second. Poses are 12 values: three rows of [rotation | place].
+// Where the instances and the camera of a drive are at a second, and how instances deform. Poses are 12 values: three rows of [rotation | place].
 
-// The pose between two samples, interpolated entry by entry: samples are dense enough for a millimetre.
-function poseBetween(seconds, poses, [first, last], second) {
+// The row of `width` values between two samples, interpolated entry by entry: samples are dense enough for a millimetre.
+function rowBetween(seconds, values, width, [first, last], second) {
   let [low, high] = [first, last - 1];
   while (high - low > 1) {
     const middle = (low + high) >> 1;
@@ -10,9 +10,13 @@ function poseBetween(seconds, poses, [first, last], second) {
   }
   const length = seconds[high] - seconds[low];
   const share = length > 0 ? Math.min(Math.max((second - seconds[low]) / length, 0), 1) : 0;
-  const pose = new Float32Array(12);
-  for (let i = 0; i < 12; i++) pose[i] = (1 - share) * poses[12 * low + i] + share * poses[12 * high + i];
-  return pose;
+  const row = new Float32Array(width);
+  for (let i = 0; i < width; i++) row[i] = (1 - share) * values[width * low + i] + share * values[width * high + i];
+  return row;
+}
+
+function poseBetween(seconds, poses, samples, second) {
+  return rowBetween(seconds, poses, 12, samples, second);
 }
 
 const STANDING = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]);
@@ -26,6 +30,12 @@ function instancePose({ samples, present }, arrays, second) {
   if (!samples) return STANDING;
   if (!isPresent({ present }, second)) return null;
   return poseBetween(arrays.motion_seconds, arrays.motion_poses, samples, second);
+}
+
+// The weights of an instance's modes at a second; null for a rigid one.
+function instanceWeights({ samples, modes }, arrays, count, second) {
+  if (modes === null || !samples || samples[0] === samples[1]) return null;
+  return rowBetween(arrays.motion_seconds, arrays.motion_weights, count, samples, second);
 }
 
 // The same pose for its Gaussians, which grow with `scale` about their origin.

@@ -9,12 +9,13 @@ precision highp usampler2D;
 layout(location = 0) in vec2 corner;
 layout(location = 1) in uint row;
 
-uniform sampler2D means, scales, quats, opacities, sh0, shN;
+uniform sampler2D means, scales, quats, opacities, sh0, shN, modes;
 uniform usampler2D instance; // the number of each row's instance
-// a line for each instance: three rows of [rotation | place], [first, shown, -, -], three rows of its colour matrix
+// a line for each instance: three rows of [rotation | place], [from row to Gaussian, shown, first row, first row of its
+// modes or -1], three rows of its colour matrix, the weights of its modes
 uniform sampler2D poses;
-uniform float shRange;
-uniform int coefficients;
+uniform float shRange, modesRange;
+uniform int coefficients, modeCount;
 uniform bool antialiased;
 uniform mat3 cameraToWorld;
 uniform vec3 position;
@@ -56,6 +57,11 @@ vec3 coefficient(uint i, int k) {
   return shRange * root * abs(root);
 }
 
+vec3 mode(uint i) {
+  vec3 root = texel(modes, i).rgb;
+  return modesRange * root * abs(root);
+}
+
 // Real spherical harmonics as 3D Gaussian Splatting orders and signs them, up to degree 3.
 vec3 radiance(uint i, vec3 d) {
   vec3 sum = 0.5 + 0.28209479177387814 * texel(sh0, i).rgb;
@@ -85,10 +91,19 @@ void main() {
   vec4 rows[3] = vec4[3](
     texelFetch(poses, ivec2(0, line), 0), texelFetch(poses, ivec2(1, line), 0), texelFetch(poses, ivec2(2, line), 0));
   mat3 toWorld = transpose(mat3(rows[0].xyz, rows[1].xyz, rows[2].xyz));
-  vec3 mean = toWorld * texel(means, index).xyz + vec3(rows[0].w, rows[1].w, rows[2].w);
+  vec3 shift = vec3(0.0), turn = vec3(0.0); // in the frame of the group
+  if (state.w >= 0.0) {
+    uint first = (uint(state.w) + row - uint(state.z)) * uint(2 * modeCount);
+    for (int k = 0; k < modeCount; k++) {
+      float weight = texelFetch(poses, ivec2(7 + k / 4, line), 0)[k % 4];
+      shift += weight * mode(first + uint(2 * k));
+      turn += weight * mode(first + uint(2 * k + 1));
+    }
+  }
+  vec3 mean = toWorld * (texel(means, index).xyz + shift) + vec3(rows[0].w, rows[1].w, rows[2].w);
   vec3 p = (mean - position) * cameraToWorld;
   vec3 scale = texel(scales, index).xyz;
-  mat3 axes = toWorld * rotation(texel(quats, index));
+  mat3 axes = toWorld * rotation(vec4(1.0, turn)) * rotation(texel(quats, index));
   vec3 cov = projected(mat3(axes[0] * scale.x, axes[1] * scale.y, axes[2] * scale.z), p);
   float sharp = max(cov.x * cov.z - cov.y * cov.y, 0.0);
   cov.xz += EPS2D;

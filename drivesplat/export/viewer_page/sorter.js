@@ -1,11 +1,11 @@
 // Sorting beside the page: in a worker, while the page draws on with the last order; here where workers are refused.
 
-// In the worker: keeps the centers of the first message, and answers each later one with its order.
+// In the worker: keeps the shapes of the first message, and answers each later one with its order.
 function answerSorts(near) {
   let order = null;
   onmessage = ({ data }) => {
-    if (data.centers) {
-      order = depthOrder(data.centers, near);
+    if (data.shapes) {
+      order = depthOrder(data.shapes, near);
       return;
     }
     const rows = order(data.axis, data.position, data.ranges).slice();
@@ -14,12 +14,12 @@ function answerSorts(near) {
 }
 
 // A worker that sorts, made of this page's own functions: it needs no file and no network. Null where it is refused.
-function sortingWorker(centers, near) {
-  const source = [`"use strict"; const dot = ${dot};`, radixPass, depthOrder, answerSorts, `answerSorts(${near});`];
+function sortingWorker(shapes, near) {
+  const source = [`"use strict"; const dot = ${dot};`, radixPass, addShifts, depthOrder, answerSorts, `answerSorts(${near});`];
   try {
     const address = URL.createObjectURL(new Blob([source.join("\n")], { type: "text/javascript" }));
     const worker = new Worker(address);
-    worker.postMessage({ centers });
+    worker.postMessage({ shapes });
     return worker;
   } catch {
     return null;
@@ -28,7 +28,7 @@ function sortingWorker(centers, near) {
 
 // What an order depends on, as numbers: equal ones need no new order.
 function sortKey(axis, position, ranges) {
-  return [...axis, ...position, ...ranges.flatMap(({ row, pose }) => [row, ...(pose || [NaN])])];
+  return [...axis, ...position, ...ranges.flatMap(({ row, pose, weights }) => [row, ...(pose || [NaN]), ...(weights || [])])];
 }
 
 const sameKey = (a, b) => a.length === b.length && a.every((x, i) => Object.is(x, b[i]));
@@ -36,9 +36,9 @@ const sameKey = (a, b) => a.length === b.length && a.every((x, i) => Object.is(x
 // Returns { now, later, settled }. now(axis, position, ranges) gives the order at once; later(…) has it sorted unless
 // nothing has changed, and calls sorted(rows) when that is done; of what is asked for meanwhile, the last is sorted
 // next. settled() says whether nothing is under way.
-function sorterOf(centers, near, sorted) {
-  const here = depthOrder(centers, near);
-  let [worker, number, last, running, waiting] = [sortingWorker(centers, near), 0, [], null, null];
+function sorterOf(shapes, near, sorted) {
+  const here = depthOrder(shapes, near);
+  let [worker, number, last, running, waiting] = [sortingWorker(shapes, near), 0, [], null, null];
   const start = (wanted) => {
     running = { ...wanted, number: ++number };
     worker.postMessage(running);
