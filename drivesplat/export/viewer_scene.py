@@ -40,8 +40,8 @@ class RecordedPath:
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """What a page shows: groups, a sky (None: black), the recorded camera, edited drives, the recorded `images` (records
-    of `viewer_images`), the methods that have pages beside it, and the `modes` of groups that deform."""
+    """What a page shows: groups, a sky (None: black), the recorded camera, edited drives, the recorded `images`
+    (records of `viewer_images`), the methods that have pages beside it, and the `modes` of groups that deform."""
 
     groups: Mapping[str, SampledGroup]
     sky: Sky | None
