@@ -559,7 +559,8 @@ def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, cap
     assert not caplog.records, "nothing was refused"
     assert len(captured.graphs._graphs) == len(captured.images.views) + len(recorded) and not eager.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
-    assert mine[-2] < mine[0] and mine[-1] < mine[1], "images and scans in turn"
+    assert mine[-1] < mine[1], "scans"
+    assert half.fine_tune or mine[-2] < mine[0], "images, with which scans take turns unless they fine-tune"
 
 
 def test_captured_velocities_are_those_of_the_actors_that_own_the_gaussians_at_a_replay():
