@@ -214,13 +214,13 @@ def _due(step: int, every: int, iterations: int) -> bool:
 
 
 def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> None:
-    """Ends an iteration: densifies each part and fades Gaussians in empty space."""
+    """Ends an iteration: checks it; unless it fine-tunes, densifies each part and fades Gaussians in empty space."""
     trainer, settings = run.trainer, run.trainer.settings
     fine_tunes = trainer.fine_tunes
-    if trainer.densifies():
+    if trainer.checks_due():
         run.check()  # NaN in a strategy triggers a GPU assertion, after which the process cannot continue
         trainer.graphs.check()
-        for part in trainer.model.parts:
+        for part in () if fine_tunes else trainer.model.parts:
             part.confine()
     trainer.densify(picture)
     if len(trainer.model) == 0:

@@ -220,9 +220,9 @@ class Trainer:
         """The addresses and sizes of all parameters. Captured iterations become invalid when they change."""
         return tuple((parameter.data_ptr(), parameter.numel()) for parameter in self.model.parameters())
 
-    def densifies(self) -> bool:
-        """Whether this iteration may add, move or remove Gaussians."""
-        return not self.fine_tunes and any(densifier.due(self.step) for densifier in self.densifiers)
+    def checks_due(self) -> bool:
+        """Whether to check this iteration: those that may add, move or remove Gaussians, and as often later on."""
+        return any(densifier.due(self.step) for densifier in self.densifiers)
 
     def densify(self, picture: Picture | None) -> None:
         """The second half of an iteration: unless it fine-tunes, each part adds, removes and relocates Gaussians."""

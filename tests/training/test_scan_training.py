@@ -22,13 +22,15 @@ from helpers.trainings import (
 )
 from pydantic import ValidationError
 
+from drivesplat.model.background import Background
 from drivesplat.model.build import definitions, gaussian_cap, rebuild_model
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanPicture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.run import TrainingInputs, prepare
 from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import (
@@ -223,9 +225,25 @@ def test_scans_leave_the_geometry_alone_where_they_are_told_to(fine_tune):
 def test_fine_tuning_changes_what_the_lidar_alone_sees():
     trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.2)
     assert changed == {"background": {"echoes", *OFFSETS.values()}, "actors": {"echoes"}}
-    assert trainer.step == 9 and trainer.fine_tunes and not trainer.densifies()
+    assert trainer.step == 9 and trainer.fine_tunes
     _, before = changed_by_a_scan(7, fine_tune=0.2)
     assert not before["background"] & {*OFFSETS.values()} and "scales" in before["background"]
+
+
+def test_checks_go_on_during_fine_tuning_and_densification_does_not(tmp_path, monkeypatch):
+    """Lists of CUDA graphs may overflow there, too."""
+    settings = settings_of(
+        iterations=20, scans=ScanTrainingSettings(share=0.5, fine_tune=0.5), refine_start=0.0, refine_stop=1.0,
+        mcmc=McmcSettings(refine_every=5),
+    )  # fmt: skip
+    recorded, checked, confined = load_scans([scan_of_a_wall()], settings.scans, CPU), [], []
+    monkeypatch.setattr(IterationGraphs, "check", lambda _: checked.append(None))
+    monkeypatch.setattr(Background, "confine", lambda _: confined.append(None))
+    train(
+        with_echoes(settings, offsets=True), recorded_views(2), settings, 0, CPU, folders_of(tmp_path, "a"),
+        scans=recorded,
+    )  # fmt: skip
+    assert (len(checked), len(confined)) == (4, 2)
 
 
 def test_the_rates_of_fine_tuning_decay():
