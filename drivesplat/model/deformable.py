@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from drivesplat.kernels.placement import LocalGaussians
+from drivesplat.kernels.placement import LocalGaussians, of_owners
 from drivesplat.kernels.quaternions import left_factor
 from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.actors import Actors
@@ -50,6 +50,7 @@ class Deformable(Actors):
     ):
         super().__init__(params, tracks, settings, gaussians)
         self._gait, self._field = settings.gait, field_of(settings)
+        self._out_of_box_weight = settings.out_of_box_weight
         initial = self._field.initial(len(tracks))
         self._field_names = tuple(initial)
         self._per_track = ("stride", *(name for name in ("lattice", "embedding") if name in initial))
@@ -124,6 +125,15 @@ class Deformable(Actors):
         corrections = self.shared["stride"].square().mean() + self.shared["phase"].square().mean()
         of_field = self._field.penalties(dict(self.shared.items()))
         return {**super().penalties(), "gait": self._gait.weight * corrections, **of_field}
+
+    def penalties_at(self, time: float) -> dict[str, Float[Tensor, ""]]:
+        if not self._out_of_box_weight:
+            return {}
+        state = self.time_state(time)
+        present = of_owners(state.present.float(), self._owns)
+        outside = (self.local(state).means.abs() - of_owners(self._reach, self._owns)).clamp(min=0.0)
+        mean = (outside.sum(dim=1) * present).sum() / present.sum().clamp(min=1.0)
+        return {"out_of_box": self._out_of_box_weight * mean}
 
 
 def field_of(settings: DeformableSettings) -> Field:

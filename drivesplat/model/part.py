@@ -182,6 +182,10 @@ class Part(nn.Module, ABC):
         """Its own weighted terms of the training loss, by name."""
         return {}
 
+    def penalties_at(self, time: float) -> dict[str, Float[Tensor, ""]]:
+        """Those that depend on the time of the image (seconds since the first one)."""
+        return {}
+
     def confine(self) -> None:
         """Fades Gaussians at places where this part must not have any."""
 

@@ -105,6 +105,8 @@ class DeformableSettings(ActorSettings):
 
     field: FieldName = "lattice"
     """What deforms them."""
+    out_of_box_weight: float = Field(0.0, ge=0)
+    """Loss weight of the mean distance (metres) by which deformed Gaussians leave their box and its margin."""
     gait: GaitSettings = GaitSettings()
     lattice: LatticeSettings = LatticeSettings()
     network: NetworkSettings = NetworkSettings()

@@ -62,7 +62,8 @@ def _dynamic_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
     """The terms of dynamic parts, colours excepted; none for a model without such parts."""
-    terms = {name: term for part in model.parts for name, term in part.penalties().items()}
+    time = view.view.time
+    terms = {name: term for part in model.parts for name, term in (part.penalties() | part.penalties_at(time)).items()}
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
         seen = alpha if view.ego_mask is None else alpha.masked_fill(view.ego_mask, 1.0)

@@ -247,9 +247,24 @@ def test_penalties_grow_with_displacements_and_their_order():
             part.shared["lattice"].zero_()
             part.shared["lattice"][:, function] = 0.1
         found = part.penalties()
-        assert float(found["lattice_roughness"]) == 0.0
-        sizes.append(float(found["lattice_size"]))
+        assert float(found["lattice_roughness"].detach()) == 0.0
+        sizes.append(float(found["lattice_size"].detach()))
     np.testing.assert_allclose(np.array(sizes) / sizes[0], squared_orders, rtol=1e-5)
+
+
+def test_leaving_the_box_is_penalised_where_the_object_is_present():
+    """By the mean distance, over the axes, beyond the box and its margin; of two objects, one is absent early."""
+    late = track_of(motion_through(TIMES[4:], [[t, 5.0, 0.9] for t in TIMES[4:]], 0.0 * TIMES[4:]), "late", SIZE)
+    part = people_of(walker(), late, out_of_box_weight=2.0)
+    for time, rows in ((0.5, slice(0, 40)), (3.0, slice(0, 80))):
+        places = in_box(part, time)[rows].abs().numpy()
+        beyond = np.clip(places - (0.5 * np.array(SIZE) + part._settings.box_margin), 0.0, None).sum(axis=1)
+        found = part.penalties_at(time)["out_of_box"]
+        assert float(found.detach()) == pytest.approx(2.0 * beyond.mean(), rel=1e-4) and beyond.max() > 0.02
+    found.backward()
+    assert float(part.shared["lattice"].grad.abs().max()) > 0.0
+    assert float(part.penalties_at(50.0)["out_of_box"].detach()) == 0.0, "nobody is there"
+    assert people_of(walker(), out_of_box_weight=0.0).penalties_at(0.5) == {}
 
 
 def test_a_part_is_built_of_its_own_objects_and_survives_a_checkpoint():
