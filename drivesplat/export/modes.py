@@ -19,7 +19,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 
-LEAST_SHARE = 0.03
+MIN_SHARE = 0.03
 """Of the singular values of the sampled weights, relative to the largest: smaller ones are noise."""
 
 
@@ -61,7 +61,7 @@ def fitted_modes(model: SplatModel, groups: Mapping[str, SampledGroup]) -> dict[
 def _fitted(model: SplatModel, name: str, shown: Gaussians, shapes: SampledShapes) -> Modes:
     sampled = _model_weights(model, name, Gait(shapes.seconds))
     _, sizes, functions = np.linalg.svd(sampled, full_matrices=False)
-    kept = sizes > LEAST_SHARE * sizes[0]
+    kept = sizes > MIN_SHARE * sizes[0]
     combined = functions[kept].T * (np.sqrt(len(sampled)) / sizes[kept])  # (k, m): weights of mean square 1
     shifts = shapes.means - shown.means.detach().cpu().numpy()
     turns = _turns(shapes.quats, torch.nn.functional.normalize(shown.quats, dim=-1).detach().cpu().numpy())
