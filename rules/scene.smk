@@ -272,3 +272,28 @@ rule scans:
         code=plan.code("scans"),
     script:
         "../workflow_scripts/scans.py"
+
+
+rule discover:
+    """
+    Finds objects that move in the LiDAR scans of a drive, without labels, and compares them with annotated ones.
+    """
+    input:
+        scene=plan.scene,
+        scans="<results>/{scene}/scans.npz",
+    output:
+        tracks="<results>/{scene}/discovered.json",
+    log:
+        "<logs>/{scene}/discover.log",
+    benchmark:
+        "<benchmarks>/{scene}/discover.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=60,
+    params:
+        settings=plan.settings("discover"),
+        code=plan.code("discover"),
+    script:
+        "../workflow_scripts/discover.py"

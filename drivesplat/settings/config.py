@@ -17,6 +17,7 @@ from drivesplat.settings.ablation import AblationSettings
 from drivesplat.settings.actor_seed import ActorSeedSettings
 from drivesplat.settings.dataset import DatasetSettings, default_datasets
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.discover import DiscoverSettings
 from drivesplat.settings.download import NuscenesMiniSettings
 from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
@@ -39,7 +40,8 @@ from drivesplat.settings.world import CameraChannel
 
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
-    "lidar_depth", "free_space", "scans", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
+    "lidar_depth", "free_space", "scans", "discover", "masks", "sky", "train", "render", "ghosts", "removal", "export",
+    "device",
 )  # fmt: skip
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
 
@@ -77,6 +79,7 @@ class Config(Settings):
     lidar_depth: LidarDepthSettings = LidarDepthSettings()
     free_space: FreeSpaceSettings = FreeSpaceSettings()
     scans: ScanSettings = ScanSettings()
+    discover: DiscoverSettings = DiscoverSettings()
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
     """Sky model behind the Gaussians: 'cubemap' (learned colours by direction), 'mask' (one learned colour, opacity

@@ -13,6 +13,7 @@ from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
+from drivesplat.settings.discover import DiscoverJob
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
@@ -231,6 +232,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "free_space": (FreeSpaceJob, lambda at: _lidar(at, "own_car_radius", "box_margin")),
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),
+    "discover": (DiscoverJob, _nothing),
     "lidar_picture": (Settings, _nothing),
     "lidar_film": (LidarFilmJob, film_fields.encoding),
     "train": (TrainJob, _training),

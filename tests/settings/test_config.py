@@ -368,6 +368,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("free_space.voxel", 1), "free_space"),
         (at("scans.azimuth_steps", 1042), "scans"),
         (at("scans.spin", None), "scans"),
+        (at("discover.lidar", "LIDAR_TOP"), "discover"),
         (at("train.floaters.free_space", True), "train"),
         (at("train.road.reach", 0.2), "train"),
         (at("sky", "none"), "train"),

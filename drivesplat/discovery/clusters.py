@@ -1,0 +1,138 @@
+"""Clusters of moving returns in single scans, and chains of them over time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from drivesplat.scene.scan_record import RecordedScan
+
+APART, APART_SHARE = 0.6, 0.01
+"""Metres, and fraction of the range, by which returns of one object lie apart horizontally at most."""
+MIN_RETURNS = 3
+MAX_SPEED = 40.0
+"""Metres per second of an object that was seen once."""
+GATE, GATE_SPEED = 0.8, 3.0
+"""Metres, and metres per second since it was last seen, by which an object may deviate from its straight way."""
+MEMORY_S = 0.5
+"""Seconds over which the velocity of a chain is taken."""
+MAX_GAP_S = 1.2
+"""Seconds after which a chain that was not seen ends."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Moving returns of scan number `scan` that lie close together: `points` (n, 3) in world metres, at their mean time
+    `seconds` since the first image, seen from `origin` (3,)."""
+
+    scan: int
+    seconds: float
+    points: Float[np.ndarray, "n 3"]
+    origin: Float[np.ndarray, "3"]
+
+    @property
+    def place(self) -> Float[np.ndarray, "2"]:
+        """The horizontal middle of its extents."""
+        return 0.5 * (self.points[:, :2].min(axis=0) + self.points[:, :2].max(axis=0))
+
+
+@dataclass
+class Chain:
+    """Clusters of one object, in order of time."""
+
+    clusters: list[Cluster] = field(default_factory=list)
+
+    @property
+    def seconds(self) -> Float[np.ndarray, " k"]:
+        return np.array([cluster.seconds for cluster in self.clusters])
+
+    @property
+    def places(self) -> Float[np.ndarray, "k 2"]:
+        return np.stack([cluster.place for cluster in self.clusters])
+
+    def motion_at_end(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+        """Where it was seen last, and its velocity (m/s) then: a line through the last MEMORY_S seconds, or through the
+        last two clusters."""
+        return _line(self.clusters[-1].seconds, self.seconds, self.places)
+
+    def motion_at_begin(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+        """Where it was seen first, and its velocity (m/s) then."""
+        return _line(self.clusters[0].seconds, self.seconds, self.places)
+
+
+def _line(at: float, seconds: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place and velocity at one end of places (k, 2) at `seconds` (k,)."""
+    order = np.argsort(np.abs(seconds - at), kind="stable")
+    near = order[: max(2, int((np.abs(seconds - at) <= MEMORY_S).sum()))]
+    if len(near) < 2:
+        return places[order[0]], np.zeros(2)
+    offsets = seconds[near] - at
+    design = np.stack([np.ones(len(near)), offsets], axis=1)
+    place, velocity = np.linalg.lstsq(design, places[near], rcond=None)[0]
+    return place, velocity
+
+
+def clusters_of(scan: RecordedScan, number: int, moving: Bool[np.ndarray, " n"]) -> list[Cluster]:
+    """The clusters of the moving ones of a scan's measured returns."""
+    chosen = scan.scan.returned & scan.measured
+    points = scan.points()[moving]
+    seconds = scan.seconds + scan.scan.rays.offsets_s[chosen][moving].astype(np.float64)
+    origin = scan.sensor_to_world[:3, 3]
+    if len(points) < MIN_RETURNS:
+        return []
+    labels = connected(points[:, :2], np.linalg.norm(points - origin, axis=1))
+    sizes = np.bincount(labels)
+    own = [labels == label for label in np.flatnonzero(sizes >= MIN_RETURNS)]
+    return [Cluster(number, float(seconds[rows].mean()), points[rows], origin) for rows in own]
+
+
+def connected(places: Float[np.ndarray, "n 2"], ranges: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """The number of the connected set of each place, at `ranges` metres from the sensor."""
+    reach = APART + APART_SHARE * ranges
+    pairs = cKDTree(places).query_pairs(float(reach.max()), output_type="ndarray")
+    apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    pairs = pairs[apart <= np.minimum(reach[pairs[:, 0]], reach[pairs[:, 1]])]
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
+    return connected_components(links, directed=False)[1]
+
+
+def chains_of(clusters: Sequence[Sequence[Cluster]]) -> list[Chain]:
+    """Chains of the clusters of consecutive scans: each goes on with the cluster nearest to where it is expected."""
+    open_, closed = [], []
+    for found in clusters:
+        if not found:
+            continue
+        now = float(np.mean([cluster.seconds for cluster in found]))
+        closed += [chain for chain in open_ if now - chain.clusters[-1].seconds > MAX_GAP_S]
+        open_ = [chain for chain in open_ if now - chain.clusters[-1].seconds <= MAX_GAP_S]
+        taken = _assigned(open_, found)
+        for cluster, chain in zip(found, taken, strict=True):
+            if chain is None:
+                open_.append(Chain([cluster]))
+            else:
+                chain.clusters.append(cluster)
+    return closed + open_
+
+
+def _assigned(chains: Sequence[Chain], found: Sequence[Cluster]) -> list[Chain | None]:
+    """For each cluster the chain that it continues, None for a new one."""
+    costs = np.full((len(chains), len(found)), np.inf)
+    for row, chain in enumerate(chains):
+        place, velocity = chain.motion_at_end()
+        since = np.array([cluster.seconds for cluster in found]) - chain.clusters[-1].seconds
+        expected = place + since[:, None] * velocity
+        apart = np.linalg.norm(np.stack([cluster.place for cluster in found]) - expected, axis=1)
+        gate = GATE + since * (MAX_SPEED if len(chain.clusters) == 1 else GATE_SPEED)
+        costs[row] = np.where(apart <= gate, apart / gate, np.inf)
+    taken: list[Chain | None] = [None] * len(found)
+    if chains:
+        rows, columns = linear_sum_assignment(np.where(np.isfinite(costs), costs, 1e3))
+        for row, column in zip(rows, columns, strict=True):
+            if np.isfinite(costs[row, column]):
+                taken[column] = chains[row]
+    return taken
