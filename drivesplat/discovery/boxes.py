@@ -20,14 +20,16 @@ RICH = 8
 """Returns of a cluster whose extents count."""
 WHOLE = 0.8
 """Fraction of a length or width from which extents count as seen whole."""
-SEEN = 90.0
-"""Percentile of the extents over all clusters that counts as seen."""
+SEEN = (97.0, 85.0)
+"""Percentiles of lengths and widths over all clusters that count as seen: at times a cluster holds two objects."""
 MARGIN = 0.05
 """Metres between the outermost returns of a cluster and the surface, on average."""
 PERSON, CYCLIST, CAR, TRUCK = (
     np.array(size) for size in ((0.7, 0.7, 1.75), (1.8, 0.7, 1.7), (4.6, 1.9, 1.6), (8.0, 2.5, 3.0))
 )
 """Typical length, width and height in metres."""
+WIDEST = {ObjectClass.CAR: 2.2, ObjectClass.TRUCK: 2.6}
+"""Metres; wider clusters hold more than one object."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,11 @@ def class_and_size(
     tall = float(np.clip(height, 0.5, 4.5))
     if max(length, width) < 1.3 and speed < 3.5:
         return ObjectClass.PEDESTRIAN, np.array([*np.maximum(seen, 0.6 * PERSON[:2]), max(tall, 0.8)])
-    if width < 1.1 and length < 2.4 and tall > 1.2 and speed < 12.0:
+    if width < 1.4 and length < 2.6 and tall > 1.2 and speed < 12.0:
         return ObjectClass.BICYCLE, np.array([max(length, CYCLIST[0]), max(width, CYCLIST[1]), tall])
     typical, found = (TRUCK, ObjectClass.TRUCK) if length > 6.5 or tall > 2.6 else (CAR, ObjectClass.CAR)
     sides = np.where(seen > WHOLE * typical[:2], seen, typical[:2])
+    sides[1] = min(sides[1], WIDEST[found])
     return found, np.array([*sides, tall if tall > 0.7 * typical[2] else typical[2]])
 
 
@@ -118,7 +121,8 @@ def _seen(extents: Float[np.ndarray, "k 2 2"], clusters: Sequence[Cluster]) -> F
     """The length and width that were seen."""
     lengths = extents[:, :, 1] - extents[:, :, 0]
     rich = np.array([len(cluster.points) >= RICH for cluster in clusters])
-    return np.percentile(lengths[rich] if rich.any() else lengths, SEEN, axis=0) + MARGIN
+    chosen = lengths[rich] if rich.any() else lengths
+    return np.array([np.percentile(chosen[:, k], share) for k, share in enumerate(SEEN)]) + MARGIN
 
 
 def _center(

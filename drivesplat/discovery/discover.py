@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from drivesplat.discovery.boxes import Discovered, fitted_box
-from drivesplat.discovery.clusters import Chain, chains_of, clusters_of
+from drivesplat.discovery.clusters import Chain, Cluster, chains_of, clusters_of
 from drivesplat.discovery.merging import merged, united
 from drivesplat.discovery.seen_empty import seen_empty
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
 
 MIN_SCANS, MIN_SECONDS, MIN_WAY = 3, 0.4, 1.0
@@ -21,8 +22,18 @@ MIN_TYPICAL = 4.0
 """Median number of returns of its clusters."""
 STRAIGHT = 0.5
 """Least ratio of the distance between its ends to the length of its way."""
+SAME_VELOCITY, SAME_SHARE = 2.5, 0.5
+"""Metres per second, and fraction of the speed, by which the velocities of parts of one object seem to differ."""
+SLACK = (1.0, 0.3)
+"""Metres along and across a vehicle by which the middles of its parts may lie beyond its box."""
+NEARLY_ALWAYS = 0.75
+"""Fraction of their common time."""
 MAX_CLEARANCE = 0.8
 """Metres between the ground and the lowest return of an object."""
+MIN_MOVING = 0.4
+"""Fraction of the returns in the place of an object that move."""
+BESIDE, KERB = 0.2, 0.3
+"""Metres around a cluster, and above the ground, where returns are counted for it."""
 AROUND, LOWEST = 3.0, 5.0
 """Metres around an object in which the lowest returns, by percentile, are the ground."""
 
@@ -32,14 +43,14 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     ordered = sorted(scans, key=lambda scan: scan.timestamp)
     moving = seen_empty(ordered)
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(ordered, moving, strict=True))]
-    grounds = Grounds(ordered, moving)
-    chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and grounds.carries(chain)]
-    return sorted(_without_overlaps(chains, grounds), key=lambda it: it.seconds[0])
+    around = Surroundings(ordered, moving)
+    chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and around.confirm(chain)]
+    return sorted(_without_overlaps(chains, around), key=lambda it: it.seconds[0])
 
 
-def _without_overlaps(chains: Sequence[Chain], grounds: "Grounds") -> list[Discovered]:
+def _without_overlaps(chains: Sequence[Chain], around: "Surroundings") -> list[Discovered]:
     """The boxes of chains; chains whose boxes overlap while both move are one object."""
-    boxes = [(chain, fitted_box(chain, grounds.below(chain))) for chain in chains]
+    boxes = [(chain, fitted_box(chain, around.grounds(chain))) for chain in chains]
     while True:
         pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if overlap(boxes[i][1], boxes[j][1]))
         pair = next(pairs, None)
@@ -47,21 +58,40 @@ def _without_overlaps(chains: Sequence[Chain], grounds: "Grounds") -> list[Disco
             return [box for _, box in boxes]
         whole = united(*(boxes[k][0] for k in pair))
         boxes = [it for k, it in enumerate(boxes) if k not in pair]
-        boxes.append((whole, fitted_box(whole, grounds.below(whole))))
+        boxes.append((whole, fitted_box(whole, around.grounds(whole))))
 
 
 def overlap(a: Discovered, b: Discovered) -> bool:
-    """Whether the centre of each box mostly lies in the other one, over their common time."""
+    """Whether two boxes are of one object: over their common time the centre of one mostly lies in the other, with
+    SLACK about vehicles, and they move alike; or it nearly always lies in a truck, on whose side patches seem to
+    slide."""
     first, last = max(a.seconds[0], b.seconds[0]), min(a.seconds[-1], b.seconds[-1])
     if last <= first:
         return False
     seconds = np.linspace(first, last, 10)
-    inside = []
+    alike = _move_alike(a, b, seconds)
     for outer, inner in ((a, b), (b, a)):
-        poses, places = outer.poses(seconds), inner.poses(seconds)[:, :3, 3]
-        local = np.einsum("nji,nj->ni", poses[:, :3, :3], places - poses[:, :3, 3])
-        inside.append((np.abs(local[:, :2]) < 0.5 * outer.size[:2]).all(axis=1).mean())
-    return min(inside) > 0.5
+        slack = np.zeros(2) if outer.object_class.is_human else np.array(SLACK)
+        if alike and _share_inside(outer, inner, seconds, slack) > 0.5:
+            return True
+        is_long = outer.object_class is ObjectClass.TRUCK
+        if is_long and _share_inside(outer, inner, seconds, np.zeros(2)) > NEARLY_ALWAYS:
+            return True
+    return False
+
+
+def _move_alike(a: Discovered, b: Discovered, seconds: np.ndarray) -> bool:
+    velocities = [item.path.velocities(seconds) for item in (a, b)]
+    speed = max(float(np.median(np.linalg.norm(own, axis=1))) for own in velocities)
+    apart = float(np.median(np.linalg.norm(velocities[0] - velocities[1], axis=1)))
+    return apart <= max(SAME_VELOCITY, SAME_SHARE * speed)
+
+
+def _share_inside(outer: Discovered, inner: Discovered, seconds: np.ndarray, slack: np.ndarray) -> float:
+    """The fraction of the times at which the centre of a box lies in another one, enlarged by `slack` (2,) metres."""
+    poses, places = outer.poses(seconds), inner.poses(seconds)[:, :3, 3]
+    local = np.einsum("nji,nj->ni", poses[:, :3, :3], places - poses[:, :3, 3])
+    return float((np.abs(local[:, :2]) < 0.5 * outer.size[:2] + slack).all(axis=1).mean())
 
 
 def _long(chains: Sequence[Chain]) -> list[Chain]:
@@ -86,30 +116,49 @@ def is_object(chain: Chain) -> bool:
     )
 
 
-class Grounds:
-    """The heights of the ground by the scans' returns that do not move."""
+class Surroundings:
+    """What the scans say around clusters: the height of the ground, and returns that do not move."""
 
     def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " n"]]):
         self._scans, self._moving = scans, moving
-        self._trees: dict[int, tuple[cKDTree, np.ndarray]] = {}
+        self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
 
-    def below(self, chain: Chain) -> Float[np.ndarray, " k"]:
+    def grounds(self, chain: Chain) -> Float[np.ndarray, " k"]:
         """The height of the ground below each cluster of a chain in metres."""
-        found = np.array([self._below(cluster.scan, cluster.place) for cluster in chain.clusters])
+        found = np.array([self._ground(cluster) for cluster in chain.clusters])
         lowest = np.array([cluster.points[:, 2].min() for cluster in chain.clusters])
-        found = np.where(np.isfinite(found), found, lowest)
-        return np.minimum(found, lowest)
+        return np.fmin(found, lowest)
 
-    def carries(self, chain: Chain) -> bool:
-        """Whether a chain mostly reaches down to the ground, as objects that move do, and leaves and signs do not."""
-        places = [(cluster.scan, cluster.place) for cluster in chain.clusters]
-        heights = [c.points[:, 2].min() - self._below(*at) for c, at in zip(chain.clusters, places, strict=True)]
-        return bool(np.nanmedian(heights) < MAX_CLEARANCE) if np.isfinite(heights).any() else False
+    def confirm(self, chain: Chain) -> bool:
+        """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
+        move, as those of standing objects do not."""
+        grounds = np.array([self._ground(cluster) for cluster in chain.clusters])
+        if not np.isfinite(grounds).any():
+            return False
+        lowest = np.array([cluster.points[:, 2].min() for cluster in chain.clusters])
+        shares = [self._moving_share(*it) for it in zip(chain.clusters, np.fmin(grounds, lowest), strict=True)]
+        return bool(np.nanmedian(lowest - grounds) < MAX_CLEARANCE and np.median(shares) > MIN_MOVING)
 
-    def _below(self, number: int, place: np.ndarray) -> float:
-        if number not in self._trees:
-            points = self._scans[number].points()[~self._moving[number]]
-            self._trees[number] = cKDTree(points[:, :2]), points[:, 2]
-        tree, heights = self._trees[number]
-        near = tree.query_ball_point(place, AROUND)
+    def _ground(self, cluster: Cluster) -> float:
+        tree, heights = self._of_scan(cluster.scan)
+        near = tree.query_ball_point(cluster.place, AROUND)
         return float(np.percentile(heights[near], LOWEST)) if len(near) >= 5 else float("nan")
+
+    def _moving_share(self, cluster: Cluster, ground: float) -> float:
+        """The fraction of the returns in a cluster's extents, above the ground, that move."""
+        tree, heights = self._of_scan(cluster.scan)
+        low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
+        reach = 0.5 * float(np.linalg.norm(high[:2] - low[:2]))
+        near = np.array(tree.query_ball_point(cluster.place, reach), dtype=np.int64)
+        places, z = tree.data[near], heights[near]
+        inside = (places >= low[:2]).all(axis=1) & (places <= high[:2]).all(axis=1)
+        standing = int((inside & (z > ground + KERB) & (z <= high[2])).sum())
+        own = int((cluster.points[:, 2] > ground + KERB).sum())
+        return own / max(own + standing, 1)
+
+    def _of_scan(self, number: int) -> tuple[cKDTree, np.ndarray]:
+        """The places of the returns of a scan that do not move, and their heights."""
+        if number not in self._standing:
+            points = self._scans[number].points()[~self._moving[number]]
+            self._standing[number] = cKDTree(points[:, :2]), points[:, 2]
+        return self._standing[number]

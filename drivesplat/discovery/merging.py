@@ -6,11 +6,11 @@ import numpy as np
 
 from drivesplat.discovery.clusters import Chain, Cluster
 
-MAX_HIDDEN_S = 2.5
-"""Seconds for which an object may be hidden."""
+MAX_HIDDEN_S, MAX_COMMON_S = 2.5, 0.3
+"""Seconds for which an object may be hidden, and by which two chains of it may overlap."""
 HIDDEN_APART, HIDDEN_APART_SPEED = 1.2, 1.0
 """Metres, and metres per second of the gap, by which it may reappear elsewhere than expected."""
-SAME_VELOCITY = 2.5
+SAME_VELOCITY = 4.0
 """Metres per second by which the velocities before and after a gap may differ."""
 MAX_LENGTH, MAX_ASIDE = 6.0, 1.2
 """Metres along and across the way between the middles of two parts of one object."""
@@ -38,20 +38,20 @@ def after_gaps(chains: Sequence[Chain]) -> list[Chain]:
                     best, pair = cost, (i, j)
         if pair is None:
             return left
-        joined = Chain([*left[pair[0]].clusters, *left[pair[1]].clusters])
+        joined = united(left[pair[0]], left[pair[1]])
         left = [chain for k, chain in enumerate(left) if k not in pair] + [joined]
 
 
 def _gap_cost(before: Chain, after: Chain) -> float:
     """The deviation of `after` from where `before` would be, relative to what is allowed; 1 and more: not joined."""
     gap = after.clusters[0].seconds - before.clusters[-1].seconds
-    if not 0.0 < gap <= MAX_HIDDEN_S or min(len(before.clusters), len(after.clusters)) < 2:
+    if not -MAX_COMMON_S < gap <= MAX_HIDDEN_S or min(len(before.clusters), len(after.clusters)) < 2:
         return 1.0
     (end, leaving), (begin, arriving) = before.motion_at_end(), after.motion_at_begin()
     if np.linalg.norm(leaving - arriving) > SAME_VELOCITY:
         return 1.0
     expected = end + 0.5 * gap * (leaving + arriving)
-    return float(np.linalg.norm(begin - expected) / (HIDDEN_APART + HIDDEN_APART_SPEED * gap))
+    return float(np.linalg.norm(begin - expected) / (HIDDEN_APART + HIDDEN_APART_SPEED * max(gap, 0.0)))
 
 
 def of_parts(chains: Sequence[Chain]) -> list[Chain]:
