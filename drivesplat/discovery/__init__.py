@@ -1,1 +1,1 @@
-"""What moves in a drive that nobody labelled, found in its LiDAR scans."""
+"""Moving objects of a drive that nobody labelled, found in its LiDAR scans."""

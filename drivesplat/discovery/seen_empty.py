@@ -1,4 +1,4 @@
-"""Returns in space that other scans prove empty: they lie on what moves.
+"""Returns in space that other scans prove empty: they lie on moving objects.
 
 A scan some seconds earlier or later looks along its own rays past the place of a return. If all its rays around that
 place went on beyond it, the place was empty then; if one ended there, it was occupied. A place that is behind what the

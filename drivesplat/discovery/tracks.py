@@ -25,7 +25,7 @@ def discovered_tracks(scene: Scene, records: ScanRecords, settings: DiscoverSett
     are known. Raises DatasetError where the scene has no scan, or none of the LiDAR that the settings name."""
     lidar, scans = searched(scene, records, settings.lidar)
     if len(scans) < 2:
-        log.warning("LiDAR %s has a single scan: nothing tells what moves", lidar)
+        log.warning("LiDAR %s has a single scan: nothing shows which objects move", lidar)
     tracks = tuple(tracks_of(scene, discovered(scans))) if len(scans) > 1 else ()
     log.info("%d moving objects in %d scans of LiDAR %s", len(tracks), len(scans), lidar)
     quality = tracks_quality(scene, tracks, scans, records.tracks) if scene.tracks else None

@@ -18,8 +18,8 @@ LOOKS = (
     "tracks", "film", "compare", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd",
     "export_viewer", "export_colmap", "export_spz", "export_sog", "lidar_picture", "lidar_film",
 )  # fmt: skip
-OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "tracks", "compare")
-STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "train", "evaluate", *LOOKS)
+OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "tracks", "compare")
+STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "train", "evaluate", *LOOKS)
 PUBLISHED = {"source": "A paper", "url": "https://example.org", "scene": "0061", "method": "M", "psnr": 20.0}
 
 
