@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -35,10 +36,15 @@ class Cluster:
     points: Float[np.ndarray, "n 3"]
     origin: Float[np.ndarray, "3"]
 
-    @property
+    @cached_property
     def place(self) -> Float[np.ndarray, "2"]:
         """The horizontal middle of its extents."""
         return 0.5 * (self.points[:, :2].min(axis=0) + self.points[:, :2].max(axis=0))
+
+    @property
+    def lowest(self) -> float:
+        """The height of its lowest return in metres."""
+        return float(self.points[:, 2].min())
 
 
 @dataclass

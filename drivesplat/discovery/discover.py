@@ -39,11 +39,10 @@ AROUND, LOWEST = 3.0, 5.0
 
 
 def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
-    """The moving objects in the scans of one LiDAR, in order of the time at which they appear."""
-    ordered = sorted(scans, key=lambda scan: scan.timestamp)
-    moving = seen_empty(ordered)
-    clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(ordered, moving, strict=True))]
-    around = Surroundings(ordered, moving)
+    """The moving objects in the scans of one LiDAR, which are in order of time, in the order in which they appear."""
+    moving = seen_empty(scans)
+    clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
+    around = Surroundings(scans, moving)
     chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and around.confirm(chain)]
     return sorted(_without_overlaps(chains, around), key=lambda it: it.seconds[0])
 
@@ -122,27 +121,29 @@ class Surroundings:
     def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " n"]]):
         self._scans, self._moving = scans, moving
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
+        self._grounds: dict[tuple[int, float, float], float] = {}
 
     def grounds(self, chain: Chain) -> Float[np.ndarray, " k"]:
         """The height of the ground below each cluster of a chain in metres."""
-        found = np.array([self._ground(cluster) for cluster in chain.clusters])
-        lowest = np.array([cluster.points[:, 2].min() for cluster in chain.clusters])
-        return np.fmin(found, lowest)
+        return np.array([np.fmin(self._ground(cluster), cluster.lowest) for cluster in chain.clusters])
 
     def confirm(self, chain: Chain) -> bool:
         """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
         move, as those of standing objects do not."""
-        grounds = np.array([self._ground(cluster) for cluster in chain.clusters])
-        if not np.isfinite(grounds).any():
+        clearances = np.array([cluster.lowest - self._ground(cluster) for cluster in chain.clusters])
+        if not np.isfinite(clearances).any() or np.nanmedian(clearances) >= MAX_CLEARANCE:
             return False
-        lowest = np.array([cluster.points[:, 2].min() for cluster in chain.clusters])
-        shares = [self._moving_share(*it) for it in zip(chain.clusters, np.fmin(grounds, lowest), strict=True)]
-        return bool(np.nanmedian(lowest - grounds) < MAX_CLEARANCE and np.median(shares) > MIN_MOVING)
+        shares = [self._moving_share(*it) for it in zip(chain.clusters, self.grounds(chain), strict=True)]
+        return bool(np.median(shares) > MIN_MOVING)
 
     def _ground(self, cluster: Cluster) -> float:
-        tree, heights = self._of_scan(cluster.scan)
-        near = tree.query_ball_point(cluster.place, AROUND)
-        return float(np.percentile(heights[near], LOWEST)) if len(near) >= 5 else float("nan")
+        """The height of the ground around a cluster; NaN where too few returns are there."""
+        key = cluster.scan, *cluster.place.tolist()
+        if key not in self._grounds:
+            tree, heights = self._of_scan(cluster.scan)
+            near = tree.query_ball_point(cluster.place, AROUND)
+            self._grounds[key] = float(np.percentile(heights[near], LOWEST)) if len(near) >= 5 else float("nan")
+        return self._grounds[key]
 
     def _moving_share(self, cluster: Cluster, ground: float) -> float:
         """The fraction of the returns in a cluster's extents, above the ground, that move."""

@@ -38,7 +38,8 @@ def tracks_quality(
     """
     seen = movers_in_sight(scene, scans, track_ids)
     matches = {track_id: _best(boxes, tracks, scene) for track_id, boxes in seen.items()}
-    right = {track.id: _is_right(track, scene) for track in tracks}
+    annotated = moving_tracks(scene)
+    right = {track.id: _is_right(track, annotated, scene.key_frame_interval) for track in tracks}
     found = {}
     for kind, belongs in KINDS.items():
         movers = [track_id for track_id, boxes in seen.items() if belongs(boxes[0][1].object_class)]
@@ -88,12 +89,12 @@ def _best(boxes: Sequence[tuple[int, Box]], tracks: Sequence[Track], scene: Scen
     return best
 
 
-def _is_right(track: Track, scene: Scene) -> bool:
-    """Whether one annotated object that moves at some time is near a track for half of its key frames."""
+def _is_right(track: Track, movers: Sequence[Track], interval: float) -> bool:
+    """Whether one of the annotated `movers` is near a track for half of its key frames. `interval`: the key-frame
+    interval in microseconds."""
     near: dict[str, int] = {}
-    movers = moving_tracks(scene)
     for timestamp, pose in zip(track.timestamps, track.object_to_world, strict=True):
-        for box in boxes_of(movers, int(timestamp), scene.key_frame_interval):
+        for box in boxes_of(movers, int(timestamp), interval):
             if np.linalg.norm(box.object_to_world[:2, 3] - pose[:2, 3]) <= NEAR:
                 near[box.track_id] = near.get(box.track_id, 0) + 1
     return max(near.values(), default=0) >= HALF * len(track.timestamps)

@@ -4,10 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from drivesplat.io.storage import Provenance, read_json, unreadable, write_json
-from drivesplat.io.typed_record import field_values, typed_record
+from drivesplat.io.json_record import read_typed_json, write_typed_json
+from drivesplat.io.storage import Provenance
 from drivesplat.scene.scene import Track
 
 RULE = "discover"
@@ -28,19 +26,9 @@ class DiscoveredTracks:
 
 def write_discovered(path: str | Path, record: DiscoveredTracks) -> None:
     """Writes discovered.json."""
-    write_json(path, {"schema": SCHEMA, **field_values(record)}, _plain)
+    write_typed_json(path, record, SCHEMA)
 
 
 def read_discovered(path: str | Path) -> DiscoveredTracks:
     """Reads discovered.json. Raises ResultError that names the file and its rule if it is invalid."""
-    content = read_json(path, RULE)
-    try:
-        if content.pop("schema") != SCHEMA:
-            raise ValueError("it has another schema")
-        return typed_record(DiscoveredTracks, content, json=True)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, RULE, f"not a record of discovered tracks ({error})") from error
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else field_values(value)
+    return read_typed_json(path, RULE, DiscoveredTracks, SCHEMA, "a record of discovered tracks")

@@ -21,6 +21,8 @@ from drivesplat.model.splat_model import SplatModel
 
 MIN_SHARE = 0.03
 """Of the singular values of the sampled weights, relative to the largest: smaller ones are noise."""
+MIN_COSINE = 0.1
+"""Of half a rotation, for finite vectors: half a turn has none."""
 
 
 @dataclass(frozen=True)
@@ -84,5 +86,5 @@ def _turns(quats: Float[np.ndarray, "t n 4"], shown: Float[np.ndarray, "n 4"]) -
     before = Rotation.from_quat(np.broadcast_to(shown, quats.shape).reshape(-1, 4), scalar_first=True)
     after = Rotation.from_quat(quats.reshape(-1, 4), scalar_first=True)
     found = (after * before.inv()).as_quat(scalar_first=True, canonical=True)
-    turned = found[:, 1:] / np.maximum(found[:, :1], 0.1)
+    turned = found[:, 1:] / np.maximum(found[:, :1], MIN_COSINE)
     return turned.reshape(*quats.shape[:2], 3)

@@ -8,14 +8,13 @@ Ego: x forward, y left, z up, on the ground under the rear axle. Timestamps: mic
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.storage import Provenance, read_json, unreadable, write_json
-from drivesplat.io.typed_record import field_values, typed_record
+from drivesplat.io.json_record import read_typed_json, write_typed_json
+from drivesplat.io.storage import Provenance
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.sensors import Camera, Lidar, SweepMotion
@@ -164,7 +163,7 @@ def place_of(recording: Frame | Sweep) -> str:
 
 def write_scene(path: str | Path, scene: Scene) -> None:
     """Writes `scene.json`."""
-    write_json(path, {"schema": SCHEMA, **field_values(scene)}, _plain)
+    write_typed_json(path, scene, SCHEMA)
 
 
 def read_scene(path: str | Path) -> Scene:
@@ -178,14 +177,4 @@ def read_scene(path: str | Path) -> Scene:
     ['car', 'truck', 'pedestrian', 'other_movable']
     """
     rule = "refine_poses" if Path(path).name == REFINED else "extract"
-    content = read_json(path, rule)
-    try:
-        if content.pop("schema") != SCHEMA:
-            raise ValueError("it has another schema")
-        return typed_record(Scene, content, json=True)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, rule, f"not a scene record ({error})") from error
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else field_values(value)
+    return read_typed_json(path, rule, Scene, SCHEMA, "a scene record")
