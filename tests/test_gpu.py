@@ -553,14 +553,14 @@ def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, cap
     """Of a sensor that moves while it turns, so that both halves of a revolution are rendered."""
     moving = {"linear": np.array([3.0, 0.5, 0.0]), "angular": np.array([0.0, 0.0, 0.3])}
     recorded = [replace(scan_of_a_wall(x), seconds=x, **moving) for x in (0.5, 1.0)]
-    half = ScanTrainingSettings(share=0.5, **limits)
-    captured, mine = trained_with(True, recorded=recorded, scans=half)
-    eager, theirs = trained_with(False, recorded=recorded, scans=half)
+    beside = ScanTrainingSettings(per_image=1.0, **limits)
+    captured, mine = trained_with(True, recorded=recorded, scans=beside)
+    eager, theirs = trained_with(False, recorded=recorded, scans=beside)
     assert not caplog.records, "nothing was refused"
     assert len(captured.graphs._graphs) == len(captured.images.views) + len(recorded) and not eager.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
     assert mine[-1] < mine[1], "scans"
-    assert half.fine_tune or mine[-2] < mine[0], "images, with which scans take turns unless they fine-tune"
+    assert beside.fine_tune or mine[-2] < mine[0], "images, with which scans take turns unless they fine-tune"
 
 
 def test_captured_velocities_are_those_of_the_actors_that_own_the_gaussians_at_a_replay():

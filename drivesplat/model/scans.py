@@ -70,7 +70,7 @@ def scan_picture(gaussians: Gaussians, view: ScanView, before: Float[Tensor, "b 
     """The scan of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets nothing, or
     that the vehicle blocks, is not returned. Raises ResultError for Gaussians without echoes."""
     if gaussians.echoes is None:
-        raise ResultError("the model was trained without LiDAR: train it with train.scans.share above 0")
+        raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
     toward = torch.nn.functional.normalize(gaussians.means.detach() - view.sensor_to_world[:3, 3], dim=-1)
     along = (toward[:, :, None] * gaussians.echoes[:, 1:]).sum(dim=1)  # a GPU multiplies small matrices slowly
     logits = gaussians.echoes[:, 0] + along

@@ -178,7 +178,8 @@ class FloaterSettings(Settings):
 
 class TrainSettings(Settings):
     iterations: int = Field(15_000, ge=1, le=1_000_000)
-    """Number of optimisation steps, one image each."""
+    """Number of optimisation steps that fit an image each; methods that render LiDAR have further ones for scans
+    (`scans`)."""
     strategy: Literal["mcmc", "default"] = "mcmc"
     """Densification: 'mcmc', or 'default' (by gradient), which fills the space in front of sparse cameras."""
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
@@ -257,8 +258,8 @@ class TrainSettings(Settings):
 
     @model_validator(mode="after")
     def _scans_need_mcmc(self) -> "TrainSettings":
-        if self.scans.share and self.strategy != "mcmc":
-            raise ValueError("scans.share needs strategy: mcmc, since densification by gradient knows images alone")
+        if self.scans.per_image and self.strategy != "mcmc":
+            raise ValueError("scans.per_image needs strategy: mcmc, since densification by gradient knows images alone")
         return self
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":

@@ -13,16 +13,16 @@ class ScanTrainingSettings(Settings):
     """Rendered LiDAR: Gaussians with an intensity and a probability to return a ray, fitted to recorded scans. Needs
     strategy: mcmc. Defaults of the weights are those of SplatAD (Hess et al. 2025, arXiv 2411.16816)."""
 
-    share: float = Field(0.0, ge=0, le=1)
-    """Fraction of the iterations that fit a scan in place of an image. 0 = LiDAR is not rendered. Without cameras every
-    iteration fits a scan where it is above 0."""
+    per_image: float = Field(0.0, ge=0, le=10)
+    """Iterations that fit a scan, per iteration that fits an image, in addition to these and evenly spread among them.
+    0 = LiDAR is not rendered. Without cameras each of `train.iterations` fits a scan where it is above 0."""
     geometry: float = Field(1.0, ge=0, le=1)
     """Factor of the gradient by which scans move and shape Gaussians. 0 = they fit intensities and returns alone, and
     images are rendered as without LiDAR."""
-    fine_tune: float = Field(0.0, ge=0, lt=1)
-    """Fraction of the iterations, the last ones, that all fit scans and change no image: they fit offsets of position,
-    rotation, size and opacity of background Gaussians that only the LiDAR sees, intensities and returns. Densification
-    and all schedules of images end before them. 0 = no such offsets."""
+    fine_tune: float = Field(0.0, ge=0, le=10)
+    """Further iterations that fit scans and change no image, per iteration that fits an image: they fit offsets of
+    position, rotation, size and opacity of background Gaussians that only the LiDAR sees, intensities and returns.
+    Densification and all schedules of images end before them. 0 = no such offsets."""
     range_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute error of ranges (metres), without the worst 5 % of the rays."""
     intensity_weight: float = Field(1.0, ge=0)

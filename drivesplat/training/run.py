@@ -161,7 +161,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         views = load_views(inputs.record, inputs.guides(job), device)
     rays = sum(int(scan.measured.sum()) for scan in inputs.scans)
     record, cap = inputs.record, gaussian_cap(inputs.record, job.train, rays)
-    if job.train.scans.share:
+    if job.train.scans.per_image:
         record = with_scan_points(record, inputs.scans, job.train.scans, job.random_seed)
     more = len(record.points) - len(inputs.record.points)
     settings = job.train.model_copy(update={"cap_max": cap + more})
@@ -173,15 +173,15 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
         _times_by_camera(views) if job.train.camera_poses.corrected else {},
-        initial_echo(inputs.scans) if job.train.scans.share else None,
+        initial_echo(inputs.scans) if job.train.scans.per_image else None,
     )
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
         views = [dataclasses.replace(view, sky=None) for view in views]
     with explain_out_of_memory(lambda: 0):
         curves = curve_views(inputs, views, job, device)
-        scans = load_scans(inputs.scans, job.train.scans, device) if job.train.scans.share else []
-    if job.train.scans.share and not scans:
-        raise TrainingError("no LiDAR scan is there to train with; set train.scans.share to 0")
+        scans = load_scans(inputs.scans, job.train.scans, device) if job.train.scans.per_image else []
+    if job.train.scans.per_image and not scans:
+        raise TrainingError("no LiDAR scan is there to train with; set train.scans.per_image to 0")
     model = build_model(init, job.parts, job.sky, settings)
     priors = geometry_priors(inputs.record, inputs.free_space, settings)
     return Prepared(model, views, settings, priors, curves, scans)
@@ -216,7 +216,7 @@ def run_training(
     started_by = os.getppid()
     with resume_state.training_lock(files.resume):
         device = choose_device(device_settings)
-        if job.train.scans.share:  # images never show some of the Gaussians that scans do
+        if job.train.scans.per_image:  # images never show some of the Gaussians that scans do
             flush_denormals()
         begun = prepare(inputs, job, device)
         fingerprint = sha256_text(

@@ -55,11 +55,13 @@ class TrainingFolders:
 class TrainingSummary:
     """The content of `train.json`.
 
+    `iterations` are those that `train.iterations` counts, and `scan_iterations` those that fitted a LiDAR scan.
     `peak_gpu_memory_gb` is torch's peak reservation, None on the CPU; `seconds` includes the runs before a resume;
     `of_cameras` are the learned gains, offsets and pose corrections of each camera, by name.
     """
 
     iterations: int
+    scan_iterations: int
     seconds: float
     gaussians: int
     peak_gpu_memory_gb: float | None
@@ -90,7 +92,7 @@ def train(
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock, scans)
         run = TrainingRun.begin(trainer, folders, curves)
-        with Monitor(folders.tensorboard, settings.iterations, trainer.step, folders.label) as monitor:
+        with Monitor(folders.tensorboard, trainer.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
         return run.summary()
 
@@ -173,7 +175,8 @@ class TrainingRun:
             torch.cuda.synchronize(t.device)
         peak = torch.cuda.max_memory_reserved(t.device) / 1e9 if on_gpu else None
         return TrainingSummary(
-            iterations=t.step,
+            iterations=t.scan_schedule.counted_before(t.step),
+            scan_iterations=t.scan_schedule.scans_before(t.step),
             seconds=self.seconds,
             gaussians=len(t.model),
             peak_gpu_memory_gb=peak,

@@ -93,8 +93,8 @@ class Trainer:
 
     @property
     def iterations(self) -> int:
-        """The number of all iterations, with those that fine-tune."""
-        return self.scan_schedule.iterations
+        """The number of all iterations, with those that fit scans."""
+        return self.scan_schedule.steps
 
     @property
     def fits_scan(self) -> bool:

@@ -181,7 +181,7 @@ class Plan(Outputs):
             able = [name for name in self.methods_with_lidar(scene) if name in self.config.methods]
             raise ConfigError(
                 f"method {method!r} does not render LiDAR, so it has no scans; those do: {', '.join(able) or 'none'} "
-                "(train.scans.share above 0, as in presets/lidar.yaml)"
+                "(train.scans.per_image above 0, as in presets/lidar.yaml)"
             )
         if kind == EDITS:
             self._refuse_without_actors(method)
@@ -207,7 +207,7 @@ class Plan(Outputs):
         if not self.renders_lidar(scene, method):
             able = ", ".join(name for name in self.config.methods if self.renders_lidar(scene, name)) or "none"
             raise ConfigError(
-                f"method {method!r} renders no LiDAR of scene {scene} (train.scans.share is 0); those do: {able} "
+                f"method {method!r} renders no LiDAR of scene {scene} (train.scans.per_image is 0); those do: {able} "
                 "(docs/lidar.md; presets/lidar.yaml adds street_lidar)"
             )
 

@@ -110,7 +110,7 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
         "actors": "actors" in stages_of_parts,
         "lidar_depth": train.depth_weight > 0 and has_cameras(config, scene),
         "free_space": train.floaters.free_space,
-        SCANS: train.scans.share > 0,
+        SCANS: train.scans.per_image > 0,
     }
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
@@ -170,7 +170,7 @@ def _training(at: Place) -> dict[str, Any]:
     config, method = at.config, at.config.all_methods[at.method]
     train = config.train.for_parts(method.parts)
     if not config.cameras:
-        alone = {"share": float(train.scans.share > 0), "fine_tune": 0.0, "geometry": 1.0}  # there is no image to spare
+        alone = {"per_image": float(train.scans.per_image > 0), "fine_tune": 0.0, "geometry": 1.0}  # there is no image to spare
         scans = train.scans.model_copy(update=alone)
         return {"parts": method.parts, "sky": "none", "train": train.model_copy(update={"scans": scans})}
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None

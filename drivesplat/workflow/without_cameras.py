@@ -41,7 +41,7 @@ def scene_methods(config: Config, scene: str) -> list[str]:
 
 
 def _renders_lidar(config: Config, scene: str, method: str) -> bool:
-    return for_scene(config, scene, method).train.scans.share > 0
+    return for_scene(config, scene, method).train.scans.per_image > 0
 
 
 def no_camera(scene: str) -> str:
@@ -53,7 +53,7 @@ def require_methods(config: Config, scene: str) -> None:
     """Raises ConfigError for a scene without cameras that no method can be trained on."""
     if not scene_methods(config, scene):
         raise ConfigError(
-            f"{no_camera(scene)}, and no method renders LiDAR; add one with train.scans.share above 0, such as "
+            f"{no_camera(scene)}, and no method renders LiDAR; add one with train.scans.per_image above 0, such as "
             "street_lidar of presets/lidar.yaml"
         )
 

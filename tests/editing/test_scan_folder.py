@@ -250,7 +250,7 @@ def test_scans_of_an_earlier_run_are_removed_and_other_files_stay(folder, scene,
 
 def test_a_model_without_lidar_is_refused_in_one_sentence_and_leaves_no_file(scene, records, tmp_path):
     path = tmp_path / "scans" / "scans.json"
-    with pytest.raises(ResultError, match=r"trained without LiDAR: train it with train\.scans\.share above 0"):
+    with pytest.raises(ResultError, match=r"trained without LiDAR: train it with train\.scans\.per_image above 0"):
         write_scan_folder(
             scene, checkpoint_of(street_model()), records, a_job(), DeviceSettings(kind="cpu"), path, SOURCE, {}
         )

@@ -51,7 +51,7 @@ CONFIG = {
     "methods": {
         METHOD: {
             "parts": ["background", "actors"],
-            "overrides": merged(HELD_TO_SKY_AND_DEPTH, {"train": {"scans": {"share": 0.25, "points": 1500}}}),
+            "overrides": merged(HELD_TO_SKY_AND_DEPTH, {"train": {"scans": {"per_image": 0.25, "points": 1500}}}),
         }
     },
     "holdout": {"every_nth": 4, "offset": 2, "last_block": 1},

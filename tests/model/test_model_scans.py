@@ -140,7 +140,7 @@ def test_each_ray_knows_the_group_that_contributes_most():
 
 def test_a_model_trained_without_lidar_is_refused():
     model = SplatModel([round_gaussians([[5.0, 0.0, 0.0]])], None)
-    with pytest.raises(ResultError, match=r"trained without LiDAR: train it with train\.scans\.share above 0"):
+    with pytest.raises(ResultError, match=r"trained without LiDAR: train it with train\.scans\.per_image above 0"):
         model.scan(view())
     gaussians = walls().gaussians_at(0.0)
     assert gaussians.echoes is None, "images need no echoes"

@@ -43,7 +43,7 @@ from drivesplat.training.scans import (
 from drivesplat.training.train import train
 from drivesplat.training.trainer import Trainer
 
-SHARE = ScanTrainingSettings(share=0.5)
+SCANS = ScanTrainingSettings(per_image=1.0)
 
 
 def picture_of(scan, **changes) -> ScanPicture:
@@ -55,40 +55,51 @@ def picture_of(scan, **changes) -> ScanPicture:
 
 
 def terms_of(picture: ScanPicture, scan, **weights) -> dict[str, float]:
-    settings = settings_of(opacity_reg=0.0, scale_reg=0.0, scans=ScanTrainingSettings(share=0.5, **weights))
+    settings = settings_of(opacity_reg=0.0, scale_reg=0.0, scans=ScanTrainingSettings(per_image=1.0, **weights))
     model = SplatModel([round_gaussians([[0.0, 0.0, 5.0]])], None)
     return {name: float(value) for name, value in scan_terms(picture, scan, model, settings).items()}
 
 
-def scheduled(share: float, fine_tune: float = 0.0, images: int = 4, scans: int = 5) -> ScanSchedule:
-    """The schedule of 300 iterations."""
-    settings = settings_of(iterations=300, scans=ScanTrainingSettings(share=share, fine_tune=fine_tune))
+def scheduled(per_image: float, fine_tune: float = 0.0, images: int = 4, scans: int = 5) -> ScanSchedule:
+    """The schedule of a training with 300 iterations."""
+    settings = settings_of(iterations=300, scans=ScanTrainingSettings(per_image=per_image, fine_tune=fine_tune))
     return ScanSchedule.of(settings, images, scans)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.25, 1 / 3, 0.5, 0.9])
-def test_scans_are_spread_evenly_over_the_iterations(share):
-    schedule = scheduled(share)
-    fitted = [schedule.fits_scan(step) for step in range(300)]
-    assert sum(fitted) == math.floor(300 * share) == schedule.scans_before(300) == 300 - schedule.images_before(300)
-    assert not any(schedule.fine_tunes(step) for step in range(300))
-    for start in range(0, 300, 30):
+@pytest.mark.parametrize("per_image", [0.0, 0.1, 0.25, 1 / 3, 1.0, 2.5])
+def test_scans_are_spread_evenly_among_all_iterations_with_images(per_image):
+    schedule = scheduled(per_image)
+    steps = 300 + round(300 * per_image)
+    fitted = [schedule.fits_scan(step) for step in range(steps)]
+    assert schedule.steps == steps and sum(fitted) == schedule.scans_before(steps) == round(300 * per_image)
+    assert schedule.images_before(steps) == schedule.counted_before(steps) == 300
+    assert not any(schedule.fine_tunes(step) for step in range(steps))
+    share = per_image / (1.0 + per_image)
+    for start in range(0, steps - 30, 30):
         assert abs(sum(fitted[start : start + 30]) - 30 * share) <= 1
 
 
 def test_the_last_iterations_fine_tune_the_lidar():
     schedule = scheduled(0.25, fine_tune=0.2)
-    assert [schedule.fine_tunes(step) for step in (0, 239, 240, 299)] == [False, False, True, True]
-    assert sum(schedule.fits_scan(step) for step in range(240)) == 60 and schedule.images_before(240) == 180
-    assert all(schedule.fits_scan(step) for step in range(240, 300))
-    assert (schedule.scans_before(300), schedule.images_before(300)) == (120, 180)
+    assert schedule.steps == 300 + 75 + 60
+    assert [schedule.fine_tunes(step) for step in (0, 374, 375, 434, 435)] == [False, False, True, True, False]
+    assert sum(schedule.fits_scan(step) for step in range(375)) == 75 and schedule.images_before(375) == 300
+    assert all(schedule.fits_scan(step) for step in range(375, 435))
+    assert (schedule.scans_before(435), schedule.images_before(435), schedule.counted_before(435)) == (135, 300, 300)
 
 
-@pytest.mark.parametrize("changes", [{"images": 0}, {"scans": 0}, {"share": 0.0}])
-def test_nothing_is_fine_tuned_without_images_or_without_scans(changes):
-    schedule = scheduled(**{"share": 0.25, "fine_tune": 0.2, **changes})
+def test_nothing_is_fine_tuned_without_scans():
+    for changes in ({"scans": 0}, {"per_image": 0.0}):
+        schedule = scheduled(**{"per_image": 0.25, "fine_tune": 0.2, **changes})
+        assert schedule.steps == 300 and not any(schedule.fine_tunes(step) for step in range(300))
+        assert schedule.scans_before(300) == 0
+
+
+def test_without_images_every_iteration_fits_a_scan_and_counts():
+    schedule = scheduled(0.25, fine_tune=0.2, images=0)
+    assert schedule.steps == 300 and all(schedule.fits_scan(step) for step in range(300))
     assert not any(schedule.fine_tunes(step) for step in range(300))
-    assert schedule.scans_before(300) == (75 if changes.get("images") == 0 else 0)
+    assert (schedule.images_before(300), schedule.counted_before(300)) == (0, 300)
 
 
 def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
@@ -100,9 +111,9 @@ def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
 
 
 def test_every_image_is_taken_once_an_epoch_whatever_the_share():
-    settings = settings_of(scans=SHARE)
+    settings = settings_of(scans=SCANS)
     trainer = Trainer.begin(
-        with_echoes(settings), recorded_views(4), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SHARE, CPU)
+        with_echoes(settings), recorded_views(4), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
     )
     numbers = []
     for trainer.step in range(16):
@@ -112,14 +123,14 @@ def test_every_image_is_taken_once_an_epoch_whatever_the_share():
 
 
 def test_an_exact_scan_has_no_loss():
-    (scan,) = load_scans([scan_of_a_wall()], SHARE, CPU)
+    (scan,) = load_scans([scan_of_a_wall()], SCANS, CPU)
     terms = terms_of(picture_of(scan), scan)
     assert set(terms) == {"scan_range", "scan_drop", "scan_intensity", "scan_sight"}
     assert terms["scan_drop"] < 2e-5 and all(terms[name] == 0.0 for name in terms if name != "scan_drop")
 
 
 def test_each_term_measures_its_own_error():
-    (scan,) = load_scans([scan_of_a_wall()], SHARE, CPU)
+    (scan,) = load_scans([scan_of_a_wall()], SCANS, CPU)
     weights = {"range_weight": 2.0, "intensity_weight": 3.0, "drop_weight": 5.0, "sight_weight": 7.0}
     half, returns = 0.5 * torch.ones_like(scan.range), float(scan.returned.float().mean())
     far = terms_of(picture_of(scan, range=scan.range + 0.25), scan, **weights)
@@ -133,7 +144,7 @@ def test_each_term_measures_its_own_error():
 
 
 def test_the_worst_ranges_are_ignored():
-    (scan,) = load_scans([scan_of_a_wall()], SHARE, CPU)
+    (scan,) = load_scans([scan_of_a_wall()], SCANS, CPU)
     wild = scan.range.clone()
     wild[0, 1:4] += 1000.0
     assert terms_of(picture_of(scan, range=wild), scan)["scan_range"] == 0.0
@@ -142,7 +153,7 @@ def test_the_worst_ranges_are_ignored():
 def test_rays_that_were_not_measured_have_no_effect():
     unmeasured = np.zeros((12, 30), dtype=bool)
     unmeasured[3:9] = True
-    (scan,) = load_scans([dataclasses.replace(scan_of_a_wall(), measured=~unmeasured)], SHARE, CPU)
+    (scan,) = load_scans([dataclasses.replace(scan_of_a_wall(), measured=~unmeasured)], SCANS, CPU)
     rows = torch.from_numpy(unmeasured)
     wrong = {name: torch.where(rows, 9.0, getattr(scan, name)) for name in ("range", "intensity")}
     right, changed = picture_of(scan), picture_of(scan, returned=torch.where(rows, 0.3, scan.returned.float()), **wrong)
@@ -152,10 +163,10 @@ def test_rays_that_were_not_measured_have_no_effect():
 def test_a_scan_without_returns_or_intensity_has_a_finite_loss():
     empty = scan_of_a_wall()
     nothing = np.zeros((12, 30), dtype=np.float32)
-    (scan,) = load_scans([dataclasses.replace(empty, scan=Scan(empty.scan.rays, nothing > 0, nothing))], SHARE, CPU)
+    (scan,) = load_scans([dataclasses.replace(empty, scan=Scan(empty.scan.rays, nothing > 0, nothing))], SCANS, CPU)
     terms = terms_of(picture_of(scan, returned=nothing_met(scan), intensity=nothing_met(scan)), scan)
     assert "scan_intensity" not in terms and all(math.isfinite(value) for value in terms.values())
-    assert load_scans([dataclasses.replace(empty, measured=nothing > 0)], SHARE, CPU) == []
+    assert load_scans([dataclasses.replace(empty, measured=nothing > 0)], SCANS, CPU) == []
 
 
 def nothing_met(scan) -> torch.Tensor:
@@ -180,7 +191,7 @@ def test_the_beam_spread_is_in_radians():
 
 
 def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
-    settings = settings_of(iterations=240, scans=ScanTrainingSettings(share=0.5), opacity_reg=0.0, scale_reg=0.0)
+    settings = settings_of(iterations=120, scans=ScanTrainingSettings(per_image=1.0), opacity_reg=0.0, scale_reg=0.0)
     model, recorded = with_echoes(settings), [scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)]
     scans = load_scans(recorded, settings.scans, CPU)
 
@@ -188,16 +199,16 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
     with torch.no_grad():
         picture = model.scan(scans[1].view)
     known = scans[1].returned & (picture.alpha > 0.5)
-    assert summary.iterations == 240 and known.sum() > 0.9 * scans[1].returned.sum()
+    assert summary.iterations == summary.scan_iterations == 120 and known.sum() > 0.9 * scans[1].returned.sum()
     assert (picture.range - scans[1].range).abs()[known].median() < 0.2
     assert (picture.intensity - scans[1].intensity).abs()[known].median() < 0.05
     assert picture.returned[scans[1].returned].median() > 0.7 > 0.5 > picture.returned[~scans[1].returned].median()
 
 
 def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[Trainer, dict[str, set[str]]]:
-    """A trainer after one of 10 iterations, which fitted a scan, and the names of the parameters that it changed, by
+    """A trainer after one of 8 iterations and, with `fine_tune`, further ones, which fitted a scan, and the names of the parameters that it changed, by
     part."""
-    settings = settings_of(iterations=10, scans=ScanTrainingSettings(share=0.5, **scans))
+    settings = settings_of(iterations=4, scans=ScanTrainingSettings(per_image=1.0, **scans))
     still = with_echoes(settings, offsets=settings.scans.fine_tune > 0)
     model = untrained_street(settings, echo=(0.0, 2.0)) if street else still
     recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
@@ -215,7 +226,7 @@ def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[
     return trainer, changed
 
 
-@pytest.mark.parametrize("fine_tune", [0.0, 0.2])
+@pytest.mark.parametrize("fine_tune", [0.0, 0.5])
 def test_scans_leave_the_geometry_alone_where_they_are_told_to(fine_tune):
     """The noise of MCMC moves Gaussians in any case."""
     _, changed = changed_by_a_scan(1, geometry=0.0, fine_tune=fine_tune)
@@ -223,17 +234,17 @@ def test_scans_leave_the_geometry_alone_where_they_are_told_to(fine_tune):
 
 
 def test_fine_tuning_changes_what_the_lidar_alone_sees():
-    trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.2)
+    trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.5)
     assert changed == {"background": {"echoes", *OFFSETS.values()}, "actors": {"echoes"}}
     assert trainer.step == 9 and trainer.fine_tunes
-    _, before = changed_by_a_scan(7, fine_tune=0.2)
+    _, before = changed_by_a_scan(7, fine_tune=0.5)
     assert not before["background"] & {*OFFSETS.values()} and "scales" in before["background"]
 
 
 def test_checks_go_on_during_fine_tuning_and_densification_does_not(tmp_path, monkeypatch):
     """Lists of CUDA graphs may overflow there, too."""
     settings = settings_of(
-        iterations=20, scans=ScanTrainingSettings(share=0.5, fine_tune=0.5), refine_start=0.0, refine_stop=1.0,
+        iterations=5, scans=ScanTrainingSettings(per_image=1.0, fine_tune=2.0), refine_start=0.0, refine_stop=1.0,
         mcmc=McmcSettings(refine_every=5),
     )  # fmt: skip
     recorded, checked, confined = load_scans([scan_of_a_wall()], settings.scans, CPU), [], []
@@ -247,7 +258,7 @@ def test_checks_go_on_during_fine_tuning_and_densification_does_not(tmp_path, mo
 
 
 def test_the_rates_of_fine_tuning_decay():
-    settings = settings_of(iterations=100, scans=ScanTrainingSettings(share=0.5, fine_tune=0.2))
+    settings = settings_of(iterations=40, scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.5))
     recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
     trainer = Trainer.begin(with_echoes(settings, offsets=True), recorded_views(4), settings, 0, CPU, scans=recorded)
     (group,) = trainer.optimizers.parts
@@ -266,8 +277,8 @@ def test_the_rates_of_fine_tuning_decay():
 
 def test_fine_tuning_renders_scans_better_and_images_as_before():
     """Before and after the last iterations of a training, which fine-tune."""
-    scans = ScanTrainingSettings(share=0.25, geometry=0.0, fine_tune=0.5, range_weight=1.0)
-    settings = settings_of(iterations=160, scans=scans)
+    scans = ScanTrainingSettings(per_image=1 / 3, geometry=0.0, fine_tune=4 / 3, range_weight=1.0)
+    settings = settings_of(iterations=60, scans=scans)
     recorded = load_scans([scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)], scans, CPU)
     model, views = with_echoes(settings, offsets=True), recorded_views(4)
     trainer = Trainer.begin(model, views, settings, 0, CPU, scans=recorded)
@@ -281,7 +292,7 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
         _, picture, _ = trainer.fit_one(with_picture=False)
         trainer.densify(picture)
     image, error = image_and_error()
-    while trainer.step < settings.iterations:
+    while trainer.step < trainer.iterations:
         _, picture, _ = trainer.fit_one(with_picture=True)
         trainer.densify(picture)
     again, better = image_and_error()
@@ -291,7 +302,7 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
 def test_a_factor_scales_the_gradients_of_what_images_show():
     shown, offsets = {"means", "quats", "scales", "opacities"}, {*OFFSETS.values()}
     for factor, fine_tunes in ((0.25, False), (0.0, False), (0.25, True)):
-        settings = settings_of(scans=ScanTrainingSettings(share=0.5, fine_tune=0.2, geometry=factor))
+        settings = settings_of(scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.2, geometry=factor))
         model = with_echoes(settings, offsets=True)
         trainer = Trainer.begin(model, [], settings, 0, CPU, scans=load_scans([scan_of_a_wall()], settings.scans, CPU))
         for parameter in model.parts[0].params.values():
@@ -308,7 +319,7 @@ def test_a_factor_scales_the_gradients_of_what_images_show():
 
 def test_cameras_do_not_see_what_lidar_sees_elsewhere():
     """Offsets of all background Gaussians by 0.5 m along the rays: the wall is farther for the LiDAR alone."""
-    settings = settings_of(scans=ScanTrainingSettings(share=0.5, fine_tune=0.2), antialiased=False)
+    settings = settings_of(scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.2), antialiased=False)
     model, (scan,) = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
     (view, *_) = recorded_views(1)
     image, range_before = model.render(view.view).image, model.scan(scan.view).range
@@ -325,9 +336,9 @@ def test_cameras_do_not_see_what_lidar_sees_elsewhere():
 
 
 def test_an_iteration_whose_picture_is_wanted_fits_an_image():
-    settings = settings_of(scans=SHARE)
+    settings = settings_of(scans=SCANS)
     trainer = Trainer.begin(
-        with_echoes(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SHARE, CPU)
+        with_echoes(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
     )
     trainer.step = 1
     terms, picture, view = trainer.fit_one(with_picture=True)
@@ -335,8 +346,8 @@ def test_an_iteration_whose_picture_is_wanted_fits_an_image():
 
 
 def test_scans_need_densification_by_mcmc():
-    with pytest.raises(ValidationError, match=r"scans\.share needs strategy: mcmc"):
-        TrainSettings(strategy="default", scans=SHARE)
+    with pytest.raises(ValidationError, match=r"scans\.per_image needs strategy: mcmc"):
+        TrainSettings(strategy="default", scans=SCANS)
     assert untrained(settings_of()).parts[0].echoes(0.0) is None
 
 
@@ -347,13 +358,13 @@ def test_seed_points_are_added_where_scans_alone_met_static_surfaces():
     wall = dataclasses.replace(wall, objects=moving, linear=np.array([0.0, 0.0, 5.0]))
     known = np.array([[0.0, 0.0, WALL_AT]], dtype=np.float32)
     record = training_record_of(2, points=known, points_rgb=np.array([[10, 20, 30]], dtype=np.uint8))
-    found = with_scan_points(record, [wall], ScanTrainingSettings(share=0.5), seed=0)
+    found = with_scan_points(record, [wall], ScanTrainingSettings(per_image=1.0), seed=0)
     added = found.points[1:]
     assert len(added) > 20 and np.array_equal(found.points[:1], known) and found.points.dtype == np.float32
     np.testing.assert_allclose(added[:, 2], WALL_AT, atol=1e-4)
     assert (added[:, 1] < 0.02).all(), "the lower half of the rays met something that moves"
     assert np.linalg.norm(added - known, axis=1).min() > 0.5 and (found.points_rgb == [10, 20, 30]).all()
-    few = with_scan_points(record, [wall], ScanTrainingSettings(share=0.5, points=7), seed=0)
+    few = with_scan_points(record, [wall], ScanTrainingSettings(per_image=1.0, points=7), seed=0)
     assert len(few.points) == 8 and np.isin(few.points[1:, 0], added[:, 0]).all()
 
 
@@ -382,7 +393,7 @@ def without_images() -> TrainingInputs:
 def test_without_images_every_iteration_fits_a_scan(tmp_path):
     """Also those that would show a picture; the seed is that of scans, and the path that is kept empty the LiDAR's."""
     changes = {"iterations": 30, "image_every": 10, "psnr_every": 10, "log_every": 10, "pixels_per_gaussian": 20}
-    job = job_of(**changes, scans=ScanTrainingSettings(share=1.0))
+    job = job_of(**changes, scans=ScanTrainingSettings(per_image=1.0))
     begun = prepare(without_images(), job, CPU)
     assert begun.views == [] and not any(begun.curves.values()) and len(begun.model) > 100
     scan = begun.scans[1]
@@ -403,7 +414,7 @@ def test_without_images_every_iteration_fits_a_scan(tmp_path):
 
 def test_without_images_iterations_with_scans_flatten_surfaces():
     """Without images the terms of surfaces belong to the iterations that fit scans. No road is known."""
-    scans = ScanTrainingSettings(share=1.0)
+    scans = ScanTrainingSettings(per_image=1.0)
 
     def terms(inputs: TrainingInputs, **changes: float) -> set[str]:
         begun = prepare(inputs, job_of(iterations=10, **changes, scans=scans), CPU)

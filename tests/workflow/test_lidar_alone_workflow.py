@@ -9,7 +9,7 @@ METHODS = {
     "vanilla": {"parts": ["background"]},
     "with_lidar": {
         "parts": ["background", "actors"],
-        "overrides": {"train": {"scans": {"share": 0.4, "points": 1500}}},
+        "overrides": {"train": {"scans": {"per_image": 0.4, "points": 1500}}},
     },
 }
 METRICS = "results/swept/metrics.json"

@@ -9,7 +9,7 @@ from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 from drivesplat.io.video import read_footage
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("lidar_workflow")]
-SCANS = {"share": 0.4}
+SCANS = {"per_image": 0.4}
 METHODS = {
     "vanilla": {"parts": ["background"]},
     "with_lidar": {"parts": ["background", "actors"], "overrides": {"train": {"scans": SCANS}}},

@@ -20,7 +20,7 @@ from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, TRAINING_
 
 ACTORS = ["background", "actors"]
 HELD = {"train": {"depth_weight": 0.01}}
-LIDAR = {"train": {"scans": {"share": 0.3}}}
+LIDAR = {"train": {"scans": {"per_image": 0.3}}}
 KEPT_OUT = {"train": {"floaters": {"free_space": True}}}
 
 
@@ -287,7 +287,7 @@ def test_scans_are_of_edits_and_trajectories_of_methods_that_render_lidar(tmp_pa
     edits = tmp_path / "edits.yaml"
     edits.write_text("edits: {gone: [remove: {track: a}]}")
     dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
-    lidar = {"overrides": {"train": {"scans": {"share": 0.3}}}}
+    lidar = {"overrides": {"train": {"scans": {"per_image": 0.3}}}}
     methods = {"vanilla": {}, "static": lidar, "moving": {"parts": ["background", "actors"], **lidar}}
     trajectories = {"original": {}, "objects": {"parts": "moving"}}
     made = plan(render={"trajectories": trajectories}, datasets={"a": dataset}, methods=methods)

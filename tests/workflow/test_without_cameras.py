@@ -21,7 +21,7 @@ METHODS = {
     "street": {"parts": ["background", "actors"]},
     "with_lidar": {
         "parts": ["background", "actors"],
-        "overrides": {"train": {"depth_weight": 0.01, "scans": {"share": 0.25, "fine_tune": 0.2, "geometry": 0.3}}},
+        "overrides": {"train": {"depth_weight": 0.01, "scans": {"per_image": 0.25, "fine_tune": 0.2, "geometry": 0.3}}},
     },
 }
 
@@ -60,8 +60,8 @@ def test_its_training_takes_no_result_of_images_and_fits_scans_alone():
     taken = {scene: [i for i in TRAINING_INPUTS if made.training_input(i)(at(scene))] for scene in ("a1", "a2")}
     assert taken == {"a1": ["actors", "lidar_depth", "scans"], "a2": ["actors", "scans"]}
     with_image, alone = (json.loads(made.settings("train")(at(scene))) for scene in ("a1", "a2"))
-    assert (with_image["train"]["scans"]["share"], with_image["sky"]) == (0.25, "cubemap")
-    assert (alone["train"]["scans"]["share"], alone["sky"], alone["reference_camera"]) == (1.0, "none", None)
+    assert (with_image["train"]["scans"]["per_image"], with_image["sky"]) == (0.25, "cubemap")
+    assert (alone["train"]["scans"]["per_image"], alone["sky"], alone["reference_camera"]) == (1.0, "none", None)
     scans = [train["train"]["scans"] for train in (with_image, alone)]
     shared = [(settings["fine_tune"], settings["geometry"]) for settings in scans]
     assert shared == [(0.2, 0.3), (0.0, 1.0)], "no image has to be spared"
