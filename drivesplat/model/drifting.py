@@ -37,6 +37,7 @@ class Drifting(Part):
     name = "drifting"
     moves = True
     geometry = (*GEOMETRY, "velocities", "peaks", "spans")
+    decaying = ("means", "velocities")
 
     def __init__(
         self,

@@ -34,7 +34,7 @@ def drifting_seed(
 ) -> DriftingSeed:
     """`count` initial Gaussians for a record with training images."""
     images = np.array(record.train_images)
-    times = np.array([record.seconds(i) for i in images])
+    times = np.array([record.seconds(int(i)) for i in images])
     chosen = random.integers(len(images), size=count)
     depths = np.exp(random.uniform(*np.log(settings.depths), size=count))
     own = images[chosen]
@@ -51,7 +51,7 @@ def drifting_seed(
 def ego_velocities(record: TrainingRecord, images: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 3"]:
     """The velocities (m/s) of the ego vehicle at the times of images, by differences between them; 0 if all have the
     same time."""
-    times = np.array([record.seconds(i) for i in images])
+    times = np.array([record.seconds(int(i)) for i in images])
     distinct, first = np.unique(times, return_index=True)
     if len(distinct) < 2:
         return np.zeros((len(images), 3))

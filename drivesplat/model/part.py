@@ -87,8 +87,12 @@ class Part(nn.Module, ABC):
     name: str
     moves = False
     """Whether its Gaussians are dynamic: at other places at other times."""
+    has_objects = False
+    """Whether its Gaussians belong to objects with tracks."""
     geometry: tuple[str, ...] = GEOMETRY
     """Those of `params` that both images and LiDAR scans fit."""
+    decaying: tuple[str, ...] = ("means",)
+    """Those of `params` whose learning rates decay in a training: positions, and what they follow from."""
     extent: float
     """Extent of its Gaussians in metres, which scales densification and the learning rate of positions."""
     cap_max: int | None = None

@@ -228,8 +228,8 @@ class TrainSettings(Settings):
     depth_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean absolute difference from LiDAR depth (metres), without the worst 5 % of pixels."""
     entropy_weight: float = Field(0.1, ge=0)
-    """Loss weight of the entropy of the moving parts' alpha, which favours opaque or absent objects. Only with moving
-    parts."""
+    """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
+    consist of objects."""
     dynamic_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute colour difference over the pixels of moving objects. Only with parts that
     consist of objects."""
@@ -268,10 +268,10 @@ class TrainSettings(Settings):
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":
         """These settings with those at their defaults that have no effect on a method of `parts`: those of other moving
-        parts and, without any, the loss weights of moving parts and of objects."""
+        parts and, without any part that consists of objects, the loss weights of objects."""
         fields = [part for part in MOVING_PARTS if part not in parts]
-        fields += [] if set(MOVING_PARTS) & set(parts) else ["entropy_weight"]
-        fields += [] if set(STAGE_OF_PART) & set(parts) else ["dynamic_weight"]
+        if not set(STAGE_OF_PART) & set(parts):
+            fields += ["entropy_weight", "dynamic_weight"]
         return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
 
 
