@@ -92,15 +92,16 @@ class Drifting(Part):
             p["means"] + (time - p["peaks"])[:, None] * p["velocities"],
             p["quats"],
             torch.exp(p["scales"]),
-            torch.sigmoid(p["opacities"]) * self._life(lived),
+            self._opacities(lived),
             p["sh0"],
             p["shN"],
         )
 
-    def _life(self, time: Float[Tensor, ""]) -> Float[Tensor, " n"]:
-        """The factors of opacities at a time, in [0, 1]."""
+    def _opacities(self, time: Float[Tensor, ""]) -> Float[Tensor, " n"]:
+        """The opacities at a time."""
         ages = (time - self.params["peaks"]) / self.life_spans
-        return torch.where(ages.abs() < LIFE_ENDS, torch.exp(-0.5 * ages.square()), 0.0)
+        life = torch.where(ages.abs() < LIFE_ENDS, torch.exp(-0.5 * ages.square()), 0.0)
+        return torch.sigmoid(self.params["opacities"]) * life
 
     @property
     def life_spans(self) -> Float[Tensor, " n"]:
@@ -118,14 +119,13 @@ class Drifting(Part):
         rates = {"means": own.lr_means, "velocities": own.lr_velocities, "peaks": own.lr_peaks, "spans": own.lr_spans}
         return {**learning_rates(self._gaussians, self.extent), **rates}
 
-    def penalties(self) -> dict[str, Float[Tensor, ""]]:
-        """The opacity of slow Gaussians. Their velocities have no gradient: what stands shall fade, not be moved."""
-        own = self._settings
-        if not own.static_weight:
+    def penalties_at(self, time: float) -> dict[str, Float[Tensor, ""]]:
+        """The mean opacity at a time. A Gaussian that is absent then has no gradient."""
+        weight = self._settings.opacity_weight
+        if not weight:
             return {}
-        speeds = self.params["velocities"].detach().square().sum(dim=1) / own.static_speed**2
-        slow = torch.sigmoid(self.params["opacities"]) * torch.exp(-0.5 * speeds)
-        return {"drifting_static": own.static_weight * slow.mean() / active_fraction([self])}
+        _, lived = self.time_state(time)
+        return {"drifting": weight * self._opacities(lived).mean() / active_fraction([self])}
 
     def definition(self) -> PartDefinition:
         return PartDefinition(self.name, self.extent, seconds=self._seconds)

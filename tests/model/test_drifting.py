@@ -131,16 +131,17 @@ def test_gradients_are_those_of_differences(name):
             assert (above - below) / (2.0 * step) == pytest.approx(float(value.grad[index]), abs=1e-5)
 
 
-def test_slow_gaussians_are_penalised_by_their_opacity_and_are_not_made_faster():
-    settings = DriftingSettings(static_weight=0.5, static_speed=2.0)
-    part = drifting(settings)
-    p = numpy_of(part)
-    slow = np.exp(-0.5 * (p["velocities"] ** 2).sum(axis=1) / 4.0) / (1.0 + np.exp(-p["opacities"]))
-    (penalty,) = part.penalties().values()
-    assert float(penalty.detach()) == pytest.approx(0.5 * slow.mean())
+def test_opacity_is_penalised_at_the_time_of_an_image_alone():
+    """What is absent then keeps its opacity, since the image could not counteract."""
+    part = drifting(DriftingSettings(opacity_weight=0.5))
+    part.params["peaks"].data[:2] = 90.0
+    (penalty,) = part.penalties_at(3.0).values()
+    _, opacities = expected_at(part, 3.0, part._settings.min_span)
+    assert float(penalty.detach()) == pytest.approx(0.5 * opacities.mean())
     penalty.backward()
-    assert part.params["velocities"].grad is None and (part.params["opacities"].grad > 0.0).all()
-    assert drifting(DriftingSettings(static_weight=0.0)).penalties() == {}
+    gradient = part.params["opacities"].grad
+    assert not gradient[:2].any() and (gradient[2:] > 0.0).any() and (gradient >= 0.0).all()
+    assert drifting(DriftingSettings(opacity_weight=0.0)).penalties_at(3.0) == {} == part.penalties()
 
 
 # ---- the seed
@@ -225,7 +226,7 @@ def test_without_images_nothing_drifts():
 
 @pytest.mark.parametrize("echo", [None, (0.3, 0.9)])
 def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(echo, tmp_path):
-    settings = TrainSettings(cap_max=100, drifting=DriftingSettings(min_span=0.7, static_weight=0.3))
+    settings = TrainSettings(cap_max=100, drifting=DriftingSettings(min_span=0.7, opacity_weight=0.3))
     model = an_untrained_model(settings, echo=echo)
     with torch.no_grad():
         for value in (value for value in model.parameters() if value.requires_grad):
@@ -239,7 +240,7 @@ def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(echo, tmp_path):
         assert all(torch.equal(values, again.tensors[name]) for name, values in ours.tensors.items())
     part, again = model.parts[1], rebuilt.parts[1]
     assert again.definition() == part.definition() and again.learning_rates() == part.learning_rates()
-    assert again.penalties() == part.penalties()
+    assert again.penalties_at(1.3) == part.penalties_at(1.3)
 
 
 def test_densification_copies_motion_and_life_with_each_gaussian():
@@ -303,7 +304,7 @@ def test_what_moves_is_learned_with_its_velocity_and_shown_between_the_images():
     gaussians = GaussianSettings(sh_degree=0, lr_means=2e-3, lr_sh0=2e-2)
     seed = DriftingSeed(places, np.zeros((40, 3)), (places[:, 0] + 1.8) / 1.2, colors, np.full(40, 0.2))
     parts = {
-        "drifting": Drifting.from_seed(seed, DriftingSettings(static_weight=0.0), gaussians, 4.0, (0.0, 3.0)),
+        "drifting": Drifting.from_seed(seed, DriftingSettings(opacity_weight=0.0), gaussians, 4.0, (0.0, 3.0)),
         "static": Background.from_points(places, colors, gaussians, 4.0),
     }
     train, between = np.linspace(0.0, 3.0, 13), np.linspace(0.125, 2.875, 12)
