@@ -1,4 +1,4 @@
-"""What moves, without boxes: Gaussians that drift through the world and live for a while.
+"""Moving things without boxes: Gaussians that drift through the world and live for a while.
 
 After Periodic Vibration Gaussian (Chen et al. 2023, arXiv 2311.18561): each Gaussian has a velocity v, a life peak tau
 and a life span beta. At time t its opacity is its own times exp(-0.5 ((t - tau) / beta)²). Its centre is at

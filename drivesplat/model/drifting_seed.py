@@ -1,6 +1,6 @@
 """Initial values of drifting Gaussians, from the poses of training images alone.
 
-Nothing tells what moves, so they are hypotheses: at random places near the ground that a training image shows, at its
+Nothing is known of moving objects, so they are hypotheses: at random places near the ground that a training image shows, at its
 time, with velocities like those of traffic along the ego vehicle's path. Those that no image supports fade, and
 densification moves them, velocities and life peaks included, to those that images support.
 """

@@ -50,8 +50,8 @@ class DriftingSettings(Settings):
     what is static to the background. Where it is too large nothing drifts."""
     lr_means: float = Field(0.01, gt=0)
     """Initial learning rate of positions (metres). It decays as that of all positions does."""
-    lr_velocities: float = Field(0.05, gt=0)
-    """Learning rate of velocities (m/s)."""
+    lr_velocities: float = Field(0.02, gt=0)
+    """Initial learning rate of velocities (m/s). It decays, too."""
     lr_peaks: float = Field(0.01, gt=0)
     """Learning rate of life peaks (seconds)."""
     lr_spans: float = Field(0.01, gt=0)
