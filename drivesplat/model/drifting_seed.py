@@ -1,8 +1,8 @@
 """Initial values of drifting Gaussians, from the poses of training images alone.
 
-Nothing is known of moving objects, so they are hypotheses: at random places near the ground that a training image shows, at its
-time, with velocities like those of traffic along the ego vehicle's path. Those that no image supports fade, and
-densification moves them, velocities and life peaks included, to those that images support.
+Nothing is known of moving objects, so these are hypotheses: at random places near the ground that a training image
+shows, at its time, with velocities like those of traffic along the ego vehicle's path. Those that no image supports
+fade, and densification moves them, velocities and life peaks included, to those that images support.
 """
 
 from dataclasses import dataclass

@@ -304,7 +304,9 @@ def test_what_moves_is_learned_with_its_velocity_and_shown_between_the_images():
     gaussians = GaussianSettings(sh_degree=0, lr_means=2e-3, lr_sh0=2e-2)
     seed = DriftingSeed(places, np.zeros((40, 3)), (places[:, 0] + 1.8) / 1.2, colors, np.full(40, 0.2))
     parts = {
-        "drifting": Drifting.from_seed(seed, DriftingSettings(opacity_weight=0.0), gaussians, 4.0, (0.0, 3.0)),
+        "drifting": Drifting.from_seed(
+            seed, DriftingSettings(opacity_weight=0.0, lr_velocities=0.05), gaussians, 4.0, (0.0, 3.0)
+        ),
         "static": Background.from_points(places, colors, gaussians, 4.0),
     }
     train, between = np.linspace(0.0, 3.0, 13), np.linspace(0.125, 2.875, 12)
