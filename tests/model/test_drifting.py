@@ -131,6 +131,13 @@ def test_gradients_are_those_of_differences(name):
             assert (above - below) / (2.0 * step) == pytest.approx(float(value.grad[index]), abs=1e-5)
 
 
+def test_what_scans_may_not_change_freely_is_all_that_places_and_opacities_follow_from():
+    part = drifting(echo=(0.3, 0.9))
+    found = part.at(3.0)
+    (found.means.sum() + found.quats.sum() + found.scales.sum() + found.opacities.sum()).backward()
+    assert {name for name, value in part.params.items() if value.grad is not None} == set(part.geometry)
+
+
 def test_opacity_is_penalised_at_the_time_of_an_image_alone():
     """What is absent then keeps its opacity, since the image could not counteract."""
     part = drifting(DriftingSettings(opacity_weight=0.5))
