@@ -273,11 +273,14 @@ def test_densification_copies_motion_and_life_with_each_gaussian():
 
 
 def test_exports_show_the_gaussians_that_are_present_as_one_group():
+    """A broken one is there, too, for the export to drop it with a warning."""
     part = drifting()
     part.params["peaks"].data[:3], part.params["peaks"].data[3:] = 100.0, 3.0
+    part.params["peaks"].data[2] = torch.nan
     (name, group), *others = part.rigid_groups(3.0).items()
-    assert (name, group.motion, len(group.gaussians), others) == ("drifting", None, COUNT - 3, [])
-    torch.testing.assert_close(group.gaussians.means, part.at(3.0).means[3:])
+    assert (name, group.motion, len(group.gaussians), others) == ("drifting", None, COUNT - 2, [])
+    torch.testing.assert_close(group.gaussians.means[1:], part.at(3.0).means[3:])
+    assert not group.gaussians.means[0].isfinite().any()
 
 
 # ---- a fit
