@@ -45,7 +45,7 @@ class DriftingSettings(Settings):
     seed: DriftingSeedSettings = DriftingSeedSettings()
     min_span: float = Field(0.3, gt=0)
     """Minimum life span (seconds): the standard deviation of opacity over time. Shorter ones show single images."""
-    opacity_weight: float = Field(0.006, ge=0)
+    opacity_weight: float = Field(0.02, ge=0)
     """Loss weight of the mean opacity of its Gaussians at the time of an image, beside train.opacity_reg. It leaves
     what is static to the background. Where it is too large nothing drifts."""
     lr_means: float = Field(0.01, gt=0)
