@@ -100,7 +100,7 @@ rule film_parts:
     benchmark:
         "<benchmarks>/{scene}/{method}/film_parts.tsv"
     wildcard_constraints:
-        method=plan.known(plan.methods_with_actors),
+        method=plan.known(plan.methods_with_moving_parts),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=8)

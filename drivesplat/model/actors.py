@@ -39,6 +39,7 @@ class Actors(Part):
 
     name = "actors"
     moves = True
+    has_objects = True
     _per_annotation: tuple[str, ...] = ("translation", "yaw")
     _per_track: tuple[str, ...] = ()
     """Entries of `shared` with a row for each annotation, and those with a row for each track."""

@@ -11,6 +11,8 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.camera_poses import TIMES, CameraPoses
 from drivesplat.model.deformable import Deformable
+from drivesplat.model.drifting import Drifting
+from drivesplat.model.drifting_seed import drifting_seed
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -60,7 +62,7 @@ def gaussian_cap(record: TrainingRecord, settings: TrainSettings, rays: int = 0)
 def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings) -> SplatModel:
     """An untrained model without the parts that would be empty, such as actors in a static scene."""
     made = (
-        _init_objects(OBJECTS[name], init, parts, settings) if name in OBJECTS else _init_background(init, settings)
+        _init_objects(OBJECTS[name], init, parts, settings) if name in OBJECTS else _MAKERS[name](init, settings)
         for name in parts
     )
     return SplatModel(
@@ -107,6 +109,9 @@ def _rebuilt(params: dict[str, torch.Tensor], definition: PartDefinition, settin
     if definition.part == Background.name:
         return Background(params, settings.gaussians, definition.extent)
     own = getattr(settings, definition.part)
+    if definition.part == Drifting.name:
+        assert definition.seconds is not None
+        return Drifting(params, own, settings.gaussians, definition.extent, definition.seconds)
     return OBJECTS[definition.part](params, definition.tracks, own, settings.gaussians)
 
 
@@ -123,6 +128,22 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
         init.echo,
         init.echo is not None and settings.scans.fine_tune > 0,
     )
+
+
+def _init_drifting(init: ModelInit, settings: TrainSettings) -> Part | None:
+    """Drifting Gaussians at random places that the training images show; None without images."""
+    record, own = init.record, settings.drifting
+    times = [record.seconds(i) for i in record.train_images]
+    if not times:
+        return None
+    count = max(MIN_SEED_POINTS, int(own.seed.share * own.share * settings.cap_max))
+    seed = drifting_seed(record, own.seed, count, np.random.default_rng(0))
+    seconds = min(times), max(times)
+    return Drifting.from_seed(seed, own, settings.gaussians, record.scene_scale, seconds, init.classes, init.echo)
+
+
+_MAKERS = {Background.name: _init_background, Drifting.name: _init_drifting}
+"""What makes the parts that do not consist of objects, by name."""
 
 
 def _init_objects(

@@ -19,6 +19,8 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.scene.motion import Motion
 
+GEOMETRY = ("means", "quats", "scales", "opacities")
+"""The parameters of every Gaussian that images and LiDAR scans share."""
 FADED = 1e-4
 """Opacity of a faded Gaussian, below the threshold at which every strategy removes or relocates it."""
 
@@ -50,12 +52,13 @@ class ActorPlacement:
 
 @dataclass(frozen=True)
 class PartDefinition:
-    """What a checkpoint needs of the part named `part` beside parameters and settings: its extent in metres, and the
-    tracks that own its Gaussians."""
+    """What a checkpoint needs of the part named `part` beside parameters and settings: its extent in metres, the tracks
+    that own its Gaussians, and the times of the first and the last training image, where they matter."""
 
     part: str
     extent: float
     tracks: tuple[ActorTrack, ...] = ()
+    seconds: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,12 @@ class Part(nn.Module, ABC):
     name: str
     moves = False
     """Whether its Gaussians are dynamic: at other places at other times."""
+    has_objects = False
+    """Whether its Gaussians belong to objects with tracks."""
+    geometry: tuple[str, ...] = GEOMETRY
+    """Those of `params` that both images and LiDAR scans fit."""
+    decaying: tuple[str, ...] = ("means",)
+    """Those of `params` whose learning rates decay in a training: positions, and what they follow from."""
     extent: float
     """Extent of its Gaussians in metres, which scales densification and the learning rate of positions."""
     cap_max: int | None = None

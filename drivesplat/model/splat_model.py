@@ -208,11 +208,12 @@ class SplatModel(nn.Module):
         return shown if self.camera_poses is None else self.camera_poses.corrected(shown)
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
-        """The alpha of the dynamic parts rendered alone, for a picture of this model; None without such parts."""
-        moving = [picture.gaussians[rows] for part, rows in zip(self.parts, self.rows, strict=True) if part.moves]
-        if not moving:
+        """The alpha of the parts with objects rendered alone, for a picture of this model; None without such parts."""
+        of_parts = zip(self.parts, self.rows, strict=True)
+        objects = [picture.gaussians[rows] for part, rows in of_parts if part.has_objects]
+        if not objects:
             return None
-        alone = concatenate(moving)
+        alone = concatenate(objects)
         return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha[0, ..., 0]
 
     def class_logits(self, picture: Picture, view: View) -> Float[Tensor, "h w c"] | None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.train import STAGE_OF_PART, PartName, Parts
+from drivesplat.settings.train import MOVING_PARTS, STAGE_OF_PART, PartName, Parts
 
 
 def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -27,7 +27,12 @@ class MethodSettings(Settings):
 
     @property
     def moving_parts(self) -> tuple[PartName, ...]:
-        """Those of its parts whose Gaussians are objects that move."""
+        """Those of its parts whose Gaussians are dynamic: films can show them apart from what is static."""
+        return tuple(part for part in self.parts if part in MOVING_PARTS)
+
+    @property
+    def object_parts(self) -> tuple[PartName, ...]:
+        """Those of its parts whose Gaussians are objects that move: edits know these objects."""
         return tuple(part for part in self.parts if part in STAGE_OF_PART)
 
     def varied(self, parts: Parts | None, overrides: Mapping[str, Any]) -> "MethodSettings":

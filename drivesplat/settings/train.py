@@ -6,13 +6,16 @@ from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.deformable import FieldName, GaitSettings, LatticeSettings, NetworkSettings
+from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train_cameras import CameraPoseSettings, ExposureSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 
-PartName = Literal["background", "actors", "deformable"]
+PartName = Literal["background", "actors", "deformable", "drifting"]
 STAGE_OF_PART: dict[PartName, str] = {"actors": "actors", "deformable": "actors"}
-"""The parts whose Gaussians are objects that move, and the stage that finds these objects in a scene. The settings of
-such a part are the field of TrainSettings with its name."""
+"""The parts whose Gaussians are objects that move, and the stage that finds these objects in a scene."""
+MOVING_PARTS: tuple[PartName, ...] = (*STAGE_OF_PART, "drifting")
+"""The parts whose Gaussians are dynamic, objects or not. The settings of such a part are the field of TrainSettings
+with its name."""
 SkyKind = Literal["none", "mask", "cubemap"]
 
 
@@ -193,6 +196,7 @@ class TrainSettings(Settings):
     gaussians: GaussianSettings = GaussianSettings()
     actors: ActorSettings = ActorSettings()
     deformable: DeformableSettings = DeformableSettings()
+    drifting: DriftingSettings = DriftingSettings()
     mcmc: McmcSettings = McmcSettings()
     default: DefaultSettings = DefaultSettings()
     floaters: FloaterSettings = FloaterSettings()
@@ -225,10 +229,11 @@ class TrainSettings(Settings):
     depth_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean absolute difference from LiDAR depth (metres), without the worst 5 % of pixels."""
     entropy_weight: float = Field(0.1, ge=0)
-    """Loss weight of the entropy of the moving parts' alpha, which favours opaque or absent objects. Only with moving
-    parts."""
+    """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
+    consist of objects."""
     dynamic_weight: float = Field(0.1, ge=0)
-    """Loss weight of the mean absolute colour difference over the pixels of moving objects. Only with moving parts."""
+    """Loss weight of the mean absolute colour difference over the pixels of moving objects. Only with parts that
+    consist of objects."""
     semantic_weight: float = Field(0.0, ge=0)
     """Loss weight of the cross entropy between rendered class logits and your class maps (masks.semantic_folder). No
     effect without maps."""
@@ -264,8 +269,8 @@ class TrainSettings(Settings):
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":
         """These settings with those at their defaults that have no effect on a method of `parts`: those of other moving
-        parts and, without any, the loss weights of moving parts."""
-        fields = [part for part in STAGE_OF_PART if part not in parts]
+        parts and, without any part that consists of objects, the loss weights of objects."""
+        fields = [part for part in MOVING_PARTS if part not in parts]
         if not set(STAGE_OF_PART) & set(parts):
             fields += ["entropy_weight", "dynamic_weight"]
         return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})

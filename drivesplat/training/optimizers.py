@@ -137,8 +137,9 @@ def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: flo
     exponentially, and that of exposures is 0 until they start; the others are constant."""
     decay = DECAY**done
     for part, group in zip(model.parts, optimizers.parts, strict=True):
-        if "means" in group:
-            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * decay
+        rates = part.learning_rates()
+        for name in (name for name in part.decaying if name in group):
+            group[name].param_groups[0]["lr"] = rates[name] * decay
     begins = {"exposure": settings.exposure.start, "camera_poses": 0.0}
     for name, start in begins.items():
         for camera, optimizer in optimizers.beside_parts.get(name, {}).items():

@@ -35,9 +35,6 @@ from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import TrainingScan, scan_index, scan_terms
 from drivesplat.training.views import TrainingView
 
-GEOMETRY = ("means", "quats", "scales", "opacities")
-"""The parameters of Gaussians that images and scans share."""
-
 
 @dataclass
 class Trainer:
@@ -207,7 +204,7 @@ class Trainer:
         unchanged. Fine-tuning leaves unchanged what images show."""
         factor = 0.0 if fine_tunes else self.settings.scans.geometry
         for part in self.model.parts:
-            _scale_gradients([*(part.params[name] for name in GEOMETRY), *part.shared.values()], factor)
+            _scale_gradients([*(part.params[name] for name in part.geometry), *part.shared.values()], factor)
             offsets = [part.params[name] for name in OFFSETS.values() if name in part.params]
             _scale_gradients(offsets, 1.0 if fine_tunes else 0.0)
 

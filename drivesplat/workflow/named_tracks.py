@@ -35,7 +35,7 @@ def run_targets(targets: Sequence[str], is_main: bool) -> list[str] | None:
 def track_references(config: Config, scene: str, targets: Sequence[str] | None = ()) -> TrackReferences:
     """The tracks that the settings of a scene name and that a run for `targets` (none: everything) uses. Without known
     targets (None) there are none. Raises ConfigError where the edits file is invalid."""
-    subject, editable = config.subjects.get(scene), any(method.moving_parts for method in config.methods.values())
+    subject, editable = config.subjects.get(scene), any(method.object_parts for method in config.methods.values())
     used = _Used(scene, targets)
     edits = scene_edits(config, scene) if editable else {}
     named = [reference for name, edit in edits.items() if used.edit(name) for reference in _of_edit(name, edit)]

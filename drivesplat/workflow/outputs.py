@@ -77,7 +77,12 @@ class Outputs(Inputs):
 
     @property
     def methods_with_actors(self) -> list[str]:
-        """The methods with parts for moving objects: those that can be edited and shown part by part."""
+        """The methods with parts that consist of objects: those that can be edited."""
+        return [name for name, method in self.config.all_methods.items() if method.object_parts]
+
+    @property
+    def methods_with_moving_parts(self) -> list[str]:
+        """The methods with dynamic parts: those that can be shown part by part."""
         return [name for name, method in self.config.all_methods.items() if method.moving_parts]
 
     @property
@@ -95,7 +100,7 @@ class Outputs(Inputs):
         return [f"{self.config.results_dir}/{scene}/metrics.json" for scene in self.config.batch_scenes]
 
     def films(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
-        """The films of every method of `scenes`, by default the batch's, of the parts of methods with moving objects,
+        """The films of every method of `scenes`, by default the batch's, of the parts of methods with moving ones,
         of LiDAR scans, and of all methods side by side."""
         chosen = self.config.batch_scenes if scenes is None else list(scenes)
         compared = [scene for scene in self._with_cameras(chosen) if for_scene(self.config, scene).render.compare]
@@ -161,13 +166,13 @@ class Outputs(Inputs):
         return [f"{folder}/{method}/eval.json" for method in scene_methods(self.config, wildcards.scene)]
 
     def _film_names(self, scene: str, method: str) -> list[str]:
-        """The films of a method; those of some of its parts only if it has actors, those of images only of scenes with
-        cameras."""
+        """The films of a method; those of some of its parts only if it has moving ones, those of images only of scenes
+        with cameras."""
         settings = for_scene(self.config, scene).render
         lidar = [LIDAR] if settings.lidar and self.renders_lidar(scene, method) else []
         if not has_cameras(self.config, scene):
             return lidar
-        if method in self.methods_with_actors:
+        if method in self.methods_with_moving_parts:
             return [*settings.trajectories, PARTS_FILM, *lidar]
         return [*(name for name, trajectory in settings.trajectories.items() if trajectory.parts == "all"), *lidar]
 

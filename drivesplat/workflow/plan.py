@@ -163,9 +163,10 @@ class Plan(Outputs):
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
         of_parts = film == PARTS_FILM or (trajectory is not None and trajectory.parts != "all")
-        if edit is not None or of_parts:
-            self._refuse_without_actors(method)
+        if of_parts:
+            self._refuse_without_moving_parts(method)
         if edit is not None:
+            self._refuse_without_actors(method)
             self._refuse_unknown_edit(scene, edit)
         if film not in (path[-1], *self._film_names(scene, method)):
             raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
@@ -199,9 +200,12 @@ class Plan(Outputs):
     def _refuse_without_actors(self, method: str) -> None:
         if method not in self.methods_with_actors:
             able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
-            raise ConfigError(
-                f"method {method!r} knows no actors that could be edited or shown apart; those do: {able}"
-            )
+            raise ConfigError(f"method {method!r} knows no actors that could be edited; those do: {able}")
+
+    def _refuse_without_moving_parts(self, method: str) -> None:
+        if method not in self.methods_with_moving_parts:
+            able = ", ".join(name for name in self.methods_with_moving_parts if name in self.config.methods) or "none"
+            raise ConfigError(f"method {method!r} has no moving parts that could be shown apart; those do: {able}")
 
     def _refuse_without_lidar(self, scene: str, method: str) -> None:
         if not self.renders_lidar(scene, method):

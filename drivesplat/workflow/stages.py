@@ -105,7 +105,7 @@ def method_stages(config: Config, scene: str) -> tuple[str, ...]:
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     """The stages of TRAINING_INPUTS that a method's training on a scene reads."""
     train = for_scene(config, scene, method).train
-    stages_of_parts = {STAGE_OF_PART[part] for part in config.all_methods[method].moving_parts}
+    stages_of_parts = {STAGE_OF_PART[part] for part in config.all_methods[method].object_parts}
     taken = {
         "actors": "actors" in stages_of_parts,
         "lidar_depth": train.depth_weight > 0 and has_cameras(config, scene),
@@ -187,7 +187,7 @@ def _evaluation(at: Place) -> dict[str, Any]:
 
 def _viewer(at: Place) -> dict[str, Any]:
     """The edits of a method that can be edited, and the methods that have pages, too."""
-    export, editable = at.config.export, at.config.all_methods[at.method].moving_parts
+    export, editable = at.config.export, at.config.all_methods[at.method].object_parts
     return {
         "gaussians": export.viewer_gaussians,
         "time_s": export.time_s,

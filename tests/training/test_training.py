@@ -55,13 +55,12 @@ from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train import (
-    STAGE_OF_PART,
     ActorSettings,
     DefaultSettings,
     FloaterSettings,
     GaussianSettings,
-    McmcSettings,
     TrainJob,
 )
 from drivesplat.training import resume_state
@@ -260,11 +259,17 @@ def test_static_methods_have_no_settings_of_dynamic_parts():
     assert {name for name, value in settings if getattr(settings.for_parts(still), name) != value} == set(moving)
 
 
-def test_a_moving_part_knows_no_settings_of_other_moving_parts(monkeypatch):
-    monkeypatch.setitem(STAGE_OF_PART, "mcmc", "actors")
-    settings = settings_of(actors=ActorSettings(fourier=2), mcmc=McmcSettings(growth=0.1), dynamic_weight=0.9)
+def test_a_moving_part_knows_no_settings_of_other_moving_parts():
+    moving = {"actors": ActorSettings(fourier=2), "drifting": DriftingSettings(share=0.1)}
+    settings = settings_of(**moving, dynamic_weight=0.9)
     kept = settings.for_parts(("background", "actors"))
-    assert kept == settings.model_copy(update={"mcmc": McmcSettings()})
+    assert kept == settings.model_copy(update={"drifting": DriftingSettings()})
+
+
+def test_parts_that_move_without_objects_know_no_loss_weights_of_objects():
+    kept = {"drifting": DriftingSettings(share=0.1)}
+    settings = settings_of(**kept, entropy_weight=0.7, dynamic_weight=0.9)
+    assert settings.for_parts(("background", "drifting")) == settings_of(**kept)
 
 
 @pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (50, 0.1), (100, 0.01)])

@@ -15,10 +15,12 @@ from drivesplat.readers.datasets import layout
 from drivesplat.settings.config import load
 from drivesplat.settings.report import HELD_OUT_PAIR, LIDAR_LOOKS, PICTURES
 from drivesplat.workflow import inputs
+from drivesplat.workflow.named_tracks import track_references
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, TRAINING_INPUTS, refines_poses, stage_settings
 
 ACTORS = ["background", "actors"]
+DRIFTING = ["background", "drifting"]
 HELD = {"train": {"depth_weight": 0.01}}
 LIDAR = {"train": {"scans": {"per_image": 0.3}}}
 KEPT_OUT = {"train": {"floaters": {"free_space": True}}}
@@ -258,8 +260,44 @@ def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
     assert {"vanilla/original.mp4", "street/objects.mp4", "street/parts.mp4"} < films
     assert not {"vanilla/objects.mp4", "vanilla/parts.mp4"} & films
     made.refuse_unknown(["elsewhere/a1/street/objects.mp4", "elsewhere/a1/street/objects.cameras.json"])
-    with pytest.raises(ConfigError, match=r"method 'vanilla' knows no actors .* those do: street"):
+    with pytest.raises(ConfigError, match=r"method 'vanilla' has no moving parts .* those do: street"):
         made.refuse_unknown(["elsewhere/a1/vanilla/objects.mp4"])
+
+
+def test_a_method_that_moves_without_objects_has_films_of_its_parts_but_no_actors_and_no_edits(tmp_path):
+    edits = tmp_path / "edits.yaml"
+    edits.write_text("edits: {gone: [remove: {track: a}]}")
+    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
+    made = plan(
+        methods={"drifting": {"parts": DRIFTING}, "mine": {"parts": ACTORS}},
+        render={"trajectories": {"original": {}, "objects": {"parts": "moving"}}},
+        datasets={"a": dataset},
+    )
+    assert {path.split("/", 2)[2] for path in made.films()} >= {"drifting/objects.mp4", "drifting/parts.mp4"}
+    assert taken(made, "a1", "drifting") == []
+    assert made.edits() == ["elsewhere/a1/mine/edits/gone.mp4"]
+    made.refuse_unknown(["elsewhere/a1/drifting/parts.mp4", "elsewhere/a1/drifting/objects.mp4"])
+    with pytest.raises(ConfigError, match=r"'drifting' knows no actors that could be edited; those do: mine"):
+        made.refuse_unknown(["elsewhere/a1/drifting/edits/gone.mp4"])
+    pages = {name: json.loads(made.stage_settings("export_viewer", "a1", name)) for name in ("drifting", "mine")}
+    assert not pages["drifting"]["edits"] and list(pages["mine"]["edits"]) == ["gone"]
+
+
+def test_a_method_that_moves_without_objects_is_not_the_static_reference_of_the_report():
+    made = plan(methods={"drifting": {"parts": DRIFTING}, "vanilla": {}})
+    assert json.loads(made.report([]).settings())["reference"] == "vanilla"
+
+
+def test_tracks_that_edits_name_do_not_matter_to_methods_that_cannot_be_edited(tmp_path):
+    edits = tmp_path / "edits.yaml"
+    edits.write_text("edits: {gone: [remove: {track: a}]}")
+    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
+
+    def edited(parts: list[str]) -> int:
+        made = plan(methods={"it": {"parts": parts}}, datasets={"a": dataset})
+        return len(track_references(made.config, "a1").edits)
+
+    assert (edited(DRIFTING), edited(ACTORS)) == (0, 1)
 
 
 def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(tmp_path):

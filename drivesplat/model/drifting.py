@@ -1,0 +1,137 @@
+"""Moving things without boxes: Gaussians that drift through the world and live for a while.
+
+After Periodic Vibration Gaussian (Chen et al. 2023, arXiv 2311.18561): each Gaussian has a velocity v, a life peak tau
+and a life span beta. At time t its opacity is its own times exp(-0.5 ((t - tau) / beta)²). Its centre is at
+mean + (t - tau) v: PVG's vibration, l / (2 pi) sin(2 pi (t - tau) / l) v, in the limit of a long cycle l. Vibrating
+Gaussians return, so that PVG can represent the static world with them, too; here the background does that.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.model.drifting_seed import DriftingSeed
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.parameters import init_params, learning_rates, make_parameters
+from drivesplat.model.part import GEOMETRY, Part, PartDefinition, RigidGroup, active_fraction
+from drivesplat.settings.drifting import DriftingSettings
+from drivesplat.settings.train import GaussianSettings
+
+LIFE_ENDS = 3.0
+"""Life spans from its peak after which a Gaussian is absent: its opacity is 1 % of that at the peak."""
+
+
+class Drifting(Part):
+    """n Gaussians that move at constant velocities through a scene with an extent of `extent` metres.
+
+    `params["means"]` (n, 3) are their centres at their life peaks `peaks` (n,) in seconds since the first image,
+    `velocities` (n, 3) are in m/s, and `spans` (n,) logarithms of the seconds by which life spans exceed the minimum
+    of the settings. `seconds` are the times of the first and the last training image: beyond them Gaussians go on
+    moving, but neither appear nor fade.
+    """
+
+    name = "drifting"
+    moves = True
+    geometry = (*GEOMETRY, "velocities", "peaks", "spans")
+    decaying = ("means", "velocities")
+
+    def __init__(
+        self,
+        params: dict[str, Tensor],
+        settings: DriftingSettings,
+        gaussians: GaussianSettings,
+        extent: float,
+        seconds: tuple[float, float],
+        cap_max: int | None = None,
+    ):
+        super().__init__()
+        self.params = make_parameters(params)
+        self.extent = extent
+        self.cap_max = cap_max
+        self._seconds = seconds
+        self._settings = settings
+        self._gaussians = gaussians
+
+    @classmethod
+    def from_seed(
+        cls,
+        seed: DriftingSeed,
+        settings: DriftingSettings,
+        gaussians: GaussianSettings,
+        extent: float,
+        seconds: tuple[float, float],
+        classes: int = 0,
+        echo: tuple[float, float] | None = None,
+    ) -> "Drifting":
+        """Initialised from a seed of a `settings.seed.share` of its maximum number; see `init_params`."""
+        own, count = settings.seed, len(seed.positions)
+        start = gaussians.model_copy(update={"init_opacity": own.opacity})
+        span = math.log(max(own.span - settings.min_span, 0.01 * settings.min_span))
+        params = {
+            **init_params(seed.positions, seed.colors, start, classes, echo),
+            "scales": torch.from_numpy(np.log(seed.scales)).float()[:, None].repeat(1, 3),
+            "velocities": torch.from_numpy(seed.velocities).float(),
+            "peaks": torch.from_numpy(seed.peaks).float(),
+            "spans": torch.full((count,), span),
+        }
+        return cls(params, settings, gaussians, extent, seconds, max(count, round(count / own.share)))
+
+    def time_state(self, time: float) -> Sequence[Tensor]:
+        """The time, and the time that decides on opacities."""
+        means, (first, last) = self.params["means"], self._seconds
+        return means.new_full((), time), means.new_full((), min(max(time, first), last))
+
+    def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+        p = self.params
+        time, lived = time_state
+        return Gaussians(
+            p["means"] + (time - p["peaks"])[:, None] * p["velocities"],
+            p["quats"],
+            torch.exp(p["scales"]),
+            self._opacities(lived),
+            p["sh0"],
+            p["shN"],
+        )
+
+    def _opacities(self, time: Float[Tensor, ""]) -> Float[Tensor, " n"]:
+        """The opacities at a time."""
+        ages = (time - self.params["peaks"]) / self.life_spans
+        life = torch.where(ages.abs() >= LIFE_ENDS, 0.0, torch.exp(-0.5 * ages.square()))  # NaN stays NaN
+        return torch.sigmoid(self.params["opacities"]) * life
+
+    @property
+    def life_spans(self) -> Float[Tensor, " n"]:
+        """The life span of each Gaussian in seconds."""
+        return self._settings.min_span + torch.exp(self.params["spans"])
+
+    def velocities(self, time: float) -> Float[Tensor, "n 3"]:
+        return self.params["velocities"].detach()
+
+    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
+        return self.params.get("echoes")
+
+    def learning_rates(self) -> dict[str, float]:
+        own = self._settings
+        rates = {"means": own.lr_means, "velocities": own.lr_velocities, "peaks": own.lr_peaks, "spans": own.lr_spans}
+        return {**learning_rates(self._gaussians, self.extent), **rates}
+
+    def penalties_at(self, time: float) -> dict[str, Float[Tensor, ""]]:
+        """The mean opacity at a time. A Gaussian that is absent then has no gradient."""
+        weight = self._settings.opacity_weight
+        if not weight:
+            return {}
+        _, lived = self.time_state(time)
+        return {"drifting": weight * self._opacities(lived).mean() / active_fraction([self])}
+
+    def definition(self) -> PartDefinition:
+        return PartDefinition(self.name, self.extent, seconds=self._seconds)
+
+    @torch.no_grad()
+    def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
+        """Those that are present at the time, as one static group."""
+        gaussians = self.at(time)
+        return {self.name: RigidGroup(gaussians[gaussians.opacities != 0], None)}
