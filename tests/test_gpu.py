@@ -28,6 +28,7 @@ from helpers.trainings import (
     settings_of,
     trained,
     untrained,
+    untrained_drifting,
     untrained_street,
 )
 from scipy.spatial.transform import Rotation
@@ -487,12 +488,13 @@ def rolling(view: View) -> View:
 
 def trained_with(
     capture: bool, iterations: int = 30, iterations_done: int | None = None, shutters: bool = False,
-    recorded: Sequence[RecordedScan] = (), people: bool = False, **settings,
+    recorded: Sequence[RecordedScan] = (), people: bool = False, drifting: bool = False, **settings,
 ) -> tuple[Trainer, list[float]]:  # fmt: skip
-    """A training of background and cars, or people, by every loss term, with or without CUDA graphs, rolling shutters,
-    scans."""
+    """A training of background and cars, people or drifting Gaussians, by every loss term, with or without CUDA graphs,
+    rolling shutters, scans."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
-    model = untrained_street(chosen, initial_echo(recorded) if recorded else None, people)
+    echo = initial_echo(recorded) if recorded else None
+    model = untrained_drifting(chosen) if drifting else untrained_street(chosen, echo, people)
     for part in model.parts:  # no spheres, whose rotations learn from rounding
         part.params["scales"].data += 0.5 * torch.randn(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
@@ -546,6 +548,15 @@ def test_people_are_captured_and_learn_what_they_learn_without_graphs(field, cap
     assert len(captured.graphs._graphs) == len(captured.images.views) and not eager.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
     assert captured.model.parts[1].shared["lattice" if field == "lattice" else "weight2"].abs().max() > 1e-4
+
+
+def test_drifting_gaussians_are_captured_and_learn_what_they_learn_without_graphs(caplog):
+    captured, mine = trained_with(True, drifting=True)
+    eager, theirs = trained_with(False, drifting=True)
+    assert not caplog.records, "nothing was refused"
+    assert len(captured.graphs._graphs) == len(captured.images.views) and not eager.graphs._graphs
+    np.testing.assert_allclose(mine, theirs, rtol=0.02)
+    assert mine[-1] < mine[0]
 
 
 @pytest.mark.parametrize("limits", [{}, {"fine_tune": 0.3, "geometry": 0.1}, {"geometry": 0.0}])

@@ -55,5 +55,6 @@ class ScanSchedule:
         return step - self.scans_before(step)
 
     def counted_before(self, step: int) -> int:
-        """How many of the first `step` iterations `train.iterations` counts: those with an image, without images all."""
+        """The number of the first `step` iterations that `train.iterations` counts: those with an image; without images
+        all."""
         return self.images_before(step) if self.images else step

@@ -170,7 +170,8 @@ def _training(at: Place) -> dict[str, Any]:
     config, method = at.config, at.config.all_methods[at.method]
     train = config.train.for_parts(method.parts)
     if not config.cameras:
-        alone = {"per_image": float(train.scans.per_image > 0), "fine_tune": 0.0, "geometry": 1.0}  # there is no image to spare
+        # There is no image to spare.
+        alone = {"per_image": float(train.scans.per_image > 0), "fine_tune": 0.0, "geometry": 1.0}
         scans = train.scans.model_copy(update=alone)
         return {"parts": method.parts, "sky": "none", "train": train.model_copy(update={"scans": scans})}
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None

@@ -18,6 +18,8 @@ from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.deformable import Deformable
+from drivesplat.model.drifting import Drifting
+from drivesplat.model.drifting_seed import DriftingSeed
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -133,6 +135,15 @@ def untrained_street(
         own = {name: value.detach() for name, value in moving.params.items()}
         moving = Deformable(own, moving.timeline.tracks, settings.deformable, settings.gaussians)
     return SplatModel([*still.parts, moving], still.sky)
+
+
+def untrained_drifting(settings: TrainSettings) -> SplatModel:
+    """Background, drifting Gaussians with velocities and life peaks during the drive of `recorded_views`, and a sky."""
+    still, rng, (positions, colors) = untrained(settings, sky=True), np.random.default_rng(2), seed_points(40)
+    velocities, peaks, scales = rng.normal(size=positions.shape), rng.uniform(0.0, 2.0, 40), np.full(40, 0.2)
+    seed = DriftingSeed(positions, velocities, peaks, colors, scales)
+    drifting = Drifting.from_seed(seed, settings.drifting, settings.gaussians, 1.0, (0.0, 2.0))
+    return SplatModel([*still.parts, drifting], still.sky)
 
 
 def guided_views(device: torch.device = CPU) -> list[TrainingView]:

@@ -206,8 +206,8 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
 
 
 def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[Trainer, dict[str, set[str]]]:
-    """A trainer after one of 8 iterations and, with `fine_tune`, further ones, which fitted a scan, and the names of the parameters that it changed, by
-    part."""
+    """A trainer after one of 8 iterations, or with `fine_tune` one of those that follow, which fitted a scan; and the
+    names of the parameters that it changed, by part."""
     settings = settings_of(iterations=4, scans=ScanTrainingSettings(per_image=1.0, **scans))
     still = with_echoes(settings, offsets=settings.scans.fine_tune > 0)
     model = untrained_street(settings, echo=(0.0, 2.0)) if street else still
