@@ -81,11 +81,12 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
     }
 
 
-COLUMNS = (
-    "scene", "dataset", "method",
+NAMES = ("scene", "dataset", "method", "tracks")
+FIGURES = (
     *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", *HUMANS, *WHOLE_IMAGE)),
     "gaussians", "train_seconds",
 )  # fmt: skip
+COLUMNS = (*NAMES, *FIGURES)
 
 
 def _mismatches(record: dict[str, Any], expected: dict[str, Any], measured: dict[str, Any]) -> list[str]:
@@ -120,7 +121,7 @@ def _rows(record: dict[str, Any]) -> list[dict[str, Any]]:
     if not rows:
         raise ValueError("it has no method")
     for row in rows:
-        for column in COLUMNS[3:]:
+        for column in FIGURES:
             value = row[column]
             if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
                 raise ValueError(f"{column} of {row['method']} is {value!r}, not a number")
@@ -132,7 +133,7 @@ def _rows(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
     result = record["methods"][method]
-    row = {"scene": record["scene"], "dataset": record["dataset"], "method": method}
+    row = {"scene": record["scene"], "dataset": record["dataset"], "method": method, "tracks": result["tracks"]}
     for group in HELD_OUT_GROUPS:
         for region in (*REGIONS, HUMANS[0]):
             row[f"{group}_{region}"] = (result[group].get(region) or {}).get("psnr")
@@ -148,9 +149,10 @@ def _means(rows: list[dict[str, Any]], random_seed: int) -> list[dict[str, Any]]
     return [
         {
             "method": method,
+            "tracks": next(iter(own.values()))["tracks"],
             "figures": {
                 column: mean_over_scenes([_figure(row, column) for row in own.values()], random_seed)
-                for column in COLUMNS[3:]
+                for column in FIGURES
             },
         }
         for method, own in _by_method(rows).items()
@@ -195,6 +197,11 @@ def _figure(row: dict[str, Any], column: str) -> int | float | None:
     return moving_gap(row, group) if name == "gap_db" else row[column]
 
 
+def shows_other_tracks(report: dict[str, Any]) -> bool:
+    """Whether a method of a report trains with other tracks than the annotated ones."""
+    return any(row["tracks"] != "annotated" for row in report["rows"])
+
+
 def shows_people(report: dict[str, Any]) -> bool:
     """Whether a scene of a report has moving people in held-out frames."""
     return any(
@@ -214,12 +221,16 @@ def summary_sentences(report: dict[str, Any]) -> list[str]:
                 continue
             scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
             line = (
-                f"{mean['method']}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
+                f"{mean['method']}{_without_labels(mean)}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
                 f"{_decibels(gap, '{:.1f}')} to static pixels, {scenes}"
             )
             part = closed.get(mean["method"], {}).get(group)
             lines.append(line + (_compared(part, report["reference"]) if part else ""))
     return lines
+
+
+def _without_labels(mean: dict[str, Any]) -> str:
+    return {"annotated": "", "discovered": " (discovered tracks)", "none": " (no tracks)"}[mean["tracks"]]
 
 
 def _compared(part: dict[str, Any], reference: str) -> str:
