@@ -82,6 +82,8 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
 
 
 NAMES = ("scene", "dataset", "method", "tracks")
+NOTES = {"annotated": "", "discovered": " (discovered tracks)", "none": " (no tracks)"}
+"""What sentences say of the tracks that a method trains with."""
 FIGURES = (
     *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", *HUMANS, *WHOLE_IMAGE)),
     "gaussians", "train_seconds",
@@ -125,6 +127,8 @@ def _rows(record: dict[str, Any]) -> list[dict[str, Any]]:
             value = row[column]
             if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
                 raise ValueError(f"{column} of {row['method']} is {value!r}, not a number")
+        if row["tracks"] not in NOTES:
+            raise ValueError(f"the tracks of {row['method']} are {row['tracks']!r}")
         if row["shown"] is not None and row["shown"]["group"] not in (*GROUP_PLACES, "train"):
             raise ValueError(f"the image shown of {row['method']} is of no group")
     json.dumps(record, allow_nan=False)  # what the report repeats of it holds no NaN either
@@ -133,7 +137,8 @@ def _rows(record: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
     result = record["methods"][method]
-    row = {"scene": record["scene"], "dataset": record["dataset"], "method": method, "tracks": result["tracks"]}
+    row = {"scene": record["scene"], "dataset": record["dataset"], "method": method}
+    row["tracks"] = result.get("tracks", "annotated")
     for group in HELD_OUT_GROUPS:
         for region in (*REGIONS, HUMANS[0]):
             row[f"{group}_{region}"] = (result[group].get(region) or {}).get("psnr")
@@ -220,17 +225,14 @@ def summary_sentences(report: dict[str, Any]) -> list[str]:
             if moving is None or gap is None:
                 continue
             scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
+            name = mean["method"] + NOTES[mean["tracks"]]
             line = (
-                f"{mean['method']}{_without_labels(mean)}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
+                f"{name}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
                 f"{_decibels(gap, '{:.1f}')} to static pixels, {scenes}"
             )
             part = closed.get(mean["method"], {}).get(group)
             lines.append(line + (_compared(part, report["reference"]) if part else ""))
     return lines
-
-
-def _without_labels(mean: dict[str, Any]) -> str:
-    return {"annotated": "", "discovered": " (discovered tracks)", "none": " (no tracks)"}[mean["tracks"]]
 
 
 def _compared(part: dict[str, Any], reference: str) -> str:
