@@ -38,7 +38,7 @@ def test_a_row_has_the_figures_of_both_groups(write):
     report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061"), NO_LOGS)
     assert report["rows"] == [
         {
-            "scene": "0061", "dataset": "nuscenes", "method": "vanilla",
+            "scene": "0061", "dataset": "nuscenes", "method": "vanilla", "tracks": "annotated",
             "interpolation_static": 24.0, "interpolation_vehicle": 19.0, "interpolation_moving_vehicle": 17.0,
             "interpolation_gap_db": 7.0, "interpolation_moving_human": None, "interpolation_human_gap_db": None,
             "interpolation_psnr": 23.0,
@@ -331,7 +331,7 @@ def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
         "ssim", "lpips",
     )  # fmt: skip
     assert list(rows[0]) == [
-        "scene", "dataset", "method",
+        "scene", "dataset", "method", "tracks",
         *(f"interpolation_{name}" for name in figures), *(f"extrapolation_{name}" for name in figures),
         "gaussians", "train_seconds",
     ]  # fmt: skip
