@@ -34,8 +34,8 @@ class Ends:
 
     def followed(self, item: Discovered) -> Discovered:
         """The object, seen as long as returns lie in its box before and after the time in which it moved."""
-        seen = np.flatnonzero((self._seconds >= item.seconds[0]) & (self._seconds <= item.seconds[-1]))
-        if not len(seen):
+        seen = np.flatnonzero((self._seconds >= item.seconds[0]) & (self._seconds <= item.seconds[-1])).tolist()
+        if not seen:
             return item
         first, last = self._end(item, seen[::-1], -1), self._end(item, seen, 1)
         columns = (item.seconds, item.headings, item.grounds)
@@ -46,10 +46,10 @@ class Ends:
         )
         return replace(item, seconds=seconds[kept], headings=headings[kept], grounds=grounds[kept])
 
-    def _end(self, item: Discovered, seen: np.ndarray, step: int) -> float:
+    def _end(self, item: Discovered, seen: Sequence[int], step: int) -> float:
         """The time of the last scan in which it is, from those in which it was `seen` to move onwards by `step`."""
         wanted = KEPT * float(np.median([self._count(item, number) for number in seen[-TYPICAL_SCANS:]]))
-        number = int(seen[-1]) + step
+        number = seen[-1] + step
         while (
             0 <= number < len(self._scans)
             and abs(self._seconds[number] - self._seconds[seen[-1]]) <= MAX_BEYOND_S
