@@ -65,5 +65,6 @@ if workflow.pathvars.get("results") != plan.config.results_dir:
 wildcard_constraints:
     scene=plan.known(plan.config.scenes),
     method=plan.known(plan.config.all_methods),
+    tracks=plan.known(["", *plan.other_tracks]),
     trajectory=plan.known(plan.all_trajectories),
     edit="[A-Za-z0-9_][A-Za-z0-9_.-]*",

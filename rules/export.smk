@@ -13,7 +13,7 @@ rule far_gaussians:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
-        parser="<results>/{scene}/parser.pkl",
+        parser=plan.of_tracks("parser.pkl"),
     output:
         far="<results>/{scene}/{method}/far.npz",
     log:
@@ -44,7 +44,7 @@ rule export:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
-        parser="<results>/{scene}/parser.pkl",
+        parser=plan.of_tracks("parser.pkl"),
     output:
         splat="<results>/{scene}/{method}/splat.ply",
         cameras="<results>/{scene}/{method}/cameras.json",
@@ -102,7 +102,7 @@ rule export_viewer:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
-        parser="<results>/{scene}/parser.pkl",
+        parser=plan.of_tracks("parser.pkl"),
     output:
         viewer=report(
             "<results>/{scene}/{method}/viewer.html",
@@ -133,7 +133,7 @@ rule export_colmap:
     """
     input:
         scene=plan.scene,
-        parser="<results>/{scene}/parser.pkl",
+        parser=plan.of_tracks("parser.pkl"),
     output:
         cameras="<results>/{scene}/{method}/colmap/cameras.txt",
         images="<results>/{scene}/{method}/colmap/images.txt",

@@ -11,27 +11,27 @@
 
 rule tracks:
     """
-    Lists every annotated object that can move, with class, speed, visible time and whether it can be edited, and draws
-    the moving ones with the ids that settings use.
+    Lists every annotated or discovered object that can move, with class, speed, visible time and whether it can be
+    edited, and draws the moving ones with the ids that settings use.
     """
     input:
         scene=plan.scene,
-        parser="<results>/{scene}/parser.pkl",
-        masks="<results>/{scene}/masks/masks.json",
+        parser=plan.of_tracks("parser.pkl"),
+        masks=plan.of_tracks("masks/masks.json"),
         actors=plan.actors,
     output:
-        table="<results>/{scene}/tracks.csv",
+        table="<results>/{scene}/{tracks}tracks.csv",
         picture=report(
-            "<results>/{scene}/tracks.png",
+            "<results>/{scene}/{tracks}tracks.png",
             caption="../report/tracks.rst",
             category="Scene {scene}",
             subcategory="figures",
-            labels={"what": "moving objects, with ids"},
+            labels={"what": "moving objects, with ids ({tracks}tracks.csv)"},
         ),
     log:
-        "<logs>/{scene}/tracks.log",
+        "<logs>/{scene}/{tracks}tracks.log",
     benchmark:
-        "<benchmarks>/{scene}/tracks.tsv"
+        "<benchmarks>/{scene}/{tracks}tracks.tsv"
     conda:
         "../envs/drivesplat.yaml"
     resources:
@@ -123,8 +123,8 @@ rule compare:
     """
     input:
         checkpoints=expand("<results>/{{scene}}/{method}/checkpoint.npz", method=plan.config.methods),
-        scene=plan.scene,
-        parser="<results>/{scene}/parser.pkl",
+        scene=plan.annotated_scene,
+        parser=plan.first_parser,
         masks="<results>/{scene}/masks/masks.json",
     output:
         film=report(
@@ -161,9 +161,9 @@ rule ghost_panel:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
-        scene=plan.scene,
-        parser="<results>/{scene}/parser.pkl",
-        masks="<results>/{scene}/masks/masks.json",
+        scene=plan.shown_scene,
+        parser=plan.of_tracks("parser.pkl"),
+        masks=plan.shown_masks,
     output:
         panel=report(
             "<results>/{scene}/{method}/ghost_panel.png",
@@ -199,9 +199,9 @@ rule remove_actor:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
-        scene=plan.scene,
-        parser="<results>/{scene}/parser.pkl",
-        masks="<results>/{scene}/masks/masks.json",
+        scene=plan.shown_scene,
+        parser=plan.of_tracks("parser.pkl"),
+        masks=plan.shown_masks,
     output:
         with_car="<results>/{scene}/{method}/with_car.png",
         without_car="<results>/{scene}/{method}/without_car.png",
@@ -238,7 +238,7 @@ rule lidar_picture:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
-        scene=plan.scene,
+        scene=plan.annotated_scene,
         scans="<results>/{scene}/scans.npz",
     output:
         picture=report(
@@ -275,7 +275,7 @@ rule lidar_film:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
-        scene=plan.scene,
+        scene=plan.annotated_scene,
         scans="<results>/{scene}/scans.npz",
     output:
         film=report(

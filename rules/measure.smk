@@ -1,6 +1,7 @@
-# Measures trained methods on held-out images.
+# Measures trained methods on held-out images, by annotated tracks whatever a method trains with.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl; with cameras masks/, without scans.npz.
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl; with cameras masks/, without scans.npz; where a
+# method has discovered tracks discovered.json.
 # OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;
 # <results>/{scene}/metrics.json; where a method renders LiDAR <results>/{scene}/scan_baselines.json;
 # resources/lpips/backbone.json.
@@ -35,13 +36,13 @@ rule evaluate:
     truth. Writes one held-out image as recorded and as rendered.
     """
     input:
-        scene=plan.scene,
+        scene=plan.annotated_scene,
         truth=plan.truth,
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",
-        parser="<results>/{scene}/parser.pkl",
+        parser=plan.of_tracks("parser.pkl"),
         masks="<results>/{scene}/masks/masks.json",
-        scans=plan.training_input("scans"),
+        scans=plan.measured_scans,
         lpips=plan.lpips_record,
     output:
         metrics="<results>/{scene}/{method}/eval.json",
@@ -73,7 +74,7 @@ rule scan_baselines:
     Measures held-out LiDAR scans made from other scans without a model: what a method that renders LiDAR has to beat.
     """
     input:
-        scene=plan.scene,
+        scene=plan.annotated_scene,
         scans="<results>/{scene}/scans.npz",
     output:
         baselines="<results>/{scene}/scan_baselines.json",
@@ -98,10 +99,10 @@ rule evaluate_scans:
     Measures the held-out LiDAR scans of a scene without cameras.
     """
     input:
-        scene=plan.scene,
+        scene=plan.annotated_scene,
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",
-        parser="<results>/{scene}/parser.pkl",
+        parser=plan.of_tracks("parser.pkl"),
         scans="<results>/{scene}/scans.npz",
     output:
         metrics="<results>/{scene}/{method}/eval.json",
@@ -128,11 +129,13 @@ rule evaluate_scans:
 
 rule scene_metrics:
     """
-    Combines the measurements of all methods of a scene, with the baselines of LiDAR scans where a method renders them.
+    Combines the measurements of all methods of a scene, with the baselines of LiDAR scans where a method renders them,
+    and the quality of discovered tracks where a method trains with them.
     """
     input:
         evals=plan.evals,
         baselines=plan.scan_baselines,
+        discovered=plan.discovered,
     output:
         metrics=report(
             "<results>/{scene}/metrics.json",

@@ -3,8 +3,9 @@
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
 # where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
-# lidar_depth.npz and free_space.npz; on request scans.npz. The scene of all rules after these (plan.scene) is the refined
-# one where there is one.
+# lidar_depth.npz, free_space.npz and scans.npz. The scene of all rules after these (plan.scene) is the refined one where
+# there is one. What depends on tracks is made for each kind of tracks that methods train with (tracks.smk): the wildcard
+# {tracks} is empty for annotated ones, else the folder 'discovered/' or 'unlabelled/'.
 
 
 rule extract:
@@ -101,11 +102,11 @@ rule lidar_seed:
         points_file=plan.points_file,
         triangulated=plan.triangulated("lidar_seed"),
     output:
-        seed="<results>/{scene}/seed.ply",
+        seed="<results>/{scene}/{tracks}seed.ply",
     log:
-        "<logs>/{scene}/lidar_seed.log",
+        "<logs>/{scene}/{tracks}lidar_seed.log",
     benchmark:
-        "<benchmarks>/{scene}/lidar_seed.tsv"
+        "<benchmarks>/{scene}/{tracks}lidar_seed.tsv"
     conda:
         "../envs/drivesplat.yaml"
     threads: 4
@@ -126,13 +127,13 @@ rule parser:
     """
     input:
         scene=plan.scene,
-        seed=plan.of_images("seed.ply"),
+        seed=plan.images_of_tracks("seed.ply"),
     output:
-        parser="<results>/{scene}/parser.pkl",
+        parser="<results>/{scene}/{tracks}parser.pkl",
     log:
-        "<logs>/{scene}/parser.log",
+        "<logs>/{scene}/{tracks}parser.log",
     benchmark:
-        "<benchmarks>/{scene}/parser.tsv"
+        "<benchmarks>/{scene}/{tracks}parser.tsv"
     conda:
         "../envs/drivesplat.yaml"
     resources:
@@ -179,11 +180,11 @@ rule actors:
         scene=plan.scene,
         own_car=plan.of_images("own_car.json"),
     output:
-        actors="<results>/{scene}/actors.npz",
+        actors="<results>/{scene}/{tracks}actors.npz",
     log:
-        "<logs>/{scene}/actors.log",
+        "<logs>/{scene}/{tracks}actors.log",
     benchmark:
-        "<benchmarks>/{scene}/actors.tsv"
+        "<benchmarks>/{scene}/{tracks}actors.tsv"
     conda:
         "../envs/drivesplat.yaml"
     resources:
@@ -206,11 +207,11 @@ rule lidar_depth:
         scene=plan.scene,
         own_car="<results>/{scene}/own_car.json",
     output:
-        depth="<results>/{scene}/lidar_depth.npz",
+        depth="<results>/{scene}/{tracks}lidar_depth.npz",
     log:
-        "<logs>/{scene}/lidar_depth.log",
+        "<logs>/{scene}/{tracks}lidar_depth.log",
     benchmark:
-        "<benchmarks>/{scene}/lidar_depth.tsv"
+        "<benchmarks>/{scene}/{tracks}lidar_depth.tsv"
     conda:
         "../envs/drivesplat.yaml"
     resources:
@@ -232,11 +233,11 @@ rule free_space:
         scene=plan.scene,
         triangulated=plan.triangulated("free_space"),
     output:
-        free_space="<results>/{scene}/free_space.npz",
+        free_space="<results>/{scene}/{tracks}free_space.npz",
     log:
-        "<logs>/{scene}/free_space.log",
+        "<logs>/{scene}/{tracks}free_space.log",
     benchmark:
-        "<benchmarks>/{scene}/free_space.tsv"
+        "<benchmarks>/{scene}/{tracks}free_space.tsv"
     conda:
         "../envs/drivesplat.yaml"
     resources:
@@ -257,11 +258,11 @@ rule scans:
     input:
         scene=plan.scene,
     output:
-        scans="<results>/{scene}/scans.npz",
+        scans="<results>/{scene}/{tracks}scans.npz",
     log:
-        "<logs>/{scene}/scans.log",
+        "<logs>/{scene}/{tracks}scans.log",
     benchmark:
-        "<benchmarks>/{scene}/scans.tsv"
+        "<benchmarks>/{scene}/{tracks}scans.tsv"
     conda:
         "../envs/drivesplat.yaml"
     resources:
@@ -272,28 +273,3 @@ rule scans:
         code=plan.code("scans"),
     script:
         "../workflow_scripts/scans.py"
-
-
-rule discover:
-    """
-    Finds objects that move in the LiDAR scans of a drive, without labels, and compares them with annotated ones.
-    """
-    input:
-        scene=plan.scene,
-        scans="<results>/{scene}/scans.npz",
-    output:
-        tracks="<results>/{scene}/discovered.json",
-    log:
-        "<logs>/{scene}/discover.log",
-    benchmark:
-        "<benchmarks>/{scene}/discover.tsv"
-    conda:
-        "../envs/drivesplat.yaml"
-    resources:
-        mem_mb=4000,
-        runtime=60,
-    params:
-        settings=plan.settings("discover"),
-        code=plan.code("discover"),
-    script:
-        "../workflow_scripts/discover.py"

@@ -2,7 +2,7 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/parser.pkl and, of scenes with cameras, masks/masks.json; actors.npz,
 # lidar_depth.npz, free_space.npz and scans.npz if the method has actors, is supervised with LiDAR depth, keeps Gaussians
-# out of empty space, and renders LiDAR.
+# out of empty space, and renders LiDAR; in discovered/ or unlabelled/ where the method has such tracks.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While a training
 # runs, resume/ holds its resume checkpoint; no rule declares it, so that Snakemake does not delete it.
 
@@ -12,8 +12,8 @@ rule train:
     Fits Gaussians to training images and LiDAR scans; resumes an interrupted training of the same settings, code and inputs.
     """
     input:
-        parser="<results>/{scene}/parser.pkl",
-        masks=plan.of_images("masks/masks.json"),
+        parser=plan.of_tracks("parser.pkl"),
+        masks=plan.images_of_tracks("masks/masks.json"),
         actors=plan.training_input("actors"),
         lidar_depth=plan.training_input("lidar_depth"),
         free_space=plan.training_input("free_space"),

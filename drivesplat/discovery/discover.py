@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from drivesplat.discovery.boxes import Discovered, fitted_box
 from drivesplat.discovery.clusters import Chain, Cluster, chains_of, clusters_of
+from drivesplat.discovery.ends import Ends
 from drivesplat.discovery.merging import merged, united
 from drivesplat.discovery.seen_empty import seen_empty
 from drivesplat.scene.object_class import ObjectClass
@@ -44,7 +45,9 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
     around = Surroundings(scans, moving)
     chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and around.confirm(chain)]
-    return sorted(_without_overlaps(chains, around), key=lambda it: it.seconds[0])
+    ends = Ends(scans)
+    found = [ends.followed(item) for item in _without_overlaps(chains, around)]
+    return sorted(found, key=lambda it: it.seconds[0])
 
 
 def _without_overlaps(chains: Sequence[Chain], around: "Surroundings") -> list[Discovered]:

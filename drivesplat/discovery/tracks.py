@@ -13,6 +13,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.scene.scan_record import RecordedScan, ScanRecords
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.discover import DiscoverSettings
+from drivesplat.settings.tracks import FOUND
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ def tracks_of(scene: Scene, objects: Sequence[Discovered]) -> list[Track]:
             of_class = item.object_class
             found.append(
                 Track(
-                    f"found_{len(found) + 1:04d}", of_class, f"discovered.{of_class.value}", item.size,
+                    f"{FOUND}{len(found) + 1:04d}", of_class, f"discovered.{of_class.value}", item.size,
                     scene.key_frame_timestamps[samples], samples, item.poses(times[samples]), np.zeros_like(samples),
                 )
             )  # fmt: skip

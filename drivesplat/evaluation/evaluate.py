@@ -126,6 +126,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
         "result": {
             **groups,
             **against_truth,
+            "tracks": job.tracks,
             **training_figures(inputs.summary),
             "findings": findings(groups["interpolation"]),
             "shown": {"group": sample.group, "key_frame": inputs.recording.frame(sample.index).sample_index},

@@ -65,6 +65,7 @@ def evaluate_scans(
         "result": {
             **{group: {**of_images, "lidar": lidar[group]} for group in HELD_OUT_GROUPS},
             "images_unavailable": UNAVAILABLE,
+            "tracks": job.tracks,
             **training_figures(inputs.summary),
             "findings": {"static_above_22_db": None, "vehicle_below_18_db": None},
             "shown": None,

@@ -21,9 +21,14 @@ def read_baselines(path: str) -> dict[str, Any]:
     return read_record(path, "scan_baselines", "baselines", "provenance")
 
 
-def side_by_side(evals: dict[str, dict[str, Any]], baselines: dict[str, Any] | None = None) -> dict[str, Any]:
+def side_by_side(
+    evals: dict[str, dict[str, Any]],
+    baselines: dict[str, Any] | None = None,
+    tracks_quality: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """The content of metrics.json, without provenance, from the eval.json of every method by name and, where methods
-    render LiDAR, the content of scan_baselines.json.
+    render LiDAR, the content of scan_baselines.json; `tracks_quality` is that of the discovered tracks, where methods
+    train with them and there are annotated ones.
 
     Raises ResultError if two methods were measured under different protocols: their figures do not compare.
     """
@@ -43,4 +48,5 @@ def side_by_side(evals: dict[str, dict[str, Any]], baselines: dict[str, Any] | N
         "drive": first["drive"],
         "methods": {name: record["result"] for name, record in evals.items()},
         **({"lidar_baselines": baselines["baselines"]} if baselines else {}),
+        **({"tracks_quality": tracks_quality} if tracks_quality else {}),
     }

@@ -11,6 +11,9 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.tracks import Box
 
+MOSTLY = 0.5
+"""Share of an object's Gaussians in the box from which it is the object of the box."""
+
 
 @dataclass(frozen=True)
 class Removal:
@@ -23,11 +26,14 @@ class Removal:
 def removal_of(model: SplatModel, gaussians: Gaussians, box: Box, margin: float) -> Removal:
     """The rows of `gaussians`, the model's at the time of `box`, that show the object in the box.
 
-    The object's own Gaussians where the model knows it, else those with centres in the box, enlarged by `margin` metres
-    at its sides and roof.
+    The object's own Gaussians where the model knows it, by its track or as objects most of whose Gaussians lie in the
+    box (discovered ones); else those with centres in the box, enlarged by `margin` metres at its sides and roof.
     """
     own = model.of_track(box.track_id)
     if own is not None:
         return Removal(own, "actor")
-    inside = box.contains(gaussians.means.detach().cpu().double().numpy(), margin)
-    return Removal(torch.from_numpy(inside).to(gaussians.means.device), "box")
+    centres = gaussians.means.detach().cpu().double().numpy()
+    inside = torch.from_numpy(box.contains(centres, margin)).to(gaussians.means.device)
+    objects = (model.of_track(name) for name in model.rigid_groups(0.0))
+    there = [rows for rows in objects if rows is not None and rows.any() and inside[rows].float().mean() > MOSTLY]
+    return Removal(torch.stack(there).any(dim=0), "actor") if there else Removal(inside, "box")

@@ -58,7 +58,8 @@ def scan_records(scene: Scene, job: ScansJob) -> ScanRecords:
         ]
     if not records:
         raise DatasetError(
-            f"scene {scene.name} has no LiDAR sweep that gives a scan; leave out what needs scans (docs/lidar.md)"
+            f"scene {scene.name} has no LiDAR sweep that gives a scan; leave out methods that render LiDAR, and give "
+            "those with tracks: discovered other tracks (annotated or none, docs/without_boxes.md)"
         )
     rays = sum(record.scan.returned.size for record in records)
     log.info(

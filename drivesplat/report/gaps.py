@@ -81,11 +81,14 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
     }
 
 
-COLUMNS = (
-    "scene", "dataset", "method",
+NAMES = ("scene", "dataset", "method", "tracks")
+NOTES = {"annotated": "", "discovered": " (discovered tracks)", "none": " (no tracks)"}
+"""What sentences say of the tracks that a method trains with."""
+FIGURES = (
     *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", *HUMANS, *WHOLE_IMAGE)),
     "gaussians", "train_seconds",
 )  # fmt: skip
+COLUMNS = (*NAMES, *FIGURES)
 
 
 def _mismatches(record: dict[str, Any], expected: dict[str, Any], measured: dict[str, Any]) -> list[str]:
@@ -120,10 +123,12 @@ def _rows(record: dict[str, Any]) -> list[dict[str, Any]]:
     if not rows:
         raise ValueError("it has no method")
     for row in rows:
-        for column in COLUMNS[3:]:
+        for column in FIGURES:
             value = row[column]
             if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
                 raise ValueError(f"{column} of {row['method']} is {value!r}, not a number")
+        if row["tracks"] not in NOTES:
+            raise ValueError(f"the tracks of {row['method']} are {row['tracks']!r}")
         if row["shown"] is not None and row["shown"]["group"] not in (*GROUP_PLACES, "train"):
             raise ValueError(f"the image shown of {row['method']} is of no group")
     json.dumps(record, allow_nan=False)  # what the report repeats of it holds no NaN either
@@ -133,6 +138,7 @@ def _rows(record: dict[str, Any]) -> list[dict[str, Any]]:
 def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
     result = record["methods"][method]
     row = {"scene": record["scene"], "dataset": record["dataset"], "method": method}
+    row["tracks"] = result.get("tracks", "annotated")
     for group in HELD_OUT_GROUPS:
         for region in (*REGIONS, HUMANS[0]):
             row[f"{group}_{region}"] = (result[group].get(region) or {}).get("psnr")
@@ -148,9 +154,10 @@ def _means(rows: list[dict[str, Any]], random_seed: int) -> list[dict[str, Any]]
     return [
         {
             "method": method,
+            "tracks": next(iter(own.values()))["tracks"],
             "figures": {
                 column: mean_over_scenes([_figure(row, column) for row in own.values()], random_seed)
-                for column in COLUMNS[3:]
+                for column in FIGURES
             },
         }
         for method, own in _by_method(rows).items()
@@ -195,6 +202,11 @@ def _figure(row: dict[str, Any], column: str) -> int | float | None:
     return moving_gap(row, group) if name == "gap_db" else row[column]
 
 
+def shows_other_tracks(report: dict[str, Any]) -> bool:
+    """Whether a method of a report trains with other tracks than the annotated ones."""
+    return any(row["tracks"] != "annotated" for row in report["rows"])
+
+
 def shows_people(report: dict[str, Any]) -> bool:
     """Whether a scene of a report has moving people in held-out frames."""
     return any(
@@ -213,8 +225,9 @@ def summary_sentences(report: dict[str, Any]) -> list[str]:
             if moving is None or gap is None:
                 continue
             scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
+            name = mean["method"] + NOTES[mean["tracks"]]
             line = (
-                f"{mean['method']}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
+                f"{name}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
                 f"{_decibels(gap, '{:.1f}')} to static pixels, {scenes}"
             )
             part = closed.get(mean["method"], {}).get(group)

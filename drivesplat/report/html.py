@@ -9,14 +9,14 @@ from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
 from drivesplat.io.html_page import filled_page
 from drivesplat.report import page
-from drivesplat.report.gaps import shows_people, summary_sentences
+from drivesplat.report.gaps import shows_other_tracks, shows_people, summary_sentences
 from drivesplat.report.lidar import page_table
 from drivesplat.report.media import MethodMedia, data_url, difference_position, read_image
 from drivesplat.report.plot import gap_plot
 from drivesplat.report.tables import pixels_label, scene_label
 
 MediaByMethod = Mapping[tuple[str, str], MethodMedia]
-NAMES = [{"key": name, "title": name, "form": "{}", "kind": "name"} for name in ("scene", "method")]
+NAMES = [{"key": name, "title": name, "form": "{}", "kind": "name"} for name in ("scene", "method", "tracks")]
 REGION_FIGURES = [
     {"key": "moving_vehicle", "title": "moving", "form": "{:.1f}", "kind": "first"},
     {"key": "static", "title": "static", "form": "{:.1f}", "kind": ""},
@@ -59,6 +59,7 @@ def report_page(
     scenes: dict[str, list[dict[str, Any]]] = {}
     for row in report["rows"]:
         scenes.setdefault(row["scene"], []).append(row)
+    names = NAMES if shows_other_tracks(report) else NAMES[:-1]
     configured = len(scenes) + len(report["left_out"]) + len(report["missing"])
     return filled_page(
         page,
@@ -70,9 +71,9 @@ def report_page(
         plot=Markup(gap_plot(report)),
         places=GROUP_PLACES,
         tables=[
-            _table("Moving vehicles and static pixels: PSNR in dB", REGION_FIGURES, []),
-            *([_table("Moving people: PSNR in dB", HUMAN_FIGURES, [])] if shows_people(report) else []),
-            _table("Whole images, with the cost of training", WHOLE_IMAGE_FIGURES, COSTS),
+            _table("Moving vehicles and static pixels: PSNR in dB", names, REGION_FIGURES, []),
+            *([_table("Moving people: PSNR in dB", names, HUMAN_FIGURES, [])] if shows_people(report) else []),
+            _table("Whole images, with the cost of training", names, WHOLE_IMAGE_FIGURES, COSTS),
         ],
         lidar=page_table(report["lidar"]),
         publications=_publications(report["published"]),
@@ -88,13 +89,15 @@ def report_page(
     )
 
 
-def _table(title: str, of_groups: list[dict[str, str]], of_methods: list[dict[str, str]]) -> dict[str, Any]:
-    """A table of figures `of_groups` of held-out frames and `of_methods`: its title, the titles of groups of columns
-    with their numbers of columns, and the columns."""
+def _table(
+    title: str, names: list[dict[str, str]], of_groups: list[dict[str, str]], of_methods: list[dict[str, str]]
+) -> dict[str, Any]:
+    """A table of figures `of_groups` of held-out frames and `of_methods`, after columns of `names`: its title, the
+    titles of groups of columns with their numbers of columns, the number of names, and the columns."""
     figures = [{**column, "key": f"{group}_{column['key']}"} for group in GROUP_PLACES for column in of_groups]
     groups = [(place, len(of_groups)) for place in GROUP_PLACES.values()]
     groups += [("", len(of_methods))] if of_methods else []
-    return {"title": title, "groups": groups, "columns": [*NAMES, *figures, *of_methods]}
+    return {"title": title, "groups": groups, "names": len(names), "columns": [*names, *figures, *of_methods]}
 
 
 def _publications(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 
 from drivesplat.io.storage import atomic_write
-from drivesplat.report.gaps import COLUMNS, HUMANS, REGIONS, shows_people
+from drivesplat.report.gaps import COLUMNS, HUMANS, REGIONS, shows_other_tracks, shows_people
 from drivesplat.report.lidar import LIDAR_COLUMNS, REGION_NAMES, page_table
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.published import MEAN
@@ -122,7 +122,12 @@ def pixels_label(row: dict[str, Any]) -> str:
 
 def _as_text(report: dict[str, Any], of_groups: list[str], of_methods: list[str]) -> str:
     means = [
-        {"scene": "mean", "method": mean["method"], **{name: it and it["mean"] for name, it in mean["figures"].items()}}
+        {
+            "scene": "mean",
+            "method": mean["method"],
+            "tracks": mean["tracks"],
+            **{name: it and it["mean"] for name, it in mean["figures"].items()},
+        }
         for mean in report["means"]
     ]
     columns = {f"{group}_{name}": name for group in HELD_OUT_GROUPS for name in of_groups}
@@ -136,4 +141,5 @@ def _as_text(report: dict[str, Any], of_groups: list[str], of_methods: list[str]
     titles = {column: TITLES.get(name, name) for column, name in columns.items()}
     titles |= {f"{group}_{of_groups[0]}": f"{group[:6]}. {TITLES[of_groups[0]]}" for group in HELD_OUT_GROUPS}
     titles["train_seconds"] = "seconds"
-    return table[[*NAMES, *columns]].rename(columns=titles).to_string(index=False)
+    names = [*NAMES, *(["tracks"] if shows_other_tracks(report) else [])]
+    return table[[*names, *columns]].rename(columns=titles).to_string(index=False)

@@ -9,10 +9,15 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.storage import Provenance, read_json, unreadable
 from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.images import read_mask
+from drivesplat.settings.tracks import OTHER_TRACKS
 
-RULE = "masks"
 UNLABELLED = 255
 """The value of pixels that have no class in the user's label image."""
+
+
+def _rule(folder: Path) -> str:
+    """The rule that writes the masks in a folder."""
+    return "regions" if folder.parent.name in OTHER_TRACKS else "masks"
 
 
 def mask_name(kind: str, camera: str, timestamp: int) -> str:
@@ -47,11 +52,11 @@ NO_MASKS = MasksRecord({}, 0, "boxes", "heuristic", 0.0, False, 0, {}, None)
 def read_masks_record(folder: Path) -> MasksRecord:
     """Reads masks.json. Raises ResultError that names the file and its rule if it is invalid."""
     path = folder / "masks.json"
-    content = read_json(path, RULE)
+    content = read_json(path, _rule(folder))
     try:
         return typed_record(MasksRecord, content)
     except ValueError as error:
-        raise unreadable(path, RULE, f"not a record of masks ({error})") from error
+        raise unreadable(path, _rule(folder), f"not a record of masks ({error})") from error
 
 
 def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
@@ -83,4 +88,4 @@ def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple
     try:
         return read_mask(path, size)
     except DatasetError as error:
-        raise unreadable(path, RULE, str(error), delete=folder / "masks.json") from error
+        raise unreadable(path, _rule(folder), str(error), delete=folder / "masks.json") from error

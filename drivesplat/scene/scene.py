@@ -18,6 +18,7 @@ from drivesplat.io.storage import Provenance
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.sensors import Camera, Lidar, SweepMotion
+from drivesplat.settings.tracks import OTHER_TRACKS
 
 SCHEMA = 1
 UNPOSED = "none"
@@ -177,4 +178,6 @@ def read_scene(path: str | Path) -> Scene:
     ['car', 'truck', 'pedestrian', 'other_movable']
     """
     rule = "refine_poses" if Path(path).name == REFINED else "extract"
+    if Path(path).parent.name in OTHER_TRACKS:
+        rule = "relabel"
     return read_typed_json(path, rule, Scene, SCHEMA, "a scene record")

@@ -6,6 +6,7 @@ from drivesplat.settings import Settings
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
+from drivesplat.settings.tracks import Tracks
 
 BACKBONE = "resources/lpips/alexnet.pth"
 """Path of LPIPS's AlexNet backbone. Without a network, users put the file there."""
@@ -36,9 +37,13 @@ class EvaluateJob(Settings):
     lpips: bool
     removal: RemovalSettings | None
     """Only for synthetic worlds: recorded drives have no ground truth without the vehicle."""
+    tracks: Tracks = "annotated"
+    """The tracks that the method was trained with."""
 
 
 class EvaluateScansJob(Settings):
     """All settings that determine one eval.json of a scene without cameras."""
 
     holdout: HoldoutSettings
+    tracks: Tracks = "annotated"
+    """The tracks that the method was trained with."""

@@ -35,6 +35,12 @@ class MaskJob(Settings):
     images: ImageSettings
 
 
+class RegionJob(Settings):
+    """All settings that determine the regions by other tracks of one scene."""
+
+    images: ImageSettings
+
+
 class EgoMaskSearch(Settings):
     """Search for the ego vehicle's body in the images of `cameras`."""
 

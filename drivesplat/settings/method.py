@@ -3,9 +3,10 @@
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import MOVING_PARTS, STAGE_OF_PART, PartName, Parts
 
 
@@ -21,9 +22,21 @@ def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, A
 class MethodSettings(Settings):
     parts: Parts = ("background",)
     """Parts of the model. Must contain 'background'."""
+    tracks: Tracks = "annotated"
+    """Tracks to train with: 'annotated', 'discovered' (moving objects found in LiDAR scans) or 'none'. Metrics use
+    annotated tracks whatever a method trains with. docs/without_boxes.md"""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings that differ for this method, as a tree. Only `sky`, `train` and `random_seed` (of its training) may be
     set."""
+
+    @model_validator(mode="after")
+    def _actors_need_tracks(self) -> "MethodSettings":
+        if self.tracks == "none" and self.object_parts:
+            raise ValueError(
+                f"tracks: none leaves the part {self.object_parts[0]!r} without objects; write tracks: discovered, or drop "
+                "the part"
+            )
+        return self
 
     @property
     def moving_parts(self) -> tuple[PartName, ...]:
@@ -37,7 +50,8 @@ class MethodSettings(Settings):
 
     def varied(self, parts: Parts | None, overrides: Mapping[str, Any]) -> "MethodSettings":
         """This method with other `parts`, unless None, and with `overrides` laid over its own."""
-        return MethodSettings(parts=parts or self.parts, overrides=merged(self.overrides, overrides))
+        own = parts or self.parts
+        return MethodSettings(parts=own, tracks=self.tracks, overrides=merged(self.overrides, overrides))
 
 
 VARIATION_OVERRIDES = ("sky", "train")

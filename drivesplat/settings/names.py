@@ -6,11 +6,12 @@ from difflib import get_close_matches
 from typing import Any
 
 from drivesplat.settings import quoted
+from drivesplat.settings.tracks import OTHER_TRACKS
 
 NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]*"
 MAX_LENGTH = 100
 """Characters of a name: file systems allow 255 bytes, and the workflow adds prefixes and suffixes."""
-RESERVED = ("logs", "benchmarks", "masks", "images", "classes", "sweeps", "undistorted")
+RESERVED = ("logs", "benchmarks", "masks", "images", "classes", "sweeps", "undistorted", *OTHER_TRACKS)
 """Folders of the workflow beside those of scenes and methods."""
 RESULT_SUFFIXES = (".csv", ".html", ".json", ".mp4", ".npz", ".pkl", ".ply", ".png", ".usdz")
 """Suffixes of files of the workflow beside folders of scenes and methods."""

@@ -14,6 +14,7 @@ from drivesplat.scene.scene import REFINED
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.names import suggestion
+from drivesplat.settings.tracks import OTHER_TRACKS, TRACK_FOLDERS, Tracks, tracks_in
 from drivesplat.settings.world import CameraChannel
 from drivesplat.workflow.stages import SCAN_BASELINES, SCANS, refines_poses, training_inputs
 from drivesplat.workflow.without_cameras import has_cameras
@@ -135,10 +136,70 @@ class Inputs:
         name = self.config.dataset_of(wildcards.scene)
         return [self.truth_file(name)] if name in self.worlds else []
 
-    def scene(self, wildcards: Any) -> str:
-        """The scene record that all stages read: with refined poses if they are enabled."""
+    def annotated_scene(self, wildcards: Any) -> str:
+        """The scene record with annotated tracks, which figures are measured with: with refined poses if they are
+        enabled."""
         name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
+
+    def scene(self, wildcards: Any) -> str:
+        """The scene record with the tracks of a job."""
+        return self._scene(wildcards, self.tracks(wildcards))
+
+    def shown_scene(self, wildcards: Any) -> str:
+        """The scene record with the tracks that pictures of a method show."""
+        return self._scene(wildcards, self._shown_tracks(wildcards))
+
+    def shown_masks(self, wildcards: Any) -> str:
+        """The masks of these tracks."""
+        return self._of(self._shown_tracks(wildcards), wildcards, "masks/masks.json")
+
+    def _scene(self, wildcards: Any, tracks: Tracks) -> str:
+        return self.annotated_scene(wildcards) if tracks == "annotated" else self._of(tracks, wildcards, "scene.json")
+
+    @property
+    def other_tracks(self) -> list[str]:
+        """The values of the wildcard `tracks` but that of annotated tracks, which is empty."""
+        return [f"{folder}/" for folder in OTHER_TRACKS]
+
+    def tracks(self, wildcards: Any) -> Tracks:
+        """The tracks of a job: those of its results' folder, or those that its method trains with."""
+        if hasattr(wildcards, "tracks"):
+            return tracks_in(wildcards.tracks)
+        return self.config.all_methods[wildcards.method].tracks if hasattr(wildcards, "method") else "annotated"
+
+    def _shown_tracks(self, wildcards: Any) -> Tracks:
+        """The tracks that pictures of a method show: its own; the annotated ones of a method without tracks."""
+        own = self.tracks(wildcards)
+        return "annotated" if own == "none" else own
+
+    def _of(self, tracks: Tracks, wildcards: Any, name: str) -> str:
+        """A result of a scene that depends on tracks."""
+        return str(Path(self.config.results_dir, wildcards.scene, TRACK_FOLDERS[tracks], name))
+
+    def of_tracks(self, name: str) -> Callable[[Any], str]:
+        """The function of wildcards that gives the result `name` for the tracks of a job."""
+        return lambda wildcards: self._of(self.tracks(wildcards), wildcards, name)
+
+    def images_of_tracks(self, name: str) -> Callable[[Any], list[str]]:
+        """As `of_tracks`, of a result that is made from images: none without cameras."""
+
+        def result(wildcards: Any) -> list[str]:
+            there = has_cameras(self.config, wildcards.scene)
+            return [self._of(self.tracks(wildcards), wildcards, name)] if there else []
+
+        return result
+
+    def first_parser(self, wildcards: Any) -> str:
+        """The training record of the first method: cameras and splits are the same for all tracks."""
+        return self._of(next(iter(self.config.methods.values())).tracks, wildcards, "parser.pkl")
+
+    def discovered(self, wildcards: Any) -> list[str]:
+        """The discovered tracks of a scene, if those of the job are discovered or, without any, those of a method."""
+        alone = hasattr(wildcards, "tracks")
+        of_any = (method.tracks for method in self.config.methods.values())
+        wanted = "discovered" in ([self.tracks(wildcards)] if alone else of_any)
+        return [f"{self.config.results_dir}/{wildcards.scene}/discovered.json"] if wanted else []
 
     def triangulated(self, stage: Literal["lidar_seed", "free_space"]) -> Callable[[Any], list[str]]:
         """The function of wildcards that gives the points triangulated by pose refinement, if the stage uses them."""
@@ -162,8 +223,8 @@ class Inputs:
                 raise ConfigError(f"lidar_seed.points_file {path} is no regular file; name a PLY file of points")
 
     def of_images(self, name: str) -> Callable[[Any], list[str]]:
-        """The function of wildcards that gives a scene's result `name`, which is made from images: none without
-        cameras."""
+        """The function of wildcards that gives a scene's result `name`, which is made from images and depends on no
+        tracks: none without cameras."""
 
         def result(wildcards: Any) -> list[str]:
             there = has_cameras(self.config, wildcards.scene)
@@ -176,9 +237,14 @@ class Inputs:
 
         def result(wildcards: Any) -> list[str]:
             taken = training_inputs(self.config, wildcards.scene, wildcards.method)
-            return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.npz"] if stage in taken else []
+            return [self._of(self.tracks(wildcards), wildcards, f"{stage}.npz")] if stage in taken else []
 
         return result
+
+    def measured_scans(self, wildcards: Any) -> list[str]:
+        """The scans with annotated objects, if a method renders LiDAR: its figures are measured with them."""
+        rendered = self.renders_lidar(wildcards.scene, wildcards.method)
+        return [f"{self.config.results_dir}/{wildcards.scene}/{SCANS}.npz"] if rendered else []
 
     def renders_lidar(self, scene: str, method: str) -> bool:
         """Whether a method renders the LiDAR of a scene."""
@@ -190,11 +256,11 @@ class Inputs:
         return [f"{self.config.results_dir}/{wildcards.scene}/{SCAN_BASELINES}.json"] if rendered else []
 
     def actors(self, wildcards: Any) -> list[str]:
-        """The actors of a scene, if any method has them."""
-        taken = (training_inputs(self.config, wildcards.scene, method) for method in self.config.methods)
-        return (
-            [f"{self.config.results_dir}/{wildcards.scene}/actors.npz"] if any("actors" in it for it in taken) else []
-        )
+        """The actors of a scene and of the tracks of a job, if any method with these tracks has them."""
+        tracks = self.tracks(wildcards)
+        own = [name for name, method in self.config.methods.items() if method.tracks == tracks]
+        taken = any("actors" in training_inputs(self.config, wildcards.scene, method) for method in own)
+        return [self._of(tracks, wildcards, "actors.npz")] if taken else []
 
     def lpips_record(self, _: Any) -> list[str]:
         """The record of LPIPS's backbone, if LPIPS is enabled."""

@@ -25,6 +25,7 @@ from drivesplat.provenance.record import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.track_references import TrackReferences
+from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow.gpus import hold_gpu
 
 S = TypeVar("S", bound=Settings)
@@ -64,7 +65,8 @@ class Job:
     @property
     def name(self) -> str:
         """Stage and scene, for messages."""
-        return " ".join([self.stage, *([self.wildcards.scene] if hasattr(self.wildcards, "scene") else [])])
+        of_tracks = getattr(self.wildcards, "tracks", "")
+        return " ".join([of_tracks + self.stage, *([self.wildcards.scene] if hasattr(self.wildcards, "scene") else [])])
 
     def settings(self, model: type[S]) -> S:
         """The rule's settings as the record it expects."""
@@ -94,7 +96,8 @@ class Job:
             self._read[path] = checked_digest(path, warn=results is not None and results in Path(path).parents)
         if dataset:
             record = self.input.scene if hasattr(self.input, "scene") else self.input.parser
-            check_dataset(Path(record).parent, dataset)
+            folder = Path(record).parent
+            check_dataset(folder.parent if folder.name in OTHER_TRACKS else folder, dataset)
 
     def _scene_folder(self) -> Path | None:
         """The folder of the scene's results, in which every file has a record; None for a rule without a scene."""

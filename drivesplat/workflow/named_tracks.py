@@ -7,10 +7,12 @@ from itertools import pairwise
 from pathlib import PurePosixPath
 from typing import Any
 
-from drivesplat.errors import ResultError
+from drivesplat.errors import ConfigError, ResultError
 from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
+from drivesplat.settings.inspection import SubjectSettings
 from drivesplat.settings.track_references import EditReference, TrackReferences
+from drivesplat.settings.tracks import FOUND, Tracks
 from drivesplat.workflow.film_names import EDITS, scene_edits
 
 RULES_OF_EDITS = ("edit", "quad", "drive_folder", "scan_folder")
@@ -32,14 +34,66 @@ def run_targets(targets: Sequence[str], is_main: bool) -> list[str] | None:
     return None if handed is None else json.loads(handed)
 
 
-def track_references(config: Config, scene: str, targets: Sequence[str] | None = ()) -> TrackReferences:
-    """The tracks that the settings of a scene name and that a run for `targets` (none: everything) uses. Without known
-    targets (None) there are none. Raises ConfigError where the edits file is invalid."""
-    subject, editable = config.subjects.get(scene), any(method.object_parts for method in config.methods.values())
-    used = _Used(scene, targets)
-    edits = scene_edits(config, scene) if editable else {}
+def track_references(
+    config: Config, scene: str, targets: Sequence[str] | None = (), tracks: Tracks = "annotated"
+) -> TrackReferences:
+    """Those of the annotated or discovered `tracks` that the settings of a scene name and that a run for `targets`
+    (none: everything) uses. Without known targets (None) there are none. Raises ConfigError where the edits file is
+    invalid."""
+    subject, used = config.subjects.get(scene, SubjectSettings()), _Used(scene, targets)
+    editable = any(method.object_parts and method.tracks == tracks for method in config.methods.values())
+    edits = fitting_edits(config, scene, tracks) if editable else {}
     named = [reference for name, edit in edits.items() if used.edit(name) for reference in _of_edit(name, edit)]
-    return TrackReferences(scene=scene, subject=subject.track if subject and used.subject else None, edits=tuple(named))
+    shown = used.subject and shows_subject(subject, tracks)
+    return TrackReferences(scene=scene, subject=subject.track if shown else None, edits=tuple(named))
+
+
+def fitting_edits(config: Config, scene: str, tracks: Tracks) -> dict[str, Edit]:
+    """The edits of a scene that name none but the `tracks` of a method. Raises ConfigError where the edits file is
+    invalid."""
+    return {name: edit for name, edit in scene_edits(config, scene).items() if _fits(edit, tracks)}
+
+
+def _fits(edit: Edit, tracks: Tracks) -> bool:
+    found = [reference.track.startswith(FOUND) for reference in _of_edit("", edit)]
+    return {"annotated": not any(found), "discovered": all(found), "none": not found}[tracks]
+
+
+def shows_subject(subject: SubjectSettings, tracks: Tracks) -> bool:
+    """Whether the vehicle that the user selected is one that pictures of a method with these tracks show."""
+    return subject.track is None or subject.track.startswith(FOUND) == (tracks == "discovered")
+
+
+def refuse_other_tracks(config: Config, scene: str, method: str, edit: str) -> None:
+    """Raises ConfigError if an edit names tracks that a method does not train with."""
+    tracks = config.all_methods[method].tracks
+    if edit in fitting_edits(config, scene, tracks):
+        return
+    able = [
+        name
+        for name, other in config.methods.items()
+        if other.object_parts and edit in fitting_edits(config, scene, other.tracks)
+    ]
+    named = dict.fromkeys(reference.track for reference in _of_edit(edit, scene_edits(config, scene)[edit]))
+    raise ConfigError(
+        f"scene {scene}, edit {edit!r} names {', '.join(named)}, but method {method!r} has tracks: {tracks} (ids of "
+        f"discovered ones begin with {FOUND}); methods with the tracks of this edit: {', '.join(able) or 'none'}"
+    )
+
+
+def edits_left_out(config: Config, scenes: Iterable[str]) -> list[str]:
+    """A sentence for each of these scenes with edits that fit the tracks of no method that can be edited."""
+    known: set[Tracks] = {method.tracks for method in config.methods.values() if method.object_parts}
+    sentences = []
+    for scene in sorted(set(scenes)) if known else ():
+        fitting = {name for tracks in known for name in fitting_edits(config, scene, tracks)}
+        absent = [name for name in scene_edits(config, scene) if name not in fitting]
+        if absent:
+            sentences.append(
+                f"scene {scene}: no method has the tracks that these edits name, which are left out: "
+                f"{', '.join(absent)} (methods.<name>.tracks: {' or '.join(sorted(known))})"
+            )
+    return sentences
 
 
 class _Used:
@@ -74,18 +128,22 @@ def _of_edit(name: str, edit: Edit) -> Iterable[EditReference]:
 
 
 def refuse_wrong_tracks(config: Config, jobs: Iterable[Any], scene_file: Callable[[Any], str]) -> None:
-    """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that the settings name. Scenes
-    whose tracks this run extracts are left to the stages `extract` and `actors`, which make the same check.
+    """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that the settings name. Records
+    that this run makes are left to the stages `extract`, `relabel` and `actors`, which make the same check.
 
-    `scene_file` gives the path of a scene's record by the wildcards of a job.
+    `scene_file` gives the path of the scene record whose tracks a job shows by its wildcards.
     """
-    planned = list(jobs)
+    planned = [job for job in jobs if hasattr(job.wildcards, "scene")]
     extracted = {job.wildcards.scene for job in planned if job.rule.name == "extract"}
+    made = {str(job.output[0]) for job in planned if job.rule.name == "relabel"}
     for job in planned:
-        rule, scene = job.rule.name, getattr(job.wildcards, "scene", None)
+        rule, scene = job.rule.name, job.wildcards.scene
         if scene in extracted or rule not in (*RULES_OF_SUBJECT, *RULES_OF_EDITS):
             continue
-        references = track_references(config, scene)
+        if scene_file(job.wildcards) in made:
+            continue
+        tracks = config.all_methods[job.wildcards.method].tracks
+        references = track_references(config, scene, tracks=tracks)
         subject = references.subject if rule in RULES_OF_SUBJECT else None
         edit = _edit_of(job.wildcards) if rule in RULES_OF_EDITS else None
         edits = tuple(one for one in references.edits if one.edit == edit)

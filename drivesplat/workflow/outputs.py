@@ -8,16 +8,18 @@ from typing import Any
 from drivesplat.provenance.code_digest import code_digest
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
-from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, scene_edits
+from drivesplat.settings.tracks import TRACK_FOLDERS
+from drivesplat.workflow.film_names import EDITS, TRAJECTORIES
 from drivesplat.workflow.inputs import Inputs
+from drivesplat.workflow.named_tracks import fitting_edits
 from drivesplat.workflow.stages import (
     OF_ONE_SCENE,
     SCAN_BASELINES,
-    SCANS,
     SIDE_BY_SIDE,
     method_stages,
     scene_stages,
     stage_settings,
+    track_stages,
     training_inputs,
 )
 from drivesplat.workflow.without_cameras import has_cameras, scene_methods
@@ -125,9 +127,12 @@ class Outputs(Inputs):
         return self.of_methods(names)
 
     def looks(self, _: Any = None) -> list[str]:
-        """The pictures of the batch's scenes and methods."""
-        shown = self._with_cameras(self.config.batch_scenes)
-        tracks = [f"{self.config.results_dir}/{scene}/tracks.png" for scene in shown]
+        """The pictures of the batch's scenes and methods, and of the tracks of any method."""
+        known = dict.fromkeys(method.tracks for method in self.config.methods.values() if method.tracks != "none")
+        places = (
+            Path(scene, TRACK_FOLDERS[own]) for scene in self._with_cameras(self.config.batch_scenes) for own in known
+        )
+        tracks = [f"{self.config.results_dir}/{place}/tracks.png" for place in places]
         return [*tracks, *self.of_methods(self._look_names, cameras=False)]
 
     def _look_names(self, scene: str, method: str) -> list[str]:
@@ -177,17 +182,22 @@ class Outputs(Inputs):
         return [*(name for name, trajectory in settings.trajectories.items() if trajectory.parts == "all"), *lidar]
 
     def _edit_names(self, scene: str, method: str) -> Iterable[str]:
-        return scene_edits(self.config, scene) if method in self.methods_with_actors else ()
+        if method not in self.methods_with_actors:
+            return ()
+        return fitting_edits(self.config, scene, self.config.all_methods[method].tracks)
 
     def metrics_stages(self, scene: str) -> dict[str, Any]:
         """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
-        methods = self.evaluation_stages(scene, scene_methods(self.config, scene))
-        combined = (*([SCAN_BASELINES] if SCANS in methods else []), SIDE_BY_SIDE)
+        own = scene_methods(self.config, scene)
+        methods = self.evaluation_stages(scene, own)
+        rendered = any(self.renders_lidar(scene, method) for method in own)
+        combined = (*([SCAN_BASELINES] if rendered else []), SIDE_BY_SIDE)
         return {**methods, **{stage: self._stage(stage, scene) for stage in combined}}
 
     def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
         """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
-        taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
+        of_methods = (find(self.config, scene, name) for name in methods for find in (training_inputs, track_stages))
+        taken = {stage for stages in of_methods for stage in stages}
         made = (*scene_stages(self.config, scene), *sorted(taken))
         stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
         own = method_stages(self.config, scene)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from drivesplat.settings.config import Config
 from drivesplat.settings.dataset import DatasetSettings
+from drivesplat.settings.tracks import Tracks
 
 
 @dataclass(frozen=True)
@@ -21,3 +22,8 @@ class Place:
     @property
     def dataset(self) -> DatasetSettings:
         return self.config.datasets[self.dataset_name]
+
+    @property
+    def tracks(self) -> Tracks:
+        """The tracks that the method trains with; the annotated ones without a method."""
+        return self.config.all_methods[self.method].tracks if self.method else "annotated"

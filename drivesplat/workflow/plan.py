@@ -19,10 +19,11 @@ from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
+from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
-from drivesplat.workflow.named_tracks import refuse_wrong_tracks, track_references
+from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import idle_variants
@@ -75,14 +76,14 @@ class Plan(Outputs):
         return self._device(wildcards.scene)[0]
 
     def track_references(self, wildcards: Any) -> str:
-        """The tracks that a scene's settings name as canonical JSON. A resource, not a param: it changes no result of
-        the stages that check it."""
-        references = track_references(self.config, wildcards.scene, self.targets)
+        """Those of a job's tracks that a scene's settings name, as canonical JSON. A resource, not a param: it changes
+        no result of the stages that check it."""
+        references = track_references(self.config, wildcards.scene, self.targets, self.tracks(wildcards))
         return canonical_json(references.model_dump(mode="json"))
 
     def refuse_wrong_tracks(self, jobs: Iterable[Any]) -> None:
         """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that settings name."""
-        refuse_wrong_tracks(self.config, jobs, self.scene)
+        refuse_wrong_tracks(self.config, jobs, self.shown_scene)
 
     def _device(self, scene: str) -> tuple[str, int]:
         """The device of a scene's jobs as canonical JSON, and how many GPUs each takes."""
@@ -136,7 +137,7 @@ class Plan(Outputs):
             raise ConfigError(
                 f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: {known}"
             )
-        if len(path) > 1 and path[0] not in (*self.config.all_methods, "masks"):
+        if len(path) > 1 and path[0] not in (*self.config.all_methods, *OTHER_TRACKS, "masks"):
             more = f"; for the ablation: {ablation.job.name_pattern}" if self.config.ablated else ""
             meant = suggestion(path[0], self.config.methods)
             raise ConfigError(f"method {path[0]!r} is not in the config; {meant}there are: {known}{more}")
@@ -167,7 +168,7 @@ class Plan(Outputs):
             self._refuse_without_moving_parts(method)
         if edit is not None:
             self._refuse_without_actors(method)
-            self._refuse_unknown_edit(scene, edit)
+            self._refuse_unknown_edit(scene, method, edit)
         if film not in (path[-1], *self._film_names(scene, method)):
             raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
 
@@ -186,7 +187,7 @@ class Plan(Outputs):
             )
         if kind == EDITS:
             self._refuse_without_actors(method)
-            self._refuse_unknown_edit(scene, name)
+            self._refuse_unknown_edit(scene, method, name)
             return
         trajectories = for_scene(self.config, scene).render.trajectories
         if name not in trajectories:
@@ -215,9 +216,10 @@ class Plan(Outputs):
                 "(docs/lidar.md; presets/lidar.yaml adds street_lidar)"
             )
 
-    def _refuse_unknown_edit(self, scene: str, edit: str) -> None:
+    def _refuse_unknown_edit(self, scene: str, method: str, edit: str) -> None:
         if edit not in scene_edits(self.config, scene):
             raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
+        refuse_other_tracks(self.config, scene, method, edit)
 
     def refuse_download(self, targets: list[str]) -> None:
         """Raises ConfigError if nuScenes mini is a target and may not be downloaded."""

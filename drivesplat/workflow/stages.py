@@ -22,7 +22,7 @@ from drivesplat.settings.images import ParserJob
 from drivesplat.settings.inspection import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
-from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, RegionJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob
 from drivesplat.settings.scans import ScansJob
@@ -30,6 +30,7 @@ from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.workflow import film_fields
 from drivesplat.workflow.film_names import no_such_edit, scene_edits
+from drivesplat.workflow.named_tracks import fitting_edits, shows_subject
 from drivesplat.workflow.place import Place
 from drivesplat.workflow.without_cameras import (
     CAMERA_STAGES,
@@ -115,6 +116,15 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
 
+def track_stages(config: Config, scene: str, method: str) -> list[str]:
+    """The stages of a scene that give a method its tracks where these are not the annotated ones."""
+    tracks = config.all_methods[method].tracks
+    if tracks == "annotated":
+        return []
+    found = [SCANS, "discover"] if tracks == "discovered" else []
+    return [*found, "relabel", *(["regions"] if has_cameras(config, scene) else [])]
+
+
 def idle_variants(config: Config, scene: str) -> list[str]:
     """The variants of the ablation that have the training settings of the whole method on a scene."""
     job = config.ablation.job
@@ -180,6 +190,7 @@ def _training(at: Place) -> dict[str, Any]:
 
 def _evaluation(at: Place) -> dict[str, Any]:
     return {
+        "tracks": at.tracks,
         "lidar": _record("lidar_depth", at),
         "lpips": at.config.lpips.enabled,
         "removal": at.config.removal if at.dataset.world else None,
@@ -193,21 +204,24 @@ def _viewer(at: Place) -> dict[str, Any]:
         "gaussians": export.viewer_gaussians,
         "time_s": export.time_s,
         "image_width": export.viewer_images,
-        "edits": scene_edits(at.config, at.scene) if editable else {},
+        "edits": fitting_edits(at.config, at.scene, at.tracks) if editable else {},
         "methods": tuple(sorted(at.config.methods)),
     }
 
 
 def _subject(at: Place) -> dict[str, Any]:
-    """The vehicle that the user selected for the scene."""
-    return {"subject": at.config.subjects.get(at.scene, SubjectSettings())}
+    """The vehicle that the user selected for the scene, if its track is one of those that pictures of the method
+    show."""
+    subject = at.config.subjects.get(at.scene, SubjectSettings())
+    return {"subject": subject if shows_subject(subject, at.tracks) else SubjectSettings()}
 
 
 def _world(at: Place) -> dict[str, Any]:
     """Raises ConfigError where an edit whose truth is asked for does not exist."""
     world, edits = at.dataset.world, scene_edits(at.config, at.scene)
     assert world is not None
-    wanted = edits if world.truth.edits is None else world.truth.edits
+    of_labels = fitting_edits(at.config, at.scene, "annotated")
+    wanted = of_labels if world.truth.edits is None else world.truth.edits
     for name in wanted:
         if name not in edits:
             raise ConfigError(no_such_edit(at.scene, name, edits))
@@ -228,6 +242,8 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "lidar_seed": (SeedJob, _nothing),
     "parser": (ParserJob, _nothing),
     "masks": (MaskJob, _nothing),
+    "relabel": (Settings, _nothing),
+    "regions": (RegionJob, _nothing),
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
     "lidar_depth": (LidarDepthJob, _lidar_depth),
     "free_space": (FreeSpaceJob, lambda at: _lidar(at, "own_car_radius", "box_margin")),
@@ -238,7 +254,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "lidar_film": (LidarFilmJob, film_fields.encoding),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
-    "evaluate_scans": (EvaluateScansJob, _nothing),
+    "evaluate_scans": (EvaluateScansJob, lambda at: {"tracks": at.tracks}),
     "scene_metrics": (Settings, _nothing),
     "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
     "tracks": (TracksJob, _nothing),

@@ -5,14 +5,15 @@ from collections.abc import Iterable, Sequence
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.report import HELD_OUT_PAIR, LOOKS
+from drivesplat.settings.tracks import OTHER_TRACKS
 
 LIDAR_SCENE_STAGES = ("extract", "parser", "scene_metrics")
 LIDAR_METHOD_STAGES = ("train", "evaluate_scans")
 """The stages behind the metrics.json of a scene without cameras, of the scene and of each of its methods."""
 CAMERA_STAGES = (
-    "own_car", "refine_poses", "lidar_seed", "masks", "lidar_depth", "evaluate", "ablation", "tracks", "film",
-    "film_parts", "compare", "edit", "quad", "drive_folder", "ghost_panel", "remove_actor", "far_gaussians", "export",
-    "export_usd", "export_viewer", "export_colmap", "export_spz", "export_sog",
+    "own_car", "refine_poses", "lidar_seed", "masks", "regions", "lidar_depth", "evaluate", "ablation", "tracks",
+    "film", "film_parts", "compare", "edit", "quad", "drive_folder", "ghost_panel", "remove_actor", "far_gaussians",
+    "export", "export_usd", "export_viewer", "export_colmap", "export_spz", "export_sog",
 )  # fmt: skip
 """Stages that need images."""
 IMAGE_RESULTS = (
@@ -63,7 +64,7 @@ def refuse_image_results(config: Config, scene: str, path: Sequence[str], films:
     LiDAR, or needs images; `films` are the names of films."""
     if has_cameras(config, scene):
         return
-    name, *rest = path
+    name, *rest = path[1:] if path[0] in OTHER_TRACKS and len(path) > 1 else path
     if name in config.all_methods and not _renders_lidar(config, scene, name):
         able = ", ".join(scene_methods(config, scene)) or "none (presets/lidar.yaml adds one)"
         raise ConfigError(

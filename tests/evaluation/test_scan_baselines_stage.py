@@ -46,5 +46,7 @@ def test_without_a_training_scan_there_are_no_figures_and_a_reason():
 def test_metrics_have_the_baselines_where_there_are_any():
     one = {"scene": "a", "dataset": "d", "protocol": {}, "drive": {}, "result": {"gaussians": 1}}
     assert "lidar_baselines" not in side_by_side({"vanilla": one})
+    assert "tracks_quality" not in side_by_side({"vanilla": one}, None, None), "nothing is annotated"
+    assert side_by_side({"vanilla": one}, tracks_quality={"all": {}})["tracks_quality"] == {"all": {}}
     measured = {"baselines": {"nearest_scan": {"interpolation": {}}}}
     assert side_by_side({"vanilla": one}, measured)["lidar_baselines"] == measured["baselines"]

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers import REPOSITORY
 
+from drivesplat.discovery.record import read_discovered
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.lpips_map import load_alexnet
@@ -47,6 +48,9 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "scene_refined.json": (read_scene, "refine_poses"),
     "own_car.json": (read_ego_mask, "own_car"),
     "masks.json": (lambda path: read_masks_record(path.parent), "masks"),
+    "discovered.json": (read_discovered, "discover"),
+    "discovered/scene.json": (read_scene, "relabel"),
+    "unlabelled/masks/masks.json": (lambda path: read_masks_record(path.parent), "regions"),
     "seed.ply": (lambda path: read_ply(path, "lidar_seed"), "lidar_seed"),
     "parser.pkl": (read_training_record, "parser"),
     "actors.npz": (read_actors, "actors"),
@@ -109,13 +113,14 @@ CASES = [(name, kind) for name in READERS for kind in (*BROKEN, *FOREIGN) if (na
 @pytest.mark.parametrize(("name", "kind"), CASES)
 def test_every_reader_stops_names_file_and_rule_and_executes_nothing(tmp_path, name, kind):
     (read, rule), path = READERS[name], tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
     write(path, kind)
     with pytest.raises(ResultError) as error:
         read(path)
     message = str(error.value)
     assert message.startswith(f"{path}: ") and f"delete it and rerun: the rule '{rule}' rebuilds it" in message
     assert "\n" not in message
-    assert not (tmp_path / "executed").exists()
+    assert not (path.parent / "executed").exists()
 
 
 @pytest.mark.parametrize("kind", BROKEN)
@@ -148,7 +153,7 @@ def test_no_script_reads_results_but_by_a_reader_that_is_tested():
         "read_triangulated",
         "read_summary",
     }
-    tested |= {"read_checkpoint", "read_evaluations", "read_baselines", "read_backbone", "read_far"}
+    tested |= {"read_checkpoint", "read_evaluations", "read_baselines", "read_backbone", "read_far", "read_discovered"}
     used = {
         name.name
         for path in (REPOSITORY / "workflow_scripts").glob("*.py")

@@ -54,7 +54,7 @@ def default_things() -> list[Thing]:
 @dataclass
 class World:
     """The recording: `speed` of the ego vehicle in m/s, images of `width` x `height` pixels, dimmed by `light`, so many
-    of them and of LiDAR sweeps between two key frames."""
+    of them and of LiDAR sweeps between two key frames. With `rings` LiDAR is denser, and returns say their beam."""
 
     scenes: tuple[str, ...] = ("0001",)
     key_frames: int = 10
@@ -63,6 +63,7 @@ class World:
     speed: float = 4.0
     sweeps_between: int = 1
     lidar_between: int = 0
+    rings: bool = False
     light: float = 1.0
     version: str = "v1.0-mini"
     things: list[Thing] = field(default_factory=default_things)
@@ -226,7 +227,9 @@ def cast_image(world: World, seconds: float) -> np.ndarray:
 
 def cast_lidar(world: World, seconds: float) -> np.ndarray:
     """Returns (n, 5) float32 in the sensor's frame, as nuScenes stores them."""
-    azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 1.5)), np.radians(np.linspace(-28, 10, 24)))
+    step, beams = (0.75, 32) if world.rings else (1.5, 24)
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, step)), np.radians(np.linspace(-28, 10, beams)))
+    numbers = np.repeat(np.arange(beams), azimuth.shape[1]) if world.rings else np.ones(azimuth.size)
     rays = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
     )
@@ -235,8 +238,8 @@ def cast_lidar(world: World, seconds: float) -> np.ndarray:
     hit = distance < 70.0
     points = rays[hit] * distance[hit, None]
     ego_mask = np.array([[0.5, 0.3, -0.4], [-0.5, -0.2, -0.5]])
-    points = np.concatenate([ego_mask, points])
-    return np.column_stack([points, np.full((len(points), 2), 1.0)]).astype(np.float32)
+    points, rings = np.concatenate([ego_mask, points]), np.concatenate([[1.0, 1.0], numbers[hit]])
+    return np.column_stack([points, np.ones(len(points)), rings]).astype(np.float32)
 
 
 def cast(world: World, origin: np.ndarray, rays: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:

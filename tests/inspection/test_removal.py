@@ -13,7 +13,7 @@ from scipy.ndimage import convolve
 
 from drivesplat.inspection.removal import RemovalPair, figures, remove_actor
 from drivesplat.inspection.rendered_view import TrainedDrive
-from drivesplat.model.part import Part
+from drivesplat.model.part import Part, RigidGroup
 from drivesplat.model.removal import removal_of
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
@@ -77,6 +77,25 @@ def test_of_an_object_without_an_actor_the_box_is_emptied():
     model = model_of(round_gaussians([box.object_to_world[:3, 3]]), Own(round_gaussians([[0.0, 0.0, 0.0]]), "another"))
     removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
     assert removal.by == "box" and removal.removed.tolist() == [True, False]
+
+
+class Discovered(Own):
+    """An object that no annotated track knows."""
+
+    def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
+        return {self._track_id: RigidGroup(self.at(time), None)}
+
+
+@pytest.mark.parametrize(("outside", "by"), [(1, "actor"), (3, "box")])
+def test_a_discovered_object_is_removed_as_a_whole_if_most_of_it_lies_in_the_box(outside, by):
+    """Two of its Gaussians lie in the box, and so many do not."""
+    box = turned_box()
+    middle = box.object_to_world[:3, 3]
+    found = Discovered(round_gaussians([middle, middle, *[middle + 9.0] * outside]), "found_0001")
+    model = model_of(round_gaussians([middle]), found, Discovered(round_gaussians([middle + 30.0]), "found_0002"))
+    removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
+    own = [True] * (2 + outside) if by == "actor" else [True, True, *[False] * outside]
+    assert removal.by == by and removal.removed.tolist() == [by == "box", *own, False]
 
 
 def test_an_actor_without_gaussians_is_not_removed_by_its_box():

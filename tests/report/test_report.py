@@ -38,7 +38,7 @@ def test_a_row_has_the_figures_of_both_groups(write):
     report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061"), NO_LOGS)
     assert report["rows"] == [
         {
-            "scene": "0061", "dataset": "nuscenes", "method": "vanilla",
+            "scene": "0061", "dataset": "nuscenes", "method": "vanilla", "tracks": "annotated",
             "interpolation_static": 24.0, "interpolation_vehicle": 19.0, "interpolation_moving_vehicle": 17.0,
             "interpolation_gap_db": 7.0, "interpolation_moving_human": None, "interpolation_human_gap_db": None,
             "interpolation_psnr": 23.0,
@@ -331,7 +331,7 @@ def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
         "ssim", "lpips",
     )  # fmt: skip
     assert list(rows[0]) == [
-        "scene", "dataset", "method",
+        "scene", "dataset", "method", "tracks",
         *(f"interpolation_{name}" for name in figures), *(f"extrapolation_{name}" for name in figures),
         "gaussians", "train_seconds",
     ]  # fmt: skip
@@ -514,3 +514,51 @@ def test_a_scene_without_cameras_stands_beside_scenes_with_one(write):
         "vanilla": 1, "with_lidar": None
     }  # fmt: skip
     assert "with_lidar" in console_table(report)
+
+
+# ---- methods with other tracks than the annotated ones
+
+
+@pytest.fixture
+def without_labels(write):
+    """A report of a static method, of one with discovered tracks and of one without any."""
+    methods = {
+        "vanilla": VANILLA_A,
+        "found": {**method(group(24.0, 22.0), group(22.0, 20.0)), "tracks": "discovered"},
+        "blind": {**method(group(24.0, 18.0), group(22.0, 15.0)), "tracks": "none"},
+    }
+    return gap_report([write(metrics("0061", methods))], expecting("0061", methods=tuple(methods)), NO_LOGS)
+
+
+def test_rows_say_which_tracks_a_method_trained_with_and_older_ones_had_annotated_ones(without_labels, tmp_path):
+    assert [row["tracks"] for row in without_labels["rows"]] == ["annotated", "discovered", "none"]
+    assert [mean["tracks"] for mean in without_labels["means"]] == ["annotated", "discovered", "none"]
+    write_figures(tmp_path / "gap_report.csv", without_labels)
+    with open(tmp_path / "gap_report.csv", newline="", encoding="utf-8") as file:
+        assert [row["tracks"] for row in csv.DictReader(file)] == ["annotated", "discovered", "none"]
+
+
+def test_the_share_of_the_gap_that_a_method_without_labels_closes_is_that_of_any_other(without_labels):
+    """Of 7 dB of vanilla, 24 - 17, `found` closes 5 and `blind` one."""
+    closed = {item["method"]: item["interpolation"]["fraction"] for item in without_labels["gap_closed"]}
+    assert closed == {"found": pytest.approx(5 / 7), "blind": pytest.approx(1 / 7)}
+    lines = summary_sentences(without_labels)
+    assert any(line.startswith("found (discovered tracks), ") and "71 % of its gap" in line for line in lines)
+    assert any(line.startswith("blind (no tracks), ") for line in lines)
+    assert any(line.startswith("vanilla, ") for line in lines)
+
+
+def test_tables_have_a_column_of_tracks_where_one_is_not_annotated(without_labels, report):
+    assert "discovered" in gap_table(without_labels) and "tracks" not in gap_table(report)
+    with_labels, page = report_page(report, {}), report_page(without_labels, {})
+    heads = '<button type="button">tracks</button>'
+    assert page.count(heads) == 2 and heads not in with_labels
+    assert page.count('<td class="name">discovered</td>') == 2 and page.count('colspan="3"></th>') == 2
+    assert 'colspan="3"></th>' not in with_labels
+
+
+def test_unknown_tracks_are_left_out_and_named(write):
+    methods = {"vanilla": {**VANILLA_A, "tracks": "guessed"}}
+    report = gap_report([write(metrics("0061", methods))], expecting("0061"), NO_LOGS)
+    (left_out,) = report["left_out"]
+    assert "the tracks of vanilla are 'guessed'" in left_out["why"] and not report["rows"]

@@ -18,8 +18,12 @@ LOOKS = (
     "tracks", "film", "compare", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd",
     "export_viewer", "export_colmap", "export_spz", "export_sog", "lidar_picture", "lidar_film",
 )  # fmt: skip
-OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "tracks", "compare")
-STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "train", "evaluate", *LOOKS)
+OF_SCENES = (
+    *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "tracks", "compare",
+)  # fmt: skip
+STAGES = (
+    *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "train", "evaluate", *LOOKS,
+)  # fmt: skip
 PUBLISHED = {"source": "A paper", "url": "https://example.org", "scene": "0061", "method": "M", "psnr": 20.0}
 
 
@@ -348,7 +352,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
             "extract own_car evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer",
         ),
         (at("sweeps", True), "extract evaluate"),
-        (at("images.width", 320), "lidar_seed parser masks actors lidar_depth evaluate"),
+        (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate"),
         (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
         (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
         (at("holdout.last_block", 0), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),

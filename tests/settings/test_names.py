@@ -22,6 +22,8 @@ BAD_NAMES = {
     "</script>": "cannot name a folder: use letters",
     "": "cannot name a folder: use letters",
     "masks": "results of the workflow are called so",
+    "discovered": "results of the workflow are called so",
+    "unlabelled": "results of the workflow are called so",
     "metrics.json": "results of the workflow are called so",
     "scene.json": "results of the workflow are called so",
     "gap_report.html": "results of the workflow are called so",

@@ -46,6 +46,7 @@ def trained(results: Path, scene: str, method: str, seconds: float, **more: Any)
         ("demo_world/demo.tsv", JobId("demo_world", film="demo")),
         ("0103/extract.tsv", JobId("extract", "0103")),
         ("0103/metrics.tsv", JobId("scene_metrics", "0103")),
+        ("0103/discovered/actors.tsv", JobId("actors", "0103", film="discovered")),
         ("0103/street/train.tsv", JobId("train", "0103", "street")),
         ("0103/street/film_lateral_2m.tsv", JobId("film", "0103", "street", "lateral_2m")),
         ("0103/street/film_parts.tsv", JobId("film_parts", "0103", "street")),

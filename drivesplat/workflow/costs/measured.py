@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
+from drivesplat.settings.tracks import OTHER_TRACKS
+
 BENCHMARKS = "benchmarks"
 """The folder of benchmark files in that of the results."""
 TRAIN, FILM, EDIT, QUAD, FILM_PARTS, WORLD = "train", "film", "edit", "quad", "film_parts", "demo_world"
@@ -20,7 +22,8 @@ RENAMED = {"metrics": "scene_metrics"}
 @dataclass(frozen=True)
 class JobId:
     """The identity of a job: stage, scene, method, and name of its film, edit or folder, each empty where it has
-    none. For the job that generates a synthetic world, `film` is the dataset."""
+    none. For the job that generates a synthetic world, `film` is the dataset; for a job about other tracks than the
+    annotated ones, the folder of its results."""
 
     stage: str
     scene: str = ""
@@ -33,6 +36,8 @@ class JobId:
         *place, name = benchmark.with_suffix("").parts
         if place == [WORLD]:
             return cls(WORLD, film=name)
+        if place and place[-1] in OTHER_TRACKS:
+            return cls(name, place[0], film=place[-1])
         scene, method = [*place, "", ""][:2]
         for stage in (FILM, EDIT, QUAD, DRIVE, SCANS):
             if method and name.startswith(f"{stage}_") and name != FILM_PARTS:

@@ -22,6 +22,7 @@ from drivesplat.workflow.costs.estimate import (
 from drivesplat.workflow.costs.measured import BENCHMARKS, JobId, read_costs
 from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
+from drivesplat.workflow.named_tracks import edits_left_out
 from drivesplat.workflow.overridden import without_effect
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.snakemake_records import drop_foreign_records
@@ -41,13 +42,14 @@ class RunCosts:
         self._ended: threading.Event | None = None
 
     def report_settings_without_effect(self) -> None:
-        """Prints each setting that an override replaces for the scenes and methods of the targets, and methods that
-        scenes without cameras leave out. Called at planning, so that `snakemake -n` and a run with nothing to do print
-        them, too."""
+        """Prints each setting that an override replaces for the scenes and methods of the targets, methods that
+        scenes without cameras leave out, and edits whose tracks no method has. Called at planning, so that
+        `snakemake -n` and a run with nothing to do print them, too."""
         wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
         if wanted or COSTS not in self._targets:
             places = self._plan.scenes_and_methods(wanted)
-            absent = methods_left_out(self._plan.config, (scene for scene, _ in places))
+            scenes = {scene for scene, _ in places}
+            absent = [*methods_left_out(self._plan.config, scenes), *edits_left_out(self._plan.config, scenes)]
             for sentence in (*without_effect(self._plan.config, places), *absent):
                 _say(sentence)
 

@@ -1,0 +1,20 @@
+"""Where the tracks of a method come from, and where results that depend on them lie.
+
+Results for annotated tracks lie in the folder of the scene. Those for other tracks lie in folders below it, under the
+same names.
+"""
+
+from typing import Literal
+
+Tracks = Literal["annotated", "discovered", "none"]
+TRACK_FOLDERS: dict[Tracks, str] = {"annotated": "", "discovered": "discovered", "none": "unlabelled"}
+"""The folder, below that of a scene, of what depends on tracks."""
+OTHER_TRACKS = tuple(folder for folder in TRACK_FOLDERS.values() if folder)
+"""The folders of tracks that replace the annotated ones."""
+FOUND = "found_"
+"""Start of the ids of discovered tracks."""
+
+
+def tracks_in(folder: str) -> Tracks:
+    """The tracks whose results lie in `folder`, which may end with a slash."""
+    return next(tracks for tracks, name in TRACK_FOLDERS.items() if name == folder.rstrip("/"))
