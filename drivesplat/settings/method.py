@@ -33,8 +33,8 @@ class MethodSettings(Settings):
     def _actors_need_tracks(self) -> "MethodSettings":
         if self.tracks == "none" and self.object_parts:
             raise ValueError(
-                f"tracks: none leaves the part {self.object_parts[0]!r} without objects; write tracks: discovered, or drop "
-                "the part"
+                f"tracks: none leaves the part {self.object_parts[0]!r} without objects; write tracks: discovered, or "
+                "drop the part"
             )
         return self
 
