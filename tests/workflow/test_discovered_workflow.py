@@ -16,7 +16,7 @@ from drivesplat.scene.scene import read_scene
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("discovered_workflow")]
 ACTORS = ["background", "actors"]
-SUPERVISED = {"train": {"depth_weight": 0.01, "scans": {"share": 0.2}}}
+SUPERVISED = {"train": {"depth_weight": 0.01, "scans": {"per_image": 0.2}}}
 METHODS = {
     "vanilla": {"parts": ["background"]},
     "street": {"parts": ACTORS, "overrides": {"train": {"depth_weight": 0.01}}},

@@ -15,7 +15,7 @@ from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import stage_settings
 
 ACTORS = ["background", "actors"]
-SUPERVISED = {"train": {"depth_weight": 0.01, "scans": {"share": 0.2}, "floaters": {"free_space": True}}}
+SUPERVISED = {"train": {"depth_weight": 0.01, "scans": {"per_image": 0.2}, "floaters": {"free_space": True}}}
 METHODS = {
     "vanilla": {},
     "street": {"parts": ACTORS, "overrides": SUPERVISED},
