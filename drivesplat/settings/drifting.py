@@ -30,8 +30,8 @@ class DriftingSeedSettings(Settings):
     """Range of their velocities in multiples of the ego vehicle's, uniform: oncoming traffic to faster traffic."""
     spread: float = Field(2.0, ge=0)
     """Standard deviation of further horizontal velocities (m/s), for what crosses, and where the ego vehicle stands."""
-    opacity: float = Field(0.5, gt=0, lt=1)
-    """Initial opacity. Faint Gaussians would fade before they have learned their velocities."""
+    opacity: float = Field(0.1, gt=0, lt=1)
+    """Initial opacity. More opaque Gaussians learn more of what moves and cost more of the static world."""
     span: float = Field(1.0, gt=0)
     """Initial life span (seconds), at least `min_span`."""
 
@@ -45,12 +45,12 @@ class DriftingSettings(Settings):
     seed: DriftingSeedSettings = DriftingSeedSettings()
     min_span: float = Field(0.3, gt=0)
     """Minimum life span (seconds): the standard deviation of opacity over time. Shorter ones show single images."""
-    opacity_weight: float = Field(0.02, ge=0)
-    """Loss weight of the mean opacity of its Gaussians at the time of an image, beside train.opacity_reg. It leaves
-    what is static to the background. Where it is too large nothing drifts."""
+    opacity_weight: float = Field(0.0, ge=0)
+    """Loss weight of the mean opacity of its Gaussians at the time of an image, beside train.opacity_reg. It separates
+    what moves from what is static, at the cost of PSNR. Where it is too large nothing drifts."""
     lr_means: float = Field(0.01, gt=0)
     """Initial learning rate of positions (metres). It decays as that of all positions does."""
-    lr_velocities: float = Field(0.02, gt=0)
+    lr_velocities: float = Field(0.05, gt=0)
     """Initial learning rate of velocities (m/s). It decays, too."""
     lr_peaks: float = Field(0.01, gt=0)
     """Learning rate of life peaks (seconds)."""

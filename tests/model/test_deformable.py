@@ -117,7 +117,7 @@ def test_equal_nodes_are_smooth():
 
 def test_without_displacements_it_is_a_rigid_actor():
     tracks = walker(), walker("other", -2.0)
-    part = people_of(*tracks)
+    part = people_of(*tracks, fourier=5)
     rigid = actors_of(*tracks, count=40, shaken=False)
     with torch.no_grad():
         part.shared["lattice"].zero_()
@@ -146,9 +146,9 @@ def test_a_cyclist_pedals_less_often_than_a_person_steps():
 
 
 def test_the_limbs_of_who_stands_change_with_time_alone():
-    still = people_of(walker(speed=0.0), fourier=1)
-    assert torch.equal(in_box(still, 0.3), in_box(still, 2.9))
-    gestures = people_of(walker(speed=0.0))
+    still = people_of(walker(speed=0.0))
+    assert torch.equal(in_box(still, 0.3), in_box(still, 2.9)), "the default"
+    gestures = people_of(walker(speed=0.0), fourier=5)
     assert (in_box(gestures, 0.3) - in_box(gestures, 2.9)).norm(dim=1).median() > 0.05
 
 
@@ -238,7 +238,7 @@ def test_a_placement_that_stands_has_no_velocity_and_one_that_walks_on_the_spot_
 
 
 def test_penalties_grow_with_displacements_and_their_order():
-    part = people_of(walker())
+    part = people_of(walker(), fourier=5)
     squared_orders = [1, 1, 4, 4, 9, 9, 1, 4, 9, 16]
     assert part.shared["lattice"].shape[1] == len(squared_orders)
     sizes = []
