@@ -12,6 +12,7 @@ from drivesplat.discovery.clusters import Chain, Cluster, chains_of, clusters_of
 from drivesplat.discovery.ends import Ends
 from drivesplat.discovery.merging import merged, united
 from drivesplat.discovery.seen_empty import seen_empty
+from drivesplat.discovery.separation import separated
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
 
@@ -39,6 +40,12 @@ AROUND, LOWEST = 3.0, 5.0
 """Metres around an object in which the lowest returns, by percentile, are the ground."""
 
 
+MAX_SEPARATIONS = 8
+"""Rounds in which boxes and the returns that belong to them are found by turns."""
+Boxed = tuple[Chain, Discovered]
+"""A chain and its box."""
+
+
 def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     """The moving objects in the scans of one LiDAR, which are in order of time, in the order in which they appear."""
     moving = seen_empty(scans)
@@ -46,18 +53,33 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     around = Surroundings(scans, moving)
     chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and around.confirm(chain)]
     ends = Ends(scans)
-    found = [ends.followed(item) for item in _without_overlaps(chains, around)]
+    found = [ends.followed(item) for item in _apart(_without_overlaps(chains, around), around)]
     return sorted(found, key=lambda it: it.seconds[0])
 
 
-def _without_overlaps(chains: Sequence[Chain], around: "Surroundings") -> list[Discovered]:
-    """The boxes of chains; chains whose boxes overlap while both move are one object."""
+def _apart(boxes: Sequence[Boxed], around: "Surroundings") -> list[Discovered]:
+    """The boxes of chains, refined by turns with the returns that belong to each, until these stay."""
+    for _ in range(MAX_SEPARATIONS if boxes else 0):
+        before = [_counts(chain) for chain, _ in boxes]
+        chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= MIN_SCANS]
+        if [_counts(chain) for chain in chains] == before:
+            break
+        boxes = [(chain, fitted_box(chain, around.grounds(chain))) for chain in chains]
+    return [box for _, box in boxes]
+
+
+def _counts(chain: Chain) -> list[tuple[int, int]]:
+    return [(cluster.scan, len(cluster.points)) for cluster in chain.clusters]
+
+
+def _without_overlaps(chains: Sequence[Chain], around: "Surroundings") -> list[Boxed]:
+    """The chains with their boxes; chains whose boxes overlap while both move are one object."""
     boxes = [(chain, fitted_box(chain, around.grounds(chain))) for chain in chains]
     while True:
         pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if overlap(boxes[i][1], boxes[j][1]))
         pair = next(pairs, None)
         if pair is None:
-            return [box for _, box in boxes]
+            return boxes
         whole = united(*(boxes[k][0] for k in pair))
         boxes = [it for k, it in enumerate(boxes) if k not in pair]
         boxes.append((whole, fitted_box(whole, around.grounds(whole))))

@@ -117,6 +117,10 @@ class Deformable(Actors):
         basis = torch.stack([self.basis(state)[self._known.index(placements[0].source)] for state in states])
         return torch.cat([torch.ones_like(basis[:, :1]), basis], dim=1)
 
+    @property
+    def decaying(self) -> tuple[str, ...]:
+        return (*super().decaying, "stride", "phase", *self._field_names)
+
     def learning_rates(self) -> dict[str, float]:
         own = {"stride": self._gait.lr_stride, "phase": self._gait.lr_phase}
         return {**super().learning_rates(), **own, **dict.fromkeys(self._field_names, self._field.learning_rate)}

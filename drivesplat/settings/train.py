@@ -107,8 +107,9 @@ class DeformableSettings(ActorSettings):
     with the distance walked and with time (docs/street.md)."""
 
     fourier: int = Field(1, ge=1, le=16)
-    """Number of Fourier coefficients over time of every colour coefficient, and of shapes beside the gait. 1 = colours are
-    constant in time, and shapes change with the gait alone: who stands does not move. More overfit (docs/measured.md)."""
+    """Number of Fourier coefficients over time of every colour coefficient, and of shapes beside the gait. 1 = colours
+    are constant in time, and shapes change with the gait alone, so that who stands does not move. More of them overfit
+    (docs/measured.md)."""
     field: FieldName = "lattice"
     """What deforms them."""
     out_of_box_weight: float = Field(0.0, ge=0)

@@ -136,10 +136,11 @@ def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: flo
     """Sets the learning rates after the fraction `done` of the training. Those of positions and cameras decay
     exponentially, and that of exposures is 0 until they start; the others are constant."""
     decay = DECAY**done
-    for part, group in zip(model.parts, optimizers.parts, strict=True):
+    for part, *groups in zip(model.parts, optimizers.parts, optimizers.shared, strict=True):
         rates = part.learning_rates()
-        for name in (name for name in part.decaying if name in group):
-            group[name].param_groups[0]["lr"] = rates[name] * decay
+        for group in groups:
+            for name in (name for name in part.decaying if name in group):
+                group[name].param_groups[0]["lr"] = rates[name] * decay
     begins = {"exposure": settings.exposure.start, "camera_poses": 0.0}
     for name, start in begins.items():
         for camera, optimizer in optimizers.beside_parts.get(name, {}).items():
