@@ -7,6 +7,7 @@ from helpers.hand_made import actors_of, motion_through, track_of
 
 from drivesplat.kernels import triton_support
 from drivesplat.model.background import Background
+from drivesplat.model.deformable import Deformable
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import GaussianSettings, TrainSettings
@@ -89,3 +90,18 @@ def test_steps_at_device_rates_equal_those_of_adam(kernels, monkeypatch):
         ends.append({name: value.cpu() for name, value in model.state_dict().items()})
     for name, value in ends[1].items():
         torch.testing.assert_close(ends[0][name], value, atol=1e-5, rtol=1e-4, msg=lambda text, name=name: name + text)
+
+
+def test_rates_decay_that_parts_name_among_their_own_and_their_shared_parameters():
+    """Gaussians that shake to the end are blurred."""
+    settings = TrainSettings()
+    track = track_of(motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 0.0]] * 3), "walker", (1.0, 1.0, 1.0))
+    points, colors = np.random.default_rng(0).uniform(-0.4, 0.4, (2, 20, 3))
+    people = Deformable.from_points([track], [points], [colors + 0.5], settings.deformable, settings.gaussians)
+    optimizers = make_optimizers(model := SplatModel([people], None))
+    first = people.learning_rates()
+    set_learning_rates(model, optimizers, 0.5, settings)
+    (own,), (shared,) = optimizers.parts, optimizers.shared
+    for name, optimizer in {**own, **shared}.items():
+        decays = name in ("means", "lattice", "stride", "phase")
+        assert optimizer.param_groups[0]["lr"] == pytest.approx((0.1 if decays else 1.0) * first[name]), name
