@@ -34,6 +34,7 @@ def removal_of(model: SplatModel, gaussians: Gaussians, box: Box, margin: float)
         return Removal(own, "actor")
     centres = gaussians.means.detach().cpu().double().numpy()
     inside = torch.from_numpy(box.contains(centres, margin)).to(gaussians.means.device)
-    objects = (model.of_track(name) for name in model.rigid_groups(0.0))
+    known = [name for part in model.parts if part.has_objects for name in part.rigid_groups(0.0)]
+    objects = (model.of_track(name) for name in known)
     there = [rows for rows in objects if rows is not None and rows.any() and inside[rows].float().mean() > MOSTLY]
     return Removal(torch.stack(there).any(dim=0), "actor") if there else Removal(inside, "box")

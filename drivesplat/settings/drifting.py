@@ -31,7 +31,7 @@ class DriftingSeedSettings(Settings):
     spread: float = Field(2.0, ge=0)
     """Standard deviation of further horizontal velocities (m/s), for what crosses, and where the ego vehicle stands."""
     opacity: float = Field(0.1, gt=0, lt=1)
-    """Initial opacity. More opaque Gaussians learn more of what moves and cost more of the static world."""
+    """Initial opacity. More opaque Gaussians learn more of moving objects and cost more of the static world."""
     span: float = Field(1.0, gt=0)
     """Initial life span (seconds), at least `min_span`."""
 
@@ -47,7 +47,7 @@ class DriftingSettings(Settings):
     """Minimum life span (seconds): the standard deviation of opacity over time. Shorter ones show single images."""
     opacity_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean opacity of its Gaussians at the time of an image, beside train.opacity_reg. It separates
-    what moves from what is static, at the cost of PSNR. Where it is too large nothing drifts."""
+    moving from static content, at the cost of PSNR. Where it is too large nothing drifts."""
     lr_means: float = Field(0.01, gt=0)
     """Initial learning rate of positions (metres). It decays as that of all positions does."""
     lr_velocities: float = Field(0.05, gt=0)

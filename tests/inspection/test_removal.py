@@ -82,6 +82,8 @@ def test_of_an_object_without_an_actor_the_box_is_emptied():
 class Discovered(Own):
     """An object that no annotated track knows."""
 
+    has_objects = True
+
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         return {self._track_id: RigidGroup(self.at(time), None)}
 
