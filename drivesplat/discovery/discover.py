@@ -38,8 +38,6 @@ BESIDE, KERB = 0.2, 0.3
 """Metres around a cluster, and above the ground, where returns are counted for it."""
 AROUND, LOWEST = 3.0, 5.0
 """Metres around an object in which the lowest returns, by percentile, are the ground."""
-
-
 MAX_SEPARATIONS = 8
 """Rounds in which boxes and the returns that belong to them are found by turns."""
 Boxed = tuple[Chain, Discovered]

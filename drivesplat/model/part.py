@@ -92,7 +92,7 @@ class Part(nn.Module, ABC):
     geometry: tuple[str, ...] = GEOMETRY
     """Those of `params` that both images and LiDAR scans fit."""
     decaying: tuple[str, ...] = ("means",)
-    """Those of `params` whose learning rates decay in a training: positions, and what they follow from."""
+    """Those of `params` and `shared` whose learning rates decay in a training: positions, and what they follow from."""
     extent: float
     """Extent of its Gaussians in metres, which scales densification and the learning rate of positions."""
     cap_max: int | None = None

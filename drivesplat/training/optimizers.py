@@ -15,7 +15,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
 DECAY = 0.01
-"""Final learning rate of positions and cameras, and of all that is fine-tuned, as a fraction of the initial rate."""
+"""Final learning rate of what decays (positions, cameras, deformations, ...), and of all that is fine-tuned, as a
+fraction of the initial rate."""
 FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.3, 2.0
 """Factors of the learning rates at which the fine-tuning of positions, and of all else, begins."""
 
@@ -133,8 +134,8 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
 
 
 def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float, settings: TrainSettings) -> None:
-    """Sets the learning rates after the fraction `done` of the training. Those of positions and cameras decay
-    exponentially, and that of exposures is 0 until they start; the others are constant."""
+    """Sets the learning rates after the fraction `done` of the training. Those of cameras and of what parts name in
+    `decaying` decay exponentially, and that of exposures is 0 until they start; the others are constant."""
     decay = DECAY**done
     for part, *groups in zip(model.parts, optimizers.parts, optimizers.shared, strict=True):
         rates = part.learning_rates()

@@ -30,7 +30,8 @@ def xs_of(chain: Chain) -> list[list[float]]:
 
 
 def test_distances_count_from_the_sides_of_a_box():
-    found = beyond(box_at(0.0), cluster_at(0.0, 0.9, 1.5, -3.0))
+    box = box_at(0.0)
+    found = beyond(box, box.poses(np.array([0.5]))[0], cluster_at(0.0, 0.9, 1.5, -3.0).points)
     np.testing.assert_allclose(found, [-0.5, -0.1, 0.5, 2.0], atol=1e-6)
 
 
