@@ -27,13 +27,13 @@ MemoryPool = tuple[int, int]
 @dataclass(frozen=True)
 class CudaGraph(Generic[T]):
     """A captured graph. `replay` runs it and overwrites `result`; `needed`, the entries that each of its lists needed;
-    and `missing`, the largest number of entries that a list has ever lacked. `capacities` are those of the lists."""
+    and `most`, the largest number that each has needed in any replay. `capacities` are those of the lists."""
 
     replay: Callable[[], None]
     result: T
     needed: Int[Tensor, " lists"]
     capacities: Sequence[int]
-    missing: Int[Tensor, ""]
+    most: Int[Tensor, " lists"]
 
 
 def graphs_supported(device: torch.device) -> bool:
@@ -71,19 +71,18 @@ def capture(
     Returns None, and logs a warning that names `what`, where the capture fails.
     """
     graph, random_state = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(device)
-    missing = torch.zeros((), dtype=torch.int32, device=device)
-    needed_now = torch.zeros(len(needed), dtype=torch.int32, device=device)
+    needed_now, most = torch.zeros(2, len(needed), dtype=torch.int32, device=device)
     try:
         with capacity.planned(needed) as lists:
             graph.capture_begin(pool=pool, capture_error_mode=errors)
             try:
                 result = work()
-                for place, (entries, available) in zip(needed_now, lists, strict=True):
+                for place, (entries, _) in zip(needed_now, lists, strict=True):
                     place.copy_(entries)
-                    torch.maximum(missing, entries - available, out=missing)
+                torch.maximum(most, needed_now, out=most)
             finally:
                 graph.capture_end()
-        return CudaGraph(graph.replay, result, needed_now, [available for _, available in lists], missing)
+        return CudaGraph(graph.replay, result, needed_now, [available for _, available in lists], most)
     except Exception as error:  # of the driver, torch or Triton; the work itself is not affected
         log.warning("%s cannot be captured as a CUDA graph, which takes longer: %s", what, _first_line(error))
     _end_broken_capture(device, pool, random_state)  # after the last reference to the captured tensors

@@ -53,6 +53,12 @@ class ScanPart:
         """Azimuths, elevations and times."""
         return self.azimuths, self.elevations, self.offsets_s
 
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors that a rendering on their device reads, in a fixed order."""
+        tiles = self.borders if self.azimuths.device.type == "cpu" else self.tiles
+        return [*self.rays, self.within, *self.firings, *tiles]
+
 
 class MetPart(NamedTuple):
     """A part of a scan, the Gaussians that its rays meet, and ranges (metres) before which alpha is wanted, too."""

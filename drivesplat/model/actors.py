@@ -115,15 +115,12 @@ class Actors(Part):
         return LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
 
     @torch.no_grad()
-    def velocities(self, time: float) -> Float[Tensor, "n 3"]:
-        return self._velocities(*((state, self.poses(state)) for state in self._beside(time)))
+    def velocities_between(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Float[Tensor, "n 3"]:
+        states = TimeState(*before), TimeState(*after)
+        return self._velocities(*((state, self.poses(state)) for state in states))
 
-    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
-        return self._echoes(self.poses(self.time_state(time))) if "echoes" in self.params else None
-
-    def _beside(self, time: float) -> tuple[TimeState, TimeState]:
-        """The states HALF_STEP seconds before and after a time."""
-        return self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
+    def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
+        return self._echoes(self.poses(TimeState(*time_state))) if "echoes" in self.params else None
 
     def _velocities(
         self, before: tuple[TimeState, ObjectPoses], after: tuple[TimeState, ObjectPoses]
@@ -154,7 +151,8 @@ class Actors(Part):
 
     @torch.no_grad()
     def velocities_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Float[Tensor, "m 3"]:
-        recorded, known, sets = self._beside(time), self._known, []
+        recorded = self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
+        known, sets = self._known, []
         for chosen, rows in self._sets(placements):
             beside = []
             for number, state in enumerate(recorded):

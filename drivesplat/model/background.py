@@ -65,7 +65,7 @@ class Background(Part):
             opacities=torch.sigmoid(p["opacities"] + p["lidar_opacities"]),
         )
 
-    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
+    def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
         return self.params.get("echoes")
 
     def learning_rates(self) -> dict[str, float]:

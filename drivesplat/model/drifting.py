@@ -108,10 +108,10 @@ class Drifting(Part):
         """The life span of each Gaussian in seconds."""
         return self._settings.min_span + torch.exp(self.params["spans"])
 
-    def velocities(self, time: float) -> Float[Tensor, "n 3"]:
+    def velocities_between(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Float[Tensor, "n 3"]:
         return self.params["velocities"].detach()
 
-    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
+    def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
         return self.params.get("echoes")
 
     def learning_rates(self) -> dict[str, float]:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.scene.motion import Motion
+from drivesplat.scene.motion import HALF_STEP, Motion
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
 """The parameters of every Gaussian that images and LiDAR scans share."""
@@ -131,11 +131,22 @@ class Part(nn.Module, ABC):
 
     def velocities(self, time: float) -> Float[Tensor, "n 3"] | None:
         """The velocities of its Gaussians in the world at a time, m/s, without gradient; None for a static part."""
+        states = [self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)]
+        return None if any(state is None for state in states) else self.velocities_between(*states)
+
+    def velocities_between(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Float[Tensor, "n 3"] | None:
+        """As `velocities`, by the time states HALF_STEP seconds before and after the time. Depends on these tensors
+        alone, as `at_time_state`."""
         return None
 
     def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
         """What a LiDAR measures of its Gaussians at a time, along directions in the world (`Gaussians.echoes`); None
         for a part that was not trained with LiDAR."""
+        state = self.time_state(time)
+        return None if state is None else self.echoes_at_time_state(state)
+
+    def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
+        """As `echoes`, by a `time_state`. Depends on these tensors alone, as `at_time_state`."""
         return None
 
     def seen_by_lidar(self, gaussians: Gaussians) -> Gaussians:

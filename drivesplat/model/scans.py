@@ -37,6 +37,12 @@ class ScanView:
     def world_to_sensor(self) -> Float[Tensor, "4 4"]:
         return inverse(self.sensor_to_world)
 
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors that a rendering reads, in a fixed order."""
+        blocked = [] if self.blocked is None else [self.blocked]
+        return [self.sensor_to_world, self.linear, self.angular, *self.rays.tensors, *blocked]
+
 
 @dataclass(frozen=True)
 class ScanPicture:

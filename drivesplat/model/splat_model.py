@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,6 +18,7 @@ from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.view import View, depth_at_lines, where_seen
 from drivesplat.rasterization import Rendering, rasterize
+from drivesplat.scene.motion import HALF_STEP
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,28 @@ class Picture:
     alpha: Float[Tensor, "h w"]
     depth: Float[Tensor, "h w"] | None
     info: dict[str, Any]
+
+
+TimeStates = Sequence[Sequence[Tensor]]
+"""The time state of each part of a model."""
+
+
+class Moment(NamedTuple):
+    """The time states of all parts `now`, and HALF_STEP seconds `before` and `after`: what a scan depends on."""
+
+    now: TimeStates
+    before: TimeStates
+    after: TimeStates
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors, in a fixed order."""
+        return [values for states in self for state in states for values in state]
+
+    @staticmethod
+    def times(time: float) -> tuple[float, float, float]:
+        """The times of the moment of a time, in seconds since the first image."""
+        return time, time - HALF_STEP, time + HALF_STEP
 
 
 class SplatModel(nn.Module):
@@ -78,14 +101,28 @@ class SplatModel(nn.Module):
             found.append(replace(shown, velocities=velocities, echoes=part.echoes(time) if with_echoes else None))
         return concatenate(found)
 
-    def time_states(self, time: float) -> list[Sequence[Tensor]] | None:
+    def time_states(self, time: float) -> TimeStates | None:
         """The time state of every part: see `Part.time_state`. None where one has none."""
         states = [part.time_state(time) for part in self.parts]
         return None if any(state is None for state in states) else states
 
-    def gaussians_at_time_states(self, states: Sequence[Sequence[Tensor]]) -> Gaussians:
+    def gaussians_at_time_states(self, states: TimeStates) -> Gaussians:
         """As `gaussians_at`, by the parts' time states."""
         return concatenate([part.at_time_state(state) for part, state in zip(self.parts, states, strict=True)])
+
+    def moment(self, time: float) -> Moment | None:
+        """The time states that a scan at a time depends on; None where a part has none."""
+        now, before, after = (self.time_states(at) for at in Moment.times(time))
+        return None if now is None or before is None or after is None else Moment(now, before, after)
+
+    def gaussians_at_moment(self, moment: Moment) -> Gaussians:
+        """As `gaussians_at` with velocities and echoes, by the parts' time states."""
+        found = []
+        for part, now, before, after in zip(self.parts, *moment, strict=True):
+            shown = part.seen_by_lidar(part.at_time_state(now))
+            velocities, echoes = part.velocities_between(before, after), part.echoes_at_time_state(now)
+            found.append(replace(shown, velocities=velocities, echoes=echoes))
+        return concatenate(found)
 
     def gaussians_with_placements(
         self,

@@ -50,6 +50,11 @@ class RayGrid:
         """Azimuths, elevations and times."""
         return self.azimuths, self.elevations, self.offsets_s
 
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors that a rendering with motion reads, in a fixed order."""
+        return [*self.rays, *self.halves.tensors]
+
 
 @dataclass(frozen=True)
 class Halves:
@@ -59,6 +64,12 @@ class Halves:
     parts: list[ScanPart]
     firings: list[Int[Tensor, " _"]]
     places: Int[Tensor, " a"] | None
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors, in a fixed order."""
+        places = [] if self.places is None else [self.places]
+        return [*(values for part in self.parts for values in part.tensors), *self.firings, *places]
 
     def joined(self, parts: Sequence[CompositedScan]) -> CompositedScan:
         """What the rays of the scan measure, by that of the parts."""

@@ -16,14 +16,12 @@ from torch import Tensor
 from drivesplat.kernels import capacity, triton_support
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool, retry_without_graphs
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.splat_model import SplatModel, TimeStates
 from drivesplat.model.view import View
 from drivesplat.rendering.color_bytes import to_uint8
 
 FrameInput = tuple[View, Gaussians | None]
 """A view, and the Gaussians to render in place of the model's own at its time (None: the model's own)."""
-TimeStates = Sequence[Sequence[Tensor]]
-"""The time state of each part of a model."""
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,12 @@ class TrainingScan:
     range: Float[Tensor, "b a"]
     intensity: Float[Tensor, "b a"] | None
 
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors that an iteration reads, in a fixed order."""
+        intensity = [] if self.intensity is None else [self.intensity]
+        return [*self.view.tensors, self.measured, self.returned, self.range, *intensity]
+
 
 def load_scans(
     recorded: Sequence[RecordedScan], settings: ScanTrainingSettings, device: torch.device

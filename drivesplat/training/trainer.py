@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.kernels import torch_private
 from drivesplat.model.parameters import OFFSETS
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.splat_model import Moment, Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
@@ -20,6 +20,7 @@ from drivesplat.training.cuda_graph.iteration_graphs import (
     Terms,
     can_capture,
 )
+from drivesplat.training.cuda_graph.scan_inputs import SharedScanInputs
 from drivesplat.training.densify import Densifier
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
@@ -34,6 +35,9 @@ from drivesplat.training.optimizers import (
 from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import TrainingScan, scan_index, scan_terms
 from drivesplat.training.views import TrainingView
+
+MEASURED_SCANS = 8
+"""Iterations with scans before one is captured: they measure the entries that the lists of any scan need."""
 
 
 @dataclass
@@ -54,6 +58,7 @@ class Trainer:
     schedule: DeviceSchedule
     scan_schedule: ScanSchedule
     scans: list[TrainingScan] = field(default_factory=list)
+    scan_inputs: SharedScanInputs = field(default_factory=SharedScanInputs)
     step: int = 0
 
     @classmethod
@@ -73,9 +78,10 @@ class Trainer:
         settings = settings.model_copy(update={"iterations": schedule.fine_tuning_from})
         optimizers, known = make_optimizers(model), priors.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        capture = clock is UNTIMED and can_capture(settings, images, device, len(scans))
+        capture = clock is UNTIMED and can_capture(settings, images, device)
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
+        model.precompute([time for scan in scans for time in Moment.times(scan.view.time)])
         return cls(
             model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
             schedule, list(scans),
@@ -110,11 +116,7 @@ class Trainer:
         self._set_learning_rates()
         step, rates = self.schedule.update(self.step, self.optimizers)
         if self.fits_scan and (self.fine_tunes or not (with_picture and self.images.views)):
-            number = scan_index(len(self.scans), self.scan_schedule.scans_before(self.step), self.seed)
-            scan, fine = Recording("scan", number), self.fine_tunes
-            layout = fine, *self._addresses()
-            terms = self._captured(scan, lambda: self._learn_scan(self.scans[number], step, rates, fine), layout)
-            return terms, None, None
+            return self._fit_scan(step, rates), None, None
         with self.clock.stage("data"):
             number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
 
@@ -126,6 +128,23 @@ class Trainer:
         image = Recording("image", (self.images.factor(self.step), number))
         layout = self.images.factor(self.step), self.sh_degree(), *self._addresses()
         return self._captured(image, lambda: iteration()[0], layout), None, view
+
+    def _fit_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
+        """An iteration with the scan whose turn it is, by its CUDA graph where there is one."""
+        number, fine = (
+            scan_index(len(self.scans), self.scan_schedule.scans_before(self.step), self.seed),
+            self.fine_tunes,
+        )
+        scan = self.scans[number]
+        moment = self.model.moment(scan.view.time) if self.graphs.enabled else None
+        if moment is None:
+            return self.graphs.retry_without_graphs(lambda: self._learn_scan(scan, None, step, rates, fine))
+        inputs = self.scan_inputs.load(scan, moment)
+        recording = Recording("scan", inputs.number, MEASURED_SCANS)
+        layout = fine, *self._addresses()
+        return self._captured(
+            recording, lambda: self._learn_scan(inputs.scan, inputs.moment, step, rates, fine), layout
+        )
 
     def _set_learning_rates(self) -> None:
         if self.fine_tunes:
@@ -164,14 +183,20 @@ class Trainer:
         return self._follow(loss, terms, step, rates), picture
 
     def _learn_scan(
-        self, scan: TrainingScan, step: int | Tensor, rates: Mapping[str, Tensor] | None, fine_tunes: bool
+        self,
+        scan: TrainingScan,
+        moment: Moment | None,
+        step: int | Tensor,
+        rates: Mapping[str, Tensor] | None,
+        fine_tunes: bool,
     ) -> Terms:
-        """An iteration with a scan, as `_learn`."""
+        """An iteration with a scan at a `moment` (None: at its time), as `_learn`."""
         stage, settings = self.clock.stage, self.settings.scans
         self.model.zero_grad()
         with stage("render"):
             before = (scan.range - settings.sight_margin).clamp(min=0.0) if settings.sight_weight else None
-            picture = self.model.scan(scan.view, before=before)
+            gaussians = None if moment is None else self.model.gaussians_at_moment(moment)
+            picture = self.model.scan(scan.view, gaussians=gaussians, before=before)
         with stage("loss"):
             terms = scan_terms(picture, scan, self.model, self.settings)
             if not self.images.views:

@@ -40,7 +40,7 @@ def warm_up(folder: Path) -> None:
     points = random.uniform((-2.0, -1.0, 4.0), (2.0, 1.0, 8.0), (GAUSSIANS, 3))
     settings = TrainSettings(
         iterations=ITERATIONS, cap_max=2 * GAUSSIANS, refine_start=0.0, refine_stop=1.0, sky_bce_weight=0.05,
-        scans=ScanTrainingSettings(share=0.5),
+        scans=ScanTrainingSettings(per_image=1.0),
     )  # fmt: skip
     width, height = SIZE
     intrinsics = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])

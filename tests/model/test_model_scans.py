@@ -1,5 +1,6 @@
 """LiDAR scans of a model: what its echoes give, seen along the rays of a sensor."""
 
+import copy
 import dataclasses
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from helpers.hand_made import actors_of, motion_through, round_gaussians, track_
 from torch import nn
 
 from drivesplat.errors import ResultError
+from drivesplat.kernels import torch_private
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.scans import ScanView, group_met, scan_picture, view_of_scan
 from drivesplat.model.splat_model import SplatModel
@@ -113,6 +115,22 @@ def test_the_echoes_of_an_actor_turn_with_it():
     torch.testing.assert_close(before, echoes)
     torch.testing.assert_close(after[:, 0], echoes[:, 0])
     torch.testing.assert_close(after[:, 1:, 1], torch.tensor([0.0, 3.0, 0.0]).expand(4, 3), atol=1e-5, rtol=0)
+
+
+def test_gaussians_follow_the_moment_copied_into_the_tensors():
+    """With what they echo and how fast they move then."""
+    motion = motion_through([0.0, 2.0, 4.0], [[10.0, 0.0, 1.0], [14.0, 0.0, 1.0], [26.0, 3.0, 1.0]], [0.0, 0.5, 1.0])
+    actors = actors_of(track_of(motion), count=4)
+    actors.params["echoes"] = nn.Parameter(torch.randn(4, 4, 2, generator=torch.Generator().manual_seed(0)))
+    model = SplatModel([*walls().parts, actors], None)
+    early, late = model.moment(0.5), model.moment(3.2)
+    inputs = copy.deepcopy(early)
+    for time, moment in ((0.5, early), (3.2, late)):
+        torch_private.copy_all(inputs.tensors, moment.tensors)
+        found = model.gaussians_at_moment(inputs)
+        expected = model.gaussians_at(time, with_velocities=True, with_echoes=True)
+        assert found.tensors.keys() == expected.tensors.keys() >= {"velocities", "echoes"}
+        assert all(torch.equal(values, expected.tensors[name]) for name, values in found.tensors.items())
 
 
 def test_alpha_before_a_range_is_that_of_what_is_nearer():

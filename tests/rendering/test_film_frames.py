@@ -105,7 +105,7 @@ class Replaying(CudaGraph):
 
     def __init__(self, film: Film, room: list[int]):
         pixels = torch.full((1, 1, 3), REPLAYED, dtype=torch.uint8)
-        super().__init__(int, RenderedFrame(pixels, torch.tensor(True)), torch.tensor([0]), room, torch.tensor(0))
+        super().__init__(int, RenderedFrame(pixels, torch.tensor(True)), torch.tensor([0]), room, torch.tensor([0]))
         self.__dict__["film"] = film
 
 

@@ -32,20 +32,19 @@ class FakeGraphs:
         image = recording.index
         self.log.append(("captured", image))
         self.capacities.append([need * gaussians for need in self.graphs._needs[recording]])
-        replay = partial(self.log.append, ("replayed", image))
+        replay, needed = partial(self.log.append, ("replayed", image)), torch.tensor([self.needed], dtype=torch.int32)
         self.graphs._graphs[recording] = CudaGraph(
-            replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), [self.needed],
-            torch.tensor(0),
-        )  # fmt: skip
+            replay, {"l1": torch.tensor(float(image))}, needed, [self.needed], needed.clone()
+        )
         return self.graphs._graphs[recording]
 
-    def run(self, image, layout=0, gaussians=HUNDRED, kind="image"):
+    def run(self, image, layout=0, gaussians=HUNDRED, kind="image", runs=1):
         def iteration():
             self.log.append(("run", image))
             capacity_for(torch.tensor(self.needed))
             return {"l1": torch.tensor(float(image))}
 
-        terms = self.graphs.run(Recording(kind, image), layout, gaussians, iteration)
+        terms = self.graphs.run(Recording(kind, image, runs), layout, gaussians, iteration)
         assert float(terms["l1"]) == image
         logged = [action for action, of in self.log if of == image]
         self.log.clear()
@@ -83,12 +82,22 @@ def test_capacities_leave_headroom_for_growth(monkeypatch):
     fake.run(0, gaussians=GaussianCount(120, 1.5))
     assert [round(room) for (room,) in fake.capacities] == [5400]
     fake.needed = 4200
-    fake.graphs._graphs[Recording("image", 0)].needed[0] = fake.needed
+    fake.graphs._graphs[Recording("image", 0)].most[0] = fake.needed
     fake.run(0, gaussians=GaussianCount(140, 1.2))
     fake.run(0, layout=1, gaussians=GaussianCount(200, 2.0))
     assert [round(room) for (room,) in fake.capacities] == [5400, 2 * 200 * 4200 // 140], (
-        "the entries that it needed last"
+        "the most entries that it has needed"
     )
+
+
+def test_a_shared_graph_has_the_capacity_for_the_largest_of_several_runs(monkeypatch):
+    """Also after another layout, though no replay needed as much."""
+    fake, found = FakeGraphs(monkeypatch), []
+    for fake.needed in (3000, 5000, 2000, 1000):
+        found.append(fake.run(0, runs=3))
+    assert found == [["run"]] * 3 + [["captured", "replayed"]]
+    assert fake.run(0, layout=1, runs=3) == ["captured", "replayed"]
+    assert [round(room) for (room,) in fake.capacities] == [5000, 5000]
 
 
 def test_invalidated_graphs_are_captured_again_while_graphs_are_enabled(monkeypatch):
@@ -106,8 +115,7 @@ def test_overflowed_graphs_are_captured_anew(monkeypatch):
         fake.run(image)
     fake.graphs.check()
     assert fake.run(0) == ["replayed"]
-    fake.graphs._graphs[Recording("image", 0)].missing.add_(1)
-    fake.graphs._graphs[Recording("image", 0)].needed[0] = 7000
+    fake.graphs._graphs[Recording("image", 0)].most[0] = 7000
     fake.graphs.check()
     assert fake.run(0) == ["captured", "replayed"]
     assert [round(room) for (room,) in fake.capacities] == [3000, 3000, 7000]
@@ -120,10 +128,10 @@ def test_the_memory_pool_is_released_with_the_last_graph(monkeypatch):
     fake.graphs._pool = (0, 1)
     for image in (0, 0, 1, 1):
         fake.run(image)
-    fake.graphs._graphs[Recording("image", 0)].missing.add_(1)
+    fake.graphs._graphs[Recording("image", 0)].most.add_(1)
     fake.graphs.check()
     assert fake.graphs._pool == (0, 1)
-    fake.graphs._graphs[Recording("image", 1)].missing.add_(1)
+    fake.graphs._graphs[Recording("image", 1)].most.add_(1)
     fake.graphs.check()
     assert fake.graphs._pool is None
 
@@ -150,15 +158,16 @@ def test_which_trainings_capture_graphs(settings, device, compiles, expected, mo
     assert can_capture(chosen, TrainingImages(guided_views(), chosen, 0), torch.device(device)) == expected
 
 
-def test_classes_and_too_many_recordings_disable_graphs(monkeypatch):
+def test_classes_and_too_many_images_disable_graphs(monkeypatch):
     monkeypatch.setattr(triton_support, "compiles", lambda: True)
     views, gpu = guided_views(), torch.device("cuda")
     labelled = [dataclasses.replace(view, classes=torch.zeros_like(view.sky, dtype=torch.uint8)) for view in views]
     assert not can_capture(TrainSettings(), TrainingImages(labelled, TrainSettings(), 0), gpu)
     images = TrainingImages(views, TrainSettings(), 0)
-    monkeypatch.setattr(iteration_graphs, "MAX_RECORDINGS", len(views) + 1)
-    assert can_capture(TrainSettings(), images, gpu, scans=1)
-    assert not can_capture(TrainSettings(), images, gpu, scans=2)
+    monkeypatch.setattr(iteration_graphs, "MAX_IMAGES", len(views))
+    assert can_capture(TrainSettings(), images, gpu)
+    monkeypatch.setattr(iteration_graphs, "MAX_IMAGES", len(views) - 1)
+    assert not can_capture(TrainSettings(), images, gpu)
 
 
 def test_graphs_are_dropped_when_memory_runs_out(monkeypatch, caplog):

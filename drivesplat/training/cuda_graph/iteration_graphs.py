@@ -1,13 +1,15 @@
 """Training iterations captured as CUDA graphs and replayed: Python launches one graph in place of a thousand kernels.
 
 At 640x360 the GPU runs an iteration's hundreds of kernels faster than Python can launch them. A graph keeps the
-addresses of what it reads and writes, so it belongs to one recording, an image or a LiDAR scan, and stays valid while
-the model's tensors keep their addresses: preallocated rows let the number of Gaussians grow meanwhile. The graph of a
-recording is captured when it is used again.
+addresses of what it reads and writes, so it belongs to one image, or to the inputs that LiDAR scans of one shape are
+copied into (`scan_inputs`), and stays valid while the model's tensors keep their addresses: preallocated rows let the
+number of Gaussians grow meanwhile. A graph is captured after the first runs have shown how many entries its lists need.
 """
 
 import logging
-from collections.abc import Callable, Hashable
+import operator
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -23,17 +25,19 @@ log = logging.getLogger(__name__)
 
 Terms = dict[str, Tensor]
 T = TypeVar("T")
-MAX_RECORDINGS = 4096
-"""A training with more images and scans captures nothing: graphs hold on to cached time states, up to three for each,
-and four times as many are cached."""
+MAX_IMAGES = 4096
+"""A training with more images captures nothing: graphs hold on to cached time states, up to three for each, and four
+times as many are cached."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What an iteration fits: the `index` of an image or a LiDAR scan among those of its `kind`."""
+    """What an iteration fits: an image, or any LiDAR scan of one shape, by its `index` among those of its `kind`. It is
+    captured after so many `runs`, which measure the entries that its lists need."""
 
     kind: str
     index: Hashable
+    runs: int = 1
 
 
 @dataclass(frozen=True)
@@ -44,12 +48,10 @@ class GaussianCount:
     headroom: float
 
 
-def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.device, scans: int = 0) -> bool:
-    """Whether iterations of a training, with so many LiDAR `scans`, can and shall be captured. Densification by
-    gradient reads intermediate results of an iteration; class logits have too many values for lists of planned
-    capacity."""
-    few = len(images.views) + scans <= MAX_RECORDINGS
-    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and few
+def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.device) -> bool:
+    """Whether iterations of a training can and shall be captured. Densification by gradient reads intermediate results
+    of an iteration; class logits have too many values for lists of planned capacity."""
+    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(images.views) <= MAX_IMAGES
     return wanted and graphs_supported(device) and all(view.classes is None for view in images.views)
 
 
@@ -62,7 +64,9 @@ class IterationGraphs:
     _layouts: dict[str, Hashable] = field(default_factory=dict)
     """By kind of recording, the layout of its graphs."""
     _needs: dict[Recording, list[float]] = field(default_factory=dict)
-    """By recording, the entries per Gaussian that each of its lists last needed."""
+    """By recording, the most entries per Gaussian that each of its lists has needed."""
+    _runs: Counter[Recording] = field(default_factory=Counter)
+    """By recording, the number of runs without a graph."""
     _graphs: dict[Recording, CudaGraph[Terms]] = field(default_factory=dict)
     _count: int = 1
     _pool: MemoryPool | None = None
@@ -79,12 +83,14 @@ class IterationGraphs:
             self._layouts[recording.kind] = layout
         self._count = max(1, gaussians.now)
         graph = self._graphs.get(recording)
-        if graph is None and recording in self._needs:
+        if graph is None and self._runs[recording] >= recording.runs:
             graph = self._capture(recording, self._count * gaussians.headroom, iteration)
         if graph is None:
             with capacity.exact() as needs:
                 terms = self.retry_without_graphs(iteration)
-            self._needs[recording] = [need / self._count for need in needs]
+            now = [need / self._count for need in needs]
+            self._needs[recording] = [*map(max, now, self._needs.get(recording, now))]
+            self._runs[recording] += 1
             return terms
         graph.replay()
         return graph.result
@@ -105,10 +111,13 @@ class IterationGraphs:
         """Drops the graphs whose lists overflowed, to be captured with more capacity. Waits for the device."""
         if not self._graphs:
             return
-        missing = torch.stack([graph.missing for graph in self._graphs.values()]).tolist()
-        overflowed = [recording for recording, more in zip(self._graphs, missing, strict=True) if more > 0]
+        overflowed = [
+            recording
+            for recording, most in self._most_needed([*self._graphs]).items()
+            if any(map(operator.gt, most, self._graphs[recording].capacities))
+        ]
         if overflowed:
-            log.debug("the lists of %d CUDA graphs lacked up to %d entries", len(overflowed), max(missing))
+            log.debug("lists of %d CUDA graphs overflowed", len(overflowed))
         self._drop(overflowed)
 
     def invalidate(self) -> bool:
@@ -116,15 +125,23 @@ class IterationGraphs:
         self._drop(list(self._graphs))
         return self.enabled
 
-    def _drop(self, recordings: list[Recording]) -> None:
-        """Drops graphs and remembers the entries that their lists last needed. Waits for the device."""
+    def _drop(self, recordings: Sequence[Recording]) -> None:
+        """Drops graphs and remembers the most entries that their lists needed. Waits for the device."""
         if not recordings:
             return
-        needs = iter(torch.cat([self._graphs[recording].needed for recording in recordings]).tolist())
-        for recording in recordings:
-            self._needs[recording] = [next(needs) / self._count for _ in self._graphs.pop(recording).needed]
+        for recording, most in self._most_needed(recordings).items():
+            now = [need / self._count for need in most]
+            before = self._needs[recording] if recording.runs > 1 else now  # not every scan was replayed since
+            self._needs[recording] = [*map(max, now, before)]
+            del self._graphs[recording]
         if not self._graphs:
             self._pool = None  # torch frees it with the last graph
+
+    def _most_needed(self, recordings: Sequence[Recording]) -> dict[Recording, list[int]]:
+        """The most entries that each list of some graphs has needed. Waits for the device once."""
+        graphs = [self._graphs[recording] for recording in recordings]
+        most = torch.cat([graph.most for graph in graphs]).cpu().split([len(graph.most) for graph in graphs])
+        return {recording: needs.tolist() for recording, needs in zip(recordings, most, strict=True)}
 
     def _disable(self) -> None:
         """Drops all graphs; none will be captured any more."""

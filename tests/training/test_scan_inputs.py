@@ -1,0 +1,69 @@
+"""The inputs that captured iterations with scans share."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from helpers.trainings import CPU, scan_of_a_wall, settings_of, untrained_street
+
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.cuda_graph.scan_inputs import ScanInputs, SharedScanInputs
+from drivesplat.training.scans import TrainingScan, load_scans, scan_terms
+
+SETTINGS = settings_of(scans=ScanTrainingSettings(per_image=1.0))
+
+
+def revolution(x: float, seconds: float) -> RecordedScan:
+    """A scan of a wall by a sensor that moves and turns meanwhile; other rays return at each `seconds`."""
+    scan = scan_of_a_wall(x, intensity=0.2 + 0.1 * seconds)
+    rays = scan.scan.rays
+    offsets = np.broadcast_to(np.linspace(-0.05, 0.05, 30, dtype=np.float32), rays.offsets_s.shape)
+    rays = replace(rays, azimuths=rays.azimuths + np.float32(0.01 * seconds), offsets_s=offsets.copy())
+    returned = scan.scan.returned & (rays.elevations > 0.1 * seconds - 0.1)
+    taken = replace(scan.scan, rays=rays, returned=returned)
+    moving = {"linear": np.array([3.0, seconds, 0.0]), "angular": np.array([0.0, 0.0, 0.3])}
+    return replace(scan, seconds=seconds, scan=taken, **moving)
+
+
+def terms_of(model: SplatModel, scan: TrainingScan, inputs: ScanInputs | None = None) -> dict[str, float]:
+    """The loss terms of a scan; with `inputs` by their tensors alone."""
+    gaussians = None if inputs is None else model.gaussians_at_moment(inputs.moment)
+    picture = model.scan(scan.view, gaussians=gaussians, before=scan.range - 0.5)
+    return {name: float(value.detach()) for name, value in scan_terms(picture, scan, model, SETTINGS).items()}
+
+
+def test_scans_of_one_shape_share_their_inputs():
+    model, shared = untrained_street(SETTINGS, echo=(0.0, 2.0)), SharedScanInputs()
+    scans = load_scans([revolution(0.0, 0.4), revolution(0.6, 1.2)], SETTINGS.scans, CPU)
+    expected = [terms_of(model, scan) for scan in scans]
+    assert all(abs(expected[0][name] - expected[1][name]) > 1e-4 for name in ("scan_range", "scan_intensity"))
+    places = set()
+    for i in (0, 1, 0):
+        inputs = shared.load(scans[i], model.moment(scans[i].view.time))
+        assert terms_of(model, inputs.scan, inputs) == expected[i] and inputs.number == 0
+        places.add(tuple(values.data_ptr() for values in inputs.tensors))
+    assert len(places) == 1, "a graph keeps the addresses"
+    assert [terms_of(model, scan) for scan in scans] == expected, "the scans themselves are unchanged"
+
+
+def test_scans_of_other_shapes_have_inputs_of_their_own():
+    """Without intensity, or with rays that the vehicle blocks."""
+    model, shared, full = untrained_street(SETTINGS, echo=(0.0, 2.0)), SharedScanInputs(), revolution(0.0, 0.4)
+    blocked = full.blocked.copy()
+    blocked[3] = True
+    silent = replace(full, scan=replace(full.scan, intensities=None))
+    scans = load_scans([full, silent, replace(full, blocked=blocked), full], SETTINGS.scans, CPU)
+    numbers = [shared.load(scan, model.moment(scan.view.time)).number for scan in scans]
+    assert numbers == [0, 1, 2, 0]
+
+
+def test_a_shape_covers_every_tensor_of_a_scan():
+    """A tensor that `tensors` forgot would keep the values of the first scan."""
+    (scan,) = load_scans([revolution(0.0, 0.4)], SETTINGS.scans, CPU)
+    known = {values.data_ptr() for values in scan.tensors}
+    held = [scan.view, scan.view.rays, *scan.view.rays.halves.parts, scan]
+    for owner in held:
+        for name, value in vars(owner).items():
+            assert not isinstance(value, torch.Tensor) or value.data_ptr() in known, name
