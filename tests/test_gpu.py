@@ -518,6 +518,11 @@ def trained_with(
     return trainer, losses
 
 
+def steps_of(trainer: Trainer) -> dict[str, int]:
+    """The number of steps of each optimizer."""
+    return {name: int(optimizer.state[optimizer.parameter]["step"]) for name, optimizer in trainer.optimizers.all()}
+
+
 def continued(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
     """The loss terms of the last of so many iterations."""
     for _ in range(iterations):
@@ -533,7 +538,7 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, caplo
     assert not caplog.records, "nothing was refused"
     assert len(captured.graphs._graphs) == len(captured.images.views) and not eager.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
-    assert mine[-1] < 0.8 * mine[0]
+    assert mine[-1] < 0.8 * mine[0] and steps_of(captured) == steps_of(eager)
     before = untrained_street(captured.settings).state_dict()
     for name, value in ((name, value) for name, value in eager.model.state_dict().items() if name in before):
         moved = (value.cpu() - before[name]).abs().float()
@@ -576,6 +581,7 @@ def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, cap
     assert not caplog.records, "nothing was refused"
     assert len(captured.graphs._graphs) == len(captured.images.views) + 1 and not eager.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
+    assert steps_of(captured) == steps_of(eager), "a replay that created a state again would count from 0"
     assert mine[-1] < mine[1], "scans"
     assert beside.fine_tune or mine[-2] < mine[0], "images, with which scans take turns unless they fine-tune"
 

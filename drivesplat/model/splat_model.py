@@ -38,7 +38,7 @@ TimeStates = Sequence[Sequence[Tensor]]
 """The time state of each part of a model."""
 
 
-class Moment(NamedTuple):
+class ScanTimeStates(NamedTuple):
     """The time states of all parts `now`, and HALF_STEP seconds `before` and `after`: what a scan depends on."""
 
     now: TimeStates
@@ -52,7 +52,7 @@ class Moment(NamedTuple):
 
     @staticmethod
     def times(time: float) -> tuple[float, float, float]:
-        """The times of the moment of a time, in seconds since the first image."""
+        """The times of the three states for a scan at a time, in seconds since the first image."""
         return time, time - HALF_STEP, time + HALF_STEP
 
 
@@ -110,15 +110,15 @@ class SplatModel(nn.Module):
         """As `gaussians_at`, by the parts' time states."""
         return concatenate([part.at_time_state(state) for part, state in zip(self.parts, states, strict=True)])
 
-    def moment(self, time: float) -> Moment | None:
+    def scan_states(self, time: float) -> ScanTimeStates | None:
         """The time states that a scan at a time depends on; None where a part has none."""
-        now, before, after = (self.time_states(at) for at in Moment.times(time))
-        return None if now is None or before is None or after is None else Moment(now, before, after)
+        now, before, after = (self.time_states(at) for at in ScanTimeStates.times(time))
+        return None if now is None or before is None or after is None else ScanTimeStates(now, before, after)
 
-    def gaussians_at_moment(self, moment: Moment) -> Gaussians:
+    def gaussians_at_scan_states(self, states: ScanTimeStates) -> Gaussians:
         """As `gaussians_at` with velocities and echoes, by the parts' time states."""
         found = []
-        for part, now, before, after in zip(self.parts, *moment, strict=True):
+        for part, now, before, after in zip(self.parts, *states, strict=True):
             shown = part.seen_by_lidar(part.at_time_state(now))
             velocities, echoes = part.velocities_between(before, after), part.echoes_at_time_state(now)
             found.append(replace(shown, velocities=velocities, echoes=echoes))

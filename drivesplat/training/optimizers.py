@@ -23,10 +23,14 @@ FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.3, 2.0
 
 class Adam(torch.optim.Adam):
     """torch.optim.Adam, fused, of one parameter, for `ModelOptimizers`: the same fields and format of state. Its own
-    methods avoid torch's, whose first call imports torch's compiler, which takes a second or more."""
+    methods avoid torch's, whose first call imports torch's compiler, which takes a second or more. The state exists
+    from the beginning: a CUDA graph that captured its creation would reset it at every replay."""
 
     def __init__(self, parameter: nn.Parameter, rate: float):
         super().__init__([parameter], lr=rate, eps=1e-15, fused=True)
+        step = torch.zeros((), dtype=torch.float32, device=parameter.device)
+        moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+        self.state[parameter] = {"step": step, **moments}
 
     @property
     def parameter(self) -> nn.Parameter:
@@ -37,19 +41,9 @@ class Adam(torch.optim.Adam):
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         self.param_groups.append({**self.defaults, **param_group})
 
-    def initialized(self) -> dict[str, Tensor]:
-        """The state of the parameter, created on first use."""
-        parameter = self.parameter
-        state = self.state[parameter]
-        if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        return state
-
     def state_dict(self) -> dict[str, Any]:
-        known = self.state.get(self.parameter)
         groups = [{**group, "params": [0]} for group in self.param_groups]
-        return {"state": {0: known} if known else {}, "param_groups": groups}
+        return {"state": {0: self.state[self.parameter]}, "param_groups": groups}
 
 
 Optimizers = dict[str, Adam]
@@ -84,7 +78,7 @@ class ModelOptimizers:
             parameter, (group,) = optimizer.parameter, optimizer.param_groups
             if parameter.grad is not None:
                 rate = group["lr"] if rates is None else rates[name]
-                ready.append((parameter, optimizer.initialized(), rate, group))
+                ready.append((parameter, optimizer.state[parameter], rate, group))
         if ready:
             torch_private.increment([state["step"] for _, state, _, _ in ready])
         for parameter, state, rate, group in ready:

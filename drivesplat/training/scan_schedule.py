@@ -48,7 +48,7 @@ class ScanSchedule:
     def scans_before(self, step: int) -> int:
         """The number of the first `step` iterations that fit a scan."""
         beside_images = min(step, self.fine_tuning_from) * self.scans // self.fine_tuning_from
-        return beside_images + max(0, step - self.fine_tuning_from)
+        return beside_images + min(max(0, step - self.fine_tuning_from), self.fine_tuning)
 
     def images_before(self, step: int) -> int:
         """The number of the first `step` iterations that fit an image."""

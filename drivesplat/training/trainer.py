@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.kernels import torch_private
 from drivesplat.model.parameters import OFFSETS
-from drivesplat.model.splat_model import Moment, Picture, SplatModel
+from drivesplat.model.splat_model import ScanTimeStates, Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
@@ -81,7 +81,7 @@ class Trainer:
         capture = clock is UNTIMED and can_capture(settings, images, device)
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
-        model.precompute([time for scan in scans for time in Moment.times(scan.view.time)])
+        model.precompute([time for scan in scans for time in ScanTimeStates.times(scan.view.time)])
         return cls(
             model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
             schedule, list(scans),
@@ -136,14 +136,14 @@ class Trainer:
             self.fine_tunes,
         )
         scan = self.scans[number]
-        moment = self.model.moment(scan.view.time) if self.graphs.enabled else None
-        if moment is None:
+        states = self.model.scan_states(scan.view.time) if self.graphs.enabled else None
+        if states is None:
             return self.graphs.retry_without_graphs(lambda: self._learn_scan(scan, None, step, rates, fine))
-        inputs = self.scan_inputs.load(scan, moment)
+        inputs = self.scan_inputs.load(scan, states)
         recording = Recording("scan", inputs.number, MEASURED_SCANS)
         layout = fine, *self._addresses()
         return self._captured(
-            recording, lambda: self._learn_scan(inputs.scan, inputs.moment, step, rates, fine), layout
+            recording, lambda: self._learn_scan(inputs.scan, inputs.states, step, rates, fine), layout
         )
 
     def _set_learning_rates(self) -> None:
@@ -185,17 +185,17 @@ class Trainer:
     def _learn_scan(
         self,
         scan: TrainingScan,
-        moment: Moment | None,
+        states: ScanTimeStates | None,
         step: int | Tensor,
         rates: Mapping[str, Tensor] | None,
         fine_tunes: bool,
     ) -> Terms:
-        """An iteration with a scan at a `moment` (None: at its time), as `_learn`."""
+        """An iteration with a scan, as `_learn`; `states` are those of its time (None: to be looked up)."""
         stage, settings = self.clock.stage, self.settings.scans
         self.model.zero_grad()
         with stage("render"):
             before = (scan.range - settings.sight_margin).clamp(min=0.0) if settings.sight_weight else None
-            gaussians = None if moment is None else self.model.gaussians_at_moment(moment)
+            gaussians = None if states is None else self.model.gaussians_at_scan_states(states)
             picture = self.model.scan(scan.view, gaussians=gaussians, before=before)
         with stage("loss"):
             terms = scan_terms(picture, scan, self.model, self.settings)

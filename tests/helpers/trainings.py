@@ -130,7 +130,9 @@ def untrained_street(
     """Background, two cars and a sky; with `echo`, logits of intensity and returns, for a LiDAR, too, with the offsets
     that settings want. `people`: what the cars are deforms."""
     still = untrained(settings, sky=True, echo=echo, offsets=settings.scans.fine_tune > 0)
-    moving: Actors = actors_of(*cars(), count=25, settings=settings.actors, shaken=False, echo=echo)
+    moving: Actors = actors_of(
+        *cars(), count=25, settings=settings.deformable if people else settings.actors, shaken=False, echo=echo
+    )
     if people:
         own = {name: value.detach() for name, value in moving.params.items()}
         moving = Deformable(own, moving.timeline.tracks, settings.deformable, settings.gaussians)

@@ -123,11 +123,11 @@ def test_gaussians_follow_the_moment_copied_into_the_tensors():
     actors = actors_of(track_of(motion), count=4)
     actors.params["echoes"] = nn.Parameter(torch.randn(4, 4, 2, generator=torch.Generator().manual_seed(0)))
     model = SplatModel([*walls().parts, actors], None)
-    early, late = model.moment(0.5), model.moment(3.2)
+    early, late = model.scan_states(0.5), model.scan_states(3.2)
     inputs = copy.deepcopy(early)
-    for time, moment in ((0.5, early), (3.2, late)):
-        torch_private.copy_all(inputs.tensors, moment.tensors)
-        found = model.gaussians_at_moment(inputs)
+    for time, states in ((0.5, early), (3.2, late)):
+        torch_private.copy_all(inputs.tensors, states.tensors)
+        found = model.gaussians_at_scan_states(inputs)
         expected = model.gaussians_at(time, with_velocities=True, with_echoes=True)
         assert found.tensors.keys() == expected.tensors.keys() >= {"velocities", "echoes"}
         assert all(torch.equal(values, expected.tensors[name]) for name, values in found.tensors.items())

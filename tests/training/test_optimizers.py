@@ -37,6 +37,14 @@ def give_gradients(model: SplatModel, step: int) -> None:
         parameter.grad = None if silent else drawn
 
 
+def test_states_exist_from_the_beginning():
+    """Before a CUDA graph could capture their creation."""
+    for name, optimizer in make_optimizers(a_model("cpu")).all():
+        state = optimizer.state[optimizer.parameter]
+        assert state["step"] == 0 and not state["exp_avg"].any() and not state["exp_avg_sq"].any(), name
+        assert state["exp_avg"].shape == state["exp_avg_sq"].shape == optimizer.parameter.shape
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_step_together_is_every_optimizers_own(device):
     settings, ends = TrainSettings(iterations=10), []

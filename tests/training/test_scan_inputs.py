@@ -29,7 +29,7 @@ def revolution(x: float, seconds: float) -> RecordedScan:
 
 def terms_of(model: SplatModel, scan: TrainingScan, inputs: ScanInputs | None = None) -> dict[str, float]:
     """The loss terms of a scan; with `inputs` by their tensors alone."""
-    gaussians = None if inputs is None else model.gaussians_at_moment(inputs.moment)
+    gaussians = None if inputs is None else model.gaussians_at_scan_states(inputs.states)
     picture = model.scan(scan.view, gaussians=gaussians, before=scan.range - 0.5)
     return {name: float(value.detach()) for name, value in scan_terms(picture, scan, model, SETTINGS).items()}
 
@@ -41,7 +41,7 @@ def test_scans_of_one_shape_share_their_inputs():
     assert all(abs(expected[0][name] - expected[1][name]) > 1e-4 for name in ("scan_range", "scan_intensity"))
     places = set()
     for i in (0, 1, 0):
-        inputs = shared.load(scans[i], model.moment(scans[i].view.time))
+        inputs = shared.load(scans[i], model.scan_states(scans[i].view.time))
         assert terms_of(model, inputs.scan, inputs) == expected[i] and inputs.number == 0
         places.add(tuple(values.data_ptr() for values in inputs.tensors))
     assert len(places) == 1, "a graph keeps the addresses"
@@ -55,7 +55,7 @@ def test_scans_of_other_shapes_have_inputs_of_their_own():
     blocked[3] = True
     silent = replace(full, scan=replace(full.scan, intensities=None))
     scans = load_scans([full, silent, replace(full, blocked=blocked), full], SETTINGS.scans, CPU)
-    numbers = [shared.load(scan, model.moment(scan.view.time)).number for scan in scans]
+    numbers = [shared.load(scan, model.scan_states(scan.view.time)).number for scan in scans]
     assert numbers == [0, 1, 2, 0]
 
 

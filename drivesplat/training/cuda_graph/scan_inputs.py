@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.splat_model import Moment
+from drivesplat.model.splat_model import ScanTimeStates
 from drivesplat.training.scans import TrainingScan
 
 Shape = tuple[tuple[torch.Size, torch.dtype], ...]
@@ -20,17 +20,17 @@ Shape = tuple[tuple[torch.Size, torch.dtype], ...]
 
 @dataclass(frozen=True)
 class ScanInputs:
-    """A scan and the time states of its moment, whose tensors have the addresses that a graph reads; `number` counts
-    the shapes of scans."""
+    """A scan and the time states that it depends on, whose tensors have the addresses that a graph reads; `number`
+    counts the shapes of scans."""
 
     number: int
     scan: TrainingScan
-    moment: Moment
+    states: ScanTimeStates
 
     @property
     def tensors(self) -> list[Tensor]:
         """All tensors, in a fixed order."""
-        return [*self.scan.tensors, *self.moment.tensors]
+        return [*self.scan.tensors, *self.states.tensors]
 
 
 @dataclass
@@ -39,13 +39,13 @@ class SharedScanInputs:
 
     _by_shape: dict[Shape, ScanInputs] = field(default_factory=dict)
 
-    def load(self, scan: TrainingScan, moment: Moment) -> ScanInputs:
-        """The inputs of this shape, holding a scan and its moment from now on."""
-        given = [*scan.tensors, *moment.tensors]
+    def load(self, scan: TrainingScan, states: ScanTimeStates) -> ScanInputs:
+        """The inputs of this shape, which hold a scan and its time states from now on."""
+        given = [*scan.tensors, *states.tensors]
         shape = _shape_of(given)
         own = self._by_shape.get(shape)
         if own is None:
-            own = ScanInputs(len(self._by_shape), *copy.deepcopy((scan, moment)))
+            own = ScanInputs(len(self._by_shape), *copy.deepcopy((scan, states)))
             self._by_shape[shape] = own
         else:
             torch_private.copy_all(own.tensors, given)
