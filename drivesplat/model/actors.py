@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import one_hot
+from torch.nn.functional import normalize, one_hot
 
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
@@ -27,6 +27,10 @@ from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.model.track_penalties import track_penalties
 from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.settings.train import ActorSettings, GaussianSettings
+
+MAX_SPREAD = 0.6
+"""Maximum standard deviation of a Gaussian along an axis of its box, as a fraction of half the box's size: that of what
+fills the box evenly is 0.58."""
 
 
 class Actors(Part):
@@ -133,7 +137,7 @@ class Actors(Part):
     def _echoes(self, poses: ObjectPoses) -> Float[Tensor, "n 4 2"]:
         """The echoes of actors at these poses along directions in the world."""
         own, turns = self.params["echoes"], rotation_matrix(poses.quats.detach())
-        turned = of_owners(turns, self._owns) @ own[:, 1:]
+        turned = (of_owners(turns, self._owns)[..., None] * own[:, None, 1:]).sum(dim=2)  # faster than small matrices
         return torch.cat([own[:, :1], turned], dim=1)
 
     def _positions(self, state: TimeState, poses: ObjectPoses) -> Float[Tensor, "n 3"]:
@@ -244,7 +248,13 @@ class Actors(Part):
 
     @torch.no_grad()
     def confine(self) -> None:
-        self.fade((self.params["means"].abs() > of_owners(self._reach, self._owns)).any(dim=1))
+        """Fades Gaussians with centres outside their box, and shrinks those that spread beyond it. A LiDAR cannot tell
+        a piece of road that moves with a car from one that stands: without the limit, such pieces grow."""
+        p, reach = self.params, of_owners(self._reach, self._owns)
+        self.fade((p["means"].abs() > reach).any(dim=1))
+        axes = rotation_matrix(normalize(p["quats"], dim=1)) * torch.exp(p["scales"])[:, None]
+        excess = (axes.norm(dim=2) / (MAX_SPREAD * reach)).amax(dim=1, keepdim=True)
+        p["scales"].sub_(excess.clamp(min=1.0).log())
 
     @torch.no_grad()
     def broken_tracks(self) -> list[str]:

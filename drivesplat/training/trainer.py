@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.kernels import torch_private
 from drivesplat.model.parameters import OFFSETS
-from drivesplat.model.splat_model import ScanTimeStates, Picture, SplatModel
+from drivesplat.model.splat_model import Picture, ScanTimeStates, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages

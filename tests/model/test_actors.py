@@ -398,6 +398,7 @@ def test_only_gaussians_outside_their_own_enlarged_box_fade():
     params = {name: value.detach()[: len(cases)].clone() for name, value in actors.params.items()}
     params["owner"] = torch.tensor([owner for owner, _, _ in cases])
     params["means"] = torch.tensor([place for _, place, _ in cases])
+    params["scales"] = torch.full((len(cases), 3), -3.0)
     few = Actors(params, [van(), car()], ActorSettings(box_margin=0.1), GaussianSettings())
     before = {name: value.detach().clone() for name, value in few.named_parameters()}
     few.confine()
@@ -409,6 +410,24 @@ def test_only_gaussians_outside_their_own_enlarged_box_fade():
     assert all(torch.equal(after[name], value) for name, value in before.items() if name != "params.opacities")
     assert all(value.grad is None and value.grad_fn is None for value in after.values())
     assert few.params["opacities"].requires_grad
+
+
+def test_gaussians_that_spread_beyond_their_own_box_shrink():
+    """The car's box is 4 x 2 x 1.6 m, grown by 0.1 m on every side: along its axes standard deviations of 1.26, 0.66
+    and 0.54 m. The third Gaussian is turned by 90 degrees about the vertical: its long axis is across the car."""
+    half = 0.5**0.5
+    turns = torch.tensor([[1.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half], [1.0, 0.0, 0.0, 0.0]])
+    scales = torch.tensor([[1.2, 0.6, 0.5], [0.3, 1.98, 0.3], [2.64, 0.1, 0.1], [0.0, 0.0, 0.0]])
+    params = {name: value.detach()[:4].clone() for name, value in actors_of(car(), count=4).params.items()}
+    params |= {"quats": turns, "scales": scales.log(), "means": torch.zeros(4, 3)}
+    actors = Actors(params, [car()], ActorSettings(box_margin=0.1), GaussianSettings())
+    actors.confine()
+    expected = scales / torch.tensor([1.0, 3.0, 4.0, 1.0])[:, None]
+    torch.testing.assert_close(actors.params["scales"].exp().detach(), expected, rtol=0.01, atol=0.0)
+    assert torch.equal(actors.params["scales"][0], scales[0].log()), "what fits is unchanged"
+    again = actors.params["scales"].detach().clone()
+    actors.confine()
+    torch.testing.assert_close(actors.params["scales"].detach(), again)
 
 
 def test_a_track_knows_its_rows():
