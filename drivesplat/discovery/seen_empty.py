@@ -65,6 +65,11 @@ class RangeImage:
         return np.interp(np.arange(count), filled, mean[filled])
 
     @cached_property
+    def _turns(self) -> Float[np.ndarray, "a 3 3"]:
+        """The rotation from the sensor at its timestamp to the sensor at the time of each column."""
+        return Rotation.from_rotvec(-self.offsets_s[:, None] * self.scan.angular).as_matrix()
+
+    @cached_property
     def _of_beams(self) -> Float[np.ndarray, " b"]:
         return np.median(self.scan.scan.rays.elevations, axis=1)
 
@@ -81,14 +86,15 @@ class RangeImage:
         in_view = (above > 0) & (above < len(self.elevations))
         above = np.clip(above, 1, len(self.elevations) - 1)
         count = self.ranges.shape[1]
-        around = np.stack(
-            [self.ranges[above + beam, (columns + step) % count] for beam in (-1, 0) for step in (-1, 0, 1)], axis=1
-        )
-        known = np.isfinite(around)
-        beyond = np.where(known, around, np.inf) > (ranges * (1.0 + BEYOND_SHARE) + BEYOND)[:, None]
-        empty = in_view & (known.sum(axis=1) >= MIN_KNOWN) & beyond.all(axis=1)
-        near = np.abs(np.where(known, around, np.inf) - ranges[:, None]) < (AT + AT_SHARE * ranges)[:, None]
-        return empty, in_view & near.any(axis=1)
+        limit, tolerance = ranges * (1.0 + BEYOND_SHARE) + BEYOND, AT + AT_SHARE * ranges
+        known, beyond, near = np.zeros(len(points), dtype=np.int8), in_view.copy(), np.zeros(len(points), dtype=bool)
+        for beam in (-1, 0):
+            for step in (-1, 0, 1):
+                around = self.ranges[above + beam, (columns + step) % count]
+                known += np.isfinite(around)
+                beyond &= ~(around <= limit)  # True for NaN
+                near |= np.abs(around - ranges) < tolerance  # False for NaN
+        return beyond & (known >= MIN_KNOWN), in_view & near
 
     def _in_sensor(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points in the sensor's frame at the times when it looks at them, and their columns."""
@@ -96,9 +102,8 @@ class RangeImage:
         places = at_timestamp
         for _ in range(STEPS):
             columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
-            offsets = self.offsets_s[columns][:, None]
-            turns = Rotation.from_rotvec(-offsets * self.scan.angular)
-            places = turns.apply(at_timestamp - offsets * self.scan.linear)
+            moved = at_timestamp - self.offsets_s[columns][:, None] * self.scan.linear
+            places = np.einsum("nij,nj->ni", self._turns[columns], moved)
         return places, self._columns(np.arctan2(places[:, 1], places[:, 0]))
 
 
