@@ -533,8 +533,9 @@ def continued(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("shutters", [False, True])
 def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, caplog):
-    captured, mine = trained_with(True, shutters=shutters)
-    eager, theirs = trained_with(False, shutters=shutters)
+    """Also parameters that learn late: colours depend on direction after images have been captured."""
+    captured, mine = trained_with(True, shutters=shutters, sh_every=0.5)
+    eager, theirs = trained_with(False, shutters=shutters, sh_every=0.5)
     assert not caplog.records, "nothing was refused"
     assert len(captured.graphs._graphs) == len(captured.images.views) and not eager.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
@@ -545,8 +546,6 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, caplo
         if moved.any() and not name.endswith(("scales", "quats")):
             apart = (captured.model.state_dict()[name] - value).abs().cpu()
             assert float(apart.quantile(0.5)) <= 0.1 * float(moved.max()), name
-    steps = [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in captured.optimizers.all()]
-    assert steps == [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in eager.optimizers.all()]
 
 
 @pytest.mark.parametrize("field", ["lattice", "network"])

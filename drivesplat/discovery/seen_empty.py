@@ -87,7 +87,8 @@ class RangeImage:
         above = np.clip(above, 1, len(self.elevations) - 1)
         count = self.ranges.shape[1]
         limit, tolerance = ranges * (1.0 + BEYOND_SHARE) + BEYOND, AT + AT_SHARE * ranges
-        known, beyond, near = np.zeros(len(points), dtype=np.int8), in_view.copy(), np.zeros(len(points), dtype=bool)
+        known, near = np.zeros(len(points), dtype=np.int8), np.zeros(len(points), dtype=bool)
+        beyond = in_view & np.isfinite(ranges)
         for beam in (-1, 0):
             for step in (-1, 0, 1):
                 around = self.ranges[above + beam, (columns + step) % count]

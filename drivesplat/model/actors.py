@@ -29,8 +29,8 @@ from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.settings.train import ActorSettings, GaussianSettings
 
 MAX_SPREAD = 0.6
-"""Maximum standard deviation of a Gaussian along an axis of its box, as a fraction of half the box's size: that of what
-fills the box evenly is 0.58."""
+"""Maximum standard deviation of a Gaussian along an axis of its box, as a fraction of half the size of the box with its
+margin. What fills a box evenly has 0.58."""
 
 
 class Actors(Part):
@@ -249,7 +249,7 @@ class Actors(Part):
     @torch.no_grad()
     def confine(self) -> None:
         """Fades Gaussians with centres outside their box, and shrinks those that spread beyond it. A LiDAR cannot tell
-        a piece of road that moves with a car from one that stands: without the limit, such pieces grow."""
+        a piece of road that moves with a car from road that stands still; without the limit such Gaussians may grow."""
         p, reach = self.params, of_owners(self._reach, self._owns)
         self.fade((p["means"].abs() > reach).any(dim=1))
         axes = rotation_matrix(normalize(p["quats"], dim=1)) * torch.exp(p["scales"])[:, None]

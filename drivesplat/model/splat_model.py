@@ -50,6 +50,10 @@ class ScanTimeStates(NamedTuple):
         """All tensors, in a fixed order."""
         return [values for states in self for state in states for values in state]
 
+    def copied(self) -> "ScanTimeStates":
+        """A copy in memory of its own."""
+        return ScanTimeStates(*([[values.clone() for values in state] for state in states] for states in self))
+
     @staticmethod
     def times(time: float) -> tuple[float, float, float]:
         """The times of the three states for a scan at a time, in seconds since the first image."""

@@ -46,7 +46,10 @@ class ScanSchedule:
         return self.scans_before(step + 1) > self.scans_before(step)
 
     def scans_before(self, step: int) -> int:
-        """The number of the first `step` iterations that fit a scan."""
+        """The number of the first `step` iterations that fit a scan; beyond the last iteration none does, unless there
+        are no images."""
+        if not self.images:
+            return step
         beside_images = min(step, self.fine_tuning_from) * self.scans // self.fine_tuning_from
         return beside_images + min(max(0, step - self.fine_tuning_from), self.fine_tuning)
 

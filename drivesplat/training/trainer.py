@@ -78,7 +78,7 @@ class Trainer:
         settings = settings.model_copy(update={"iterations": schedule.fine_tuning_from})
         optimizers, known = make_optimizers(model), priors.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        capture = clock is UNTIMED and can_capture(settings, images, device)
+        capture = clock is UNTIMED and can_capture(settings, images, device, len(scans))
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
         model.precompute([time for scan in scans for time in ScanTimeStates.times(scan.view.time)])
@@ -131,15 +131,12 @@ class Trainer:
 
     def _fit_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
         """An iteration with the scan whose turn it is, by its CUDA graph where there is one."""
-        number, fine = (
-            scan_index(len(self.scans), self.scan_schedule.scans_before(self.step), self.seed),
-            self.fine_tunes,
-        )
-        scan = self.scans[number]
+        number = scan_index(len(self.scans), self.scan_schedule.scans_before(self.step), self.seed)
+        scan, fine = self.scans[number], self.fine_tunes
         states = self.model.scan_states(scan.view.time) if self.graphs.enabled else None
         if states is None:
             return self.graphs.retry_without_graphs(lambda: self._learn_scan(scan, None, step, rates, fine))
-        inputs = self.scan_inputs.load(scan, states)
+        inputs = self.graphs.retry_without_graphs(lambda: self.scan_inputs.load(scan, states))
         recording = Recording("scan", inputs.number, MEASURED_SCANS)
         layout = fine, *self._addresses()
         return self._captured(

@@ -86,6 +86,7 @@ def test_the_last_iterations_fine_tune_the_lidar():
     assert sum(schedule.fits_scan(step) for step in range(375)) == 75 and schedule.images_before(375) == 300
     assert all(schedule.fits_scan(step) for step in range(375, 435))
     assert (schedule.scans_before(435), schedule.images_before(435), schedule.counted_before(435)) == (135, 300, 300)
+    assert not schedule.fits_scan(435), "beyond the end only images are fitted"
 
 
 def test_nothing_is_fine_tuned_without_scans():
@@ -99,7 +100,7 @@ def test_without_images_every_iteration_fits_a_scan_and_counts():
     schedule = scheduled(0.25, fine_tune=0.2, images=0)
     assert schedule.steps == 300 and all(schedule.fits_scan(step) for step in range(300))
     assert not any(schedule.fine_tunes(step) for step in range(300))
-    assert (schedule.images_before(300), schedule.counted_before(300)) == (0, 300)
+    assert (schedule.images_before(300), schedule.counted_before(300)) == (0, 300) and schedule.fits_scan(300)
 
 
 def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():

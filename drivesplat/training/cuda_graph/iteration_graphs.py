@@ -11,6 +11,7 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import TypeVar
 
 import torch
@@ -25,9 +26,13 @@ log = logging.getLogger(__name__)
 
 Terms = dict[str, Tensor]
 T = TypeVar("T")
-MAX_IMAGES = 4096
-"""A training with more images captures nothing: graphs hold on to cached time states, up to three for each, and four
-times as many are cached."""
+MAX_RECORDINGS = 4096
+"""A training with more images and scans captures nothing. Graphs of images read cached time states, up to three for
+each image, and scans use as many; four times MAX_RECORDINGS are cached, so that none is replaced."""
+
+REMEMBERED = 0.8
+"""Part of the entries needed before that a shared graph keeps when it is captured again: perhaps not every scan was
+replayed since."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +53,12 @@ class GaussianCount:
     headroom: float
 
 
-def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.device) -> bool:
-    """Whether iterations of a training can and shall be captured. Densification by gradient reads intermediate results
-    of an iteration; class logits have too many values for lists of planned capacity."""
-    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(images.views) <= MAX_IMAGES
+def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.device, scans: int = 0) -> bool:
+    """Whether iterations of a training, with so many LiDAR `scans`, can and shall be captured. Densification by
+    gradient reads intermediate results of an iteration; class logits have too many values for lists of planned
+    capacity."""
+    few = len(images.views) + scans <= MAX_RECORDINGS
+    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and few
     return wanted and graphs_supported(device) and all(view.classes is None for view in images.views)
 
 
@@ -131,8 +138,10 @@ class IterationGraphs:
             return
         for recording, most in self._most_needed(recordings).items():
             now = [need / self._count for need in most]
-            before = self._needs[recording] if recording.runs > 1 else now  # not every scan was replayed since
-            self._needs[recording] = [*map(max, now, before)]
+            before = self._needs[recording] if recording.runs > 1 else []
+            self._needs[recording] = [
+                max(need, REMEMBERED * old) for need, old in zip_longest(now, before, fillvalue=0)
+            ]
             del self._graphs[recording]
         if not self._graphs:
             self._pool = None  # torch frees it with the last graph

@@ -45,7 +45,7 @@ class SharedScanInputs:
         shape = _shape_of(given)
         own = self._by_shape.get(shape)
         if own is None:
-            own = ScanInputs(len(self._by_shape), *copy.deepcopy((scan, states)))
+            own = ScanInputs(len(self._by_shape), copy.deepcopy(scan), states.copied())
             self._by_shape[shape] = own
         else:
             torch_private.copy_all(own.tensors, given)
