@@ -68,7 +68,7 @@ def held_by(value: object, path: str = "scan") -> dict[str, torch.Tensor]:
         names = getattr(value, "_fields", range(len(value)))
         items = zip(names, value, strict=True)
     else:
-        items = getattr(value, "__dict__", {}).items()
+        items = ((name, item) for name, item in getattr(value, "__dict__", {}).items() if item is not value)
     return {k: v for name, item in items for k, v in held_by(item, f"{path}.{name}").items()}
 
 

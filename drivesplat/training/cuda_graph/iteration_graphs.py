@@ -11,7 +11,6 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
 from typing import TypeVar
 
 import torch
@@ -138,10 +137,9 @@ class IterationGraphs:
             return
         for recording, most in self._most_needed(recordings).items():
             now = [need / self._count for need in most]
-            before = self._needs[recording] if recording.runs > 1 else []
-            self._needs[recording] = [
-                max(need, REMEMBERED * old) for need, old in zip_longest(now, before, fillvalue=0)
-            ]
+            if recording.runs > 1:
+                now = [max(need, REMEMBERED * old) for need, old in zip(now, self._needs[recording], strict=True)]
+            self._needs[recording] = now
             del self._graphs[recording]
         if not self._graphs:
             self._pool = None  # torch frees it with the last graph
