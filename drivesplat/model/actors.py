@@ -155,8 +155,7 @@ class Actors(Part):
 
     @torch.no_grad()
     def velocities_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Float[Tensor, "m 3"]:
-        recorded = self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
-        known, sets = self._known, []
+        recorded, known, sets = self._beside(time), self._known, []
         for chosen, rows in self._sets(placements):
             beside = []
             for number, state in enumerate(recorded):

@@ -131,8 +131,12 @@ class Part(nn.Module, ABC):
 
     def velocities(self, time: float) -> Float[Tensor, "n 3"] | None:
         """The velocities of its Gaussians in the world at a time, m/s, without gradient; None for a static part."""
-        states = [self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)]
+        states = self._beside(time)
         return None if any(state is None for state in states) else self.velocities_between(*states)
+
+    def _beside(self, time: float) -> tuple[Sequence[Tensor] | None, Sequence[Tensor] | None]:
+        """The time states HALF_STEP seconds before and after a time."""
+        return self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
 
     def velocities_between(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Float[Tensor, "n 3"] | None:
         """As `velocities`, by the time states HALF_STEP seconds before and after the time. Depends on these tensors

@@ -1,6 +1,5 @@
 """LiDAR scans of a model: what its echoes give, seen along the rays of a sensor."""
 
-import copy
 import dataclasses
 from dataclasses import replace
 
@@ -117,14 +116,14 @@ def test_the_echoes_of_an_actor_turn_with_it():
     torch.testing.assert_close(after[:, 1:, 1], torch.tensor([0.0, 3.0, 0.0]).expand(4, 3), atol=1e-5, rtol=0)
 
 
-def test_gaussians_follow_the_moment_copied_into_the_tensors():
+def test_gaussians_follow_the_time_states_copied_into_the_tensors():
     """With what they echo and how fast they move then."""
     motion = motion_through([0.0, 2.0, 4.0], [[10.0, 0.0, 1.0], [14.0, 0.0, 1.0], [26.0, 3.0, 1.0]], [0.0, 0.5, 1.0])
     actors = actors_of(track_of(motion), count=4)
     actors.params["echoes"] = nn.Parameter(torch.randn(4, 4, 2, generator=torch.Generator().manual_seed(0)))
     model = SplatModel([*walls().parts, actors], None)
     early, late = model.scan_states(0.5), model.scan_states(3.2)
-    inputs = copy.deepcopy(early)
+    inputs = early.copied()
     for time, states in ((0.5, early), (3.2, late)):
         torch_private.copy_all(inputs.tensors, states.tensors)
         found = model.gaussians_at_scan_states(inputs)

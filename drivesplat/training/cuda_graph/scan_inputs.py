@@ -1,7 +1,7 @@
 """The inputs of captured iterations with LiDAR scans: one graph serves all scans of the same shape.
 
-A drive has a hundred scans and more, each used a dozen times in a training, and a capture takes as long as several
-replays. The graph therefore reads copies, into which the scan of each iteration is written.
+A drive has a hundred scans or more. A training uses each of them some twenty times, and a capture takes as long as
+several replays. The graph therefore reads inputs of its own, into which the scan of each iteration is copied.
 """
 
 import copy
