@@ -6,6 +6,8 @@ import sys
 import pytest
 from helpers import REPOSITORY
 
+from drivesplat.training.warm_up import warm_up
+
 LEFT = """
 import importlib, pathlib, pkgutil, tempfile
 from numba.core.registry import CPUDispatcher
@@ -19,6 +21,11 @@ for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
         if isinstance(kernel, CPUDispatcher) and kernel.stats.cache_path:  # without: kept with its callers
             print(name, len(kernel.signatures))
 """
+
+
+def test_the_warm_up_trains_to_its_end(tmp_path):
+    warm_up(tmp_path)
+    assert (tmp_path / "tensorboard").exists()
 
 
 @pytest.mark.slow
