@@ -86,3 +86,9 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """The same Gaussians with spherical harmonics of at least this degree: coefficients that they lack are 0."""
     lacking = max(0, (degree + 1) ** 2 - 1 - gaussians.shN.shape[1])
     return replace(gaussians, shN=F.pad(gaussians.shN, (0, 0, 0, lacking)))
+
+
+def with_constant_colors(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians with the colours of degree 0, for sensors that see none: copying all coefficients of a million
+    Gaussians takes time."""
+    return replace(gaussians, shN=gaussians.shN[:, :0])

@@ -13,7 +13,7 @@ from drivesplat.errors import ResultError
 from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import Gaussians, concatenate, with_constant_colors
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.view import View, depth_at_lines, where_seen
@@ -120,10 +120,10 @@ class SplatModel(nn.Module):
         return None if now is None or before is None or after is None else ScanTimeStates(now, before, after)
 
     def gaussians_at_scan_states(self, states: ScanTimeStates) -> Gaussians:
-        """As `gaussians_at` with velocities and echoes, by the parts' time states."""
+        """As `gaussians_at` with velocities and echoes and with constant colours, by the parts' time states."""
         found = []
         for part, now, before, after in zip(self.parts, *states, strict=True):
-            shown = part.seen_by_lidar(part.at_time_state(now))
+            shown = with_constant_colors(part.seen_by_lidar(part.at_time_state(now)))
             velocities, echoes = part.velocities_between(before, after), part.echoes_at_time_state(now)
             found.append(replace(shown, velocities=velocities, echoes=echoes))
         return concatenate(found)
