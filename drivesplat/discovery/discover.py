@@ -31,7 +31,8 @@ SLACK = (1.0, 0.3)
 NEARLY_ALWAYS = 0.75
 """Fraction of their common time."""
 MAX_CLEARANCE = 0.8
-"""Metres between the ground and the lowest return of an object."""
+"""Metres between the ground and the lowest return of an object. Far away it is the height of a kerb and the distance of
+two beams there, where that is more."""
 MIN_MOVING = 0.4
 """Fraction of the returns in the place of an object that move."""
 BESIDE, KERB = 0.2, 0.3
@@ -143,6 +144,8 @@ class Surroundings:
 
     def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " n"]]):
         self._scans, self._moving = scans, moving
+        elevations = np.sort(np.median(scans[0].scan.rays.elevations, axis=1))
+        self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
         self._grounds: dict[tuple[int, float, float], float] = {}
 
@@ -154,7 +157,8 @@ class Surroundings:
         """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
         move, as those of standing objects do not."""
         clearances = np.array([cluster.lowest - self._ground(cluster) for cluster in chain.clusters])
-        if not np.isfinite(clearances).any() or np.nanmedian(clearances) >= MAX_CLEARANCE:
+        excess = clearances - [max(MAX_CLEARANCE, KERB + self._beams_apart(cluster)) for cluster in chain.clusters]
+        if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
             return False
         shares = [self._moving_share(*it) for it in zip(chain.clusters, self.grounds(chain), strict=True)]
         return bool(np.median(shares) > MIN_MOVING)
@@ -167,6 +171,10 @@ class Surroundings:
             near = tree.query_ball_point(cluster.place, AROUND)
             self._grounds[key] = float(np.percentile(heights[near], LOWEST)) if len(near) >= 5 else float("nan")
         return self._grounds[key]
+
+    def _beams_apart(self, cluster: Cluster) -> float:
+        """The vertical distance in metres of neighbouring beams at the place of a cluster."""
+        return self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2]))
 
     def _moving_share(self, cluster: Cluster, ground: float) -> float:
         """The fraction of the returns in a cluster's extents, above the ground, that move."""

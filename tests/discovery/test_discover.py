@@ -1,5 +1,7 @@
 """Moving objects found in the scans of a street: how many, where, how large, and what is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.street_scans import Mover, street_scans
@@ -7,6 +9,8 @@ from helpers.street_scans import Mover, street_scans
 from drivesplat.discovery.boxes import Discovered
 from drivesplat.discovery.discover import discovered
 from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.scan import Scan, ScanRays
+from drivesplat.scene.scan_record import RecordedScan
 
 SECONDS = 0.1 * np.arange(45)
 
@@ -44,6 +48,25 @@ def test_a_vehicle_is_found_with_its_place_heading_and_size(mover):
     headings = np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) - mover.heading
     assert np.degrees(np.median(np.abs((headings + np.pi) % (2.0 * np.pi) - np.pi))) < 3.0
     assert np.median(np.abs(poses[:, 2, 3] - 0.5 * mover.size[2])) < 0.35
+
+
+@pytest.mark.parametrize("distance", [34.0, 38.0])
+def test_a_van_is_found_where_beams_are_a_metre_apart(distance):
+    """Its lowest return is up to a metre above the ground."""
+    van = Mover((distance, 3.0), (8.0, 0.0), size=(5.5, 2.0, 2.5))
+    scans = [_with_half_the_beams(scan) for scan in street_scans([van], SECONDS[:30], 7.0)]
+    (item,) = discovered(scans)
+    assert item.object_class is ObjectClass.CAR and len(item.seconds) > 20
+    along, across = np.median(np.abs(offsets(item, van)), axis=0)
+    assert along < 0.8 and across < 0.3
+
+
+def _with_half_the_beams(recorded: RecordedScan) -> RecordedScan:
+    own = recorded.scan
+    rays = ScanRays(*(values[::2] for values in (own.rays.azimuths, own.rays.elevations, own.rays.offsets_s)))
+    scan = Scan(rays, own.returned[::2], own.ranges[::2])
+    beside = {name: getattr(recorded, name)[::2] for name in ("measured", "objects", "blocked")}
+    return replace(recorded, scan=scan, **beside)
 
 
 def test_a_person_is_found_as_one():
