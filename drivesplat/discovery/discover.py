@@ -160,8 +160,7 @@ class Surroundings:
         excess = clearances - [max(MAX_CLEARANCE, KERB + self._beams_apart(cluster)) for cluster in chain.clusters]
         if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
             return False
-        shares = [self._moving_share(*it) for it in zip(chain.clusters, self.grounds(chain), strict=True)]
-        return bool(np.median(shares) > MIN_MOVING)
+        return bool(np.median([self._moving_share(cluster) for cluster in chain.clusters]) > MIN_MOVING)
 
     def _ground(self, cluster: Cluster) -> float:
         """The height of the ground around a cluster; NaN where too few returns are there."""
@@ -176,16 +175,18 @@ class Surroundings:
         """The vertical distance in metres of neighbouring beams at the place of a cluster."""
         return self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2]))
 
-    def _moving_share(self, cluster: Cluster, ground: float) -> float:
-        """The fraction of the returns in a cluster's extents, above the ground, that move."""
+    def _moving_share(self, cluster: Cluster) -> float:
+        """The fraction of the returns in a cluster's extents, above the ground where it is known, that move."""
+        ground = self._ground(cluster)
+        floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
         tree, heights = self._of_scan(cluster.scan)
         low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
         reach = 0.5 * float(np.linalg.norm(high[:2] - low[:2]))
         near = np.array(tree.query_ball_point(cluster.place, reach), dtype=np.int64)
         places, z = tree.data[near], heights[near]
         inside = (places >= low[:2]).all(axis=1) & (places <= high[:2]).all(axis=1)
-        standing = int((inside & (z > ground + KERB) & (z <= high[2])).sum())
-        own = int((cluster.points[:, 2] > ground + KERB).sum())
+        standing = int((inside & (z > floor) & (z <= high[2])).sum())
+        own = int((cluster.points[:, 2] > floor).sum())
         return own / max(own + standing, 1)
 
     def _of_scan(self, number: int) -> tuple[cKDTree, np.ndarray]:
