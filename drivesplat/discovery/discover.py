@@ -144,7 +144,7 @@ class Surroundings:
 
     def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " n"]]):
         self._scans, self._moving = scans, moving
-        elevations = np.sort(np.median(scans[0].scan.rays.elevations, axis=1))
+        elevations = np.sort(scans[0].scan.rays.beam_elevations)
         self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
         self._grounds: dict[tuple[int, float, float], float] = {}

@@ -71,7 +71,7 @@ class RangeImage:
 
     @cached_property
     def _of_beams(self) -> Float[np.ndarray, " b"]:
-        return np.median(self.scan.scan.rays.elevations, axis=1)
+        return self.scan.scan.rays.beam_elevations
 
     def _columns(self, azimuths: np.ndarray) -> np.ndarray:
         count = self.scan.scan.rays.shape[1]

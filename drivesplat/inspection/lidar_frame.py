@@ -134,7 +134,7 @@ class LidarFrames:
         """What all frames have: titles, scales and rings of distance."""
         figure = Figure(figsize=(SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI, facecolor=PAGE)
         canvas = FigureCanvasAgg(figure)
-        elevations = np.degrees(np.median(scan.scan.rays.elevations, axis=1))
+        elevations = np.degrees(scan.scan.rays.beam_elevations)
         for place, name in ((RECORDED, "Range, recorded"), (RENDERED, "Range, rendered")):
             axis = _panel(figure, place, name)
             axis.set_yticks([1.0, 0.0], [f"{e:+.0f}°".replace("-", "−") for e in (elevations.max(), elevations.min())])

@@ -64,7 +64,7 @@ def shown_order(rays: ScanRays, ahead: float | None) -> tuple[Int[np.ndarray, " 
     """The order in which beams are shown from above, and firings from the left."""
     middle = np.angle(np.exp(1j * rays.azimuths.astype(np.float64)).mean(axis=0))
     firings = np.argsort(-wrapped(middle - (ahead or 0.0)), kind="stable")
-    return np.argsort(-np.median(rays.elevations, axis=1)), firings
+    return np.argsort(-rays.beam_elevations), firings
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _draw(part: SubFigure, item: ShownScan, rows: Sequence[_Row], ahead: float |
     part.suptitle(item.title, x=0.01, ha="left", fontsize=15)
     rays, measured = item.recorded.scan.rays, item.recorded.measured
     beams, firings = shown_order(rays, ahead)
-    elevations = np.degrees(np.median(rays.elevations, axis=1))[beams[[0, -1]]]
+    elevations = np.degrees(rays.beam_elevations)[beams[[0, -1]]]
     heights = [f"{degrees:+.0f}°".replace("-", "−") for degrees in elevations]
     for axis, row in zip(part.subplots(len(rows), 1, squeeze=False)[:, 0], rows, strict=True):
         hidden = False if row.there is None else ~row.there

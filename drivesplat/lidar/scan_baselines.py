@@ -91,6 +91,6 @@ def _met(points: Float[np.ndarray, "n 3"], target: RecordedScan) -> tuple[np.nda
 
 def _spacing(rays: ScanRays) -> float:
     """The angle between neighbouring beams or firings, whichever is wider, in radians."""
-    beams = np.sort(np.median(rays.elevations, axis=1))
+    beams = np.sort(rays.beam_elevations)
     between = float(np.diff(beams).max()) if len(beams) > 1 else 0.0
     return max(between, 2.0 * np.pi / rays.shape[1])

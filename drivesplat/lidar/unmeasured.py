@@ -60,12 +60,12 @@ def blocked_rays(
         np.add.at(returns, _cells(scan), scan.returned)
     mostly = returns.sum(axis=1) >= 0.5 * rays.sum(axis=1)
     empty = mostly[:, None] & (rays > 0) & (returns == 0)
-    return [empty[_cells(scan)] & (np.median(scan.rays.elevations, axis=1) < 0)[:, None] for scan in scans]
+    return [empty[_cells(scan)] & (scan.rays.beam_elevations < 0)[:, None] for scan in scans]
 
 
 def _from_above(cells: Bool[np.ndarray, "beams bins"], scan: Scan) -> Bool[np.ndarray, "b bins"]:
     """The cells of each beam of a scan, with those that are set for a beam above it."""
-    downwards = np.argsort(-np.median(scan.rays.elevations, axis=1), kind="stable")
+    downwards = np.argsort(-scan.rays.beam_elevations, kind="stable")
     out = np.empty((len(downwards), cells.shape[1]), dtype=bool)
     out[downwards] = np.logical_or.accumulate(cells[downwards], axis=0)
     return out

@@ -23,6 +23,11 @@ class ScanRays:
         """Beams and firings."""
         return self.azimuths.shape
 
+    @property
+    def beam_elevations(self) -> Float32[np.ndarray, " b"]:
+        """The median elevation of each beam, radians."""
+        return np.median(self.elevations, axis=1)
+
     def directions(self) -> Float32[np.ndarray, "b a 3"]:
         """Unit vectors in the sensor's frame at each ray's own time."""
         flat = np.cos(self.elevations)
