@@ -61,9 +61,12 @@ def regularization(gaussians: Gaussians, model: SplatModel, settings: TrainSetti
 def _dynamic_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The terms of dynamic parts, colours excepted; none for a model without such parts."""
-    time = view.view.time
-    terms = {name: term for part in model.parts for name, term in (part.penalties() | part.penalties_at(time)).items()}
+    """The terms of dynamic parts, colours excepted; none for a model without such parts. Penalties of several parts that
+    have one name are added."""
+    terms: dict[str, Float[Tensor, ""]] = {}
+    for part in model.parts:
+        for name, penalty in (part.penalties() | part.penalties_at(view.view.time)).items():
+            terms[name] = terms[name] + penalty if name in terms else penalty
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
         seen = alpha if view.ego_mask is None else alpha.masked_fill(view.ego_mask, 1.0)

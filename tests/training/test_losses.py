@@ -400,6 +400,17 @@ def test_terms_are_what_they_are_called():
         torch.testing.assert_close(terms[name], value)
 
 
+def test_penalties_of_several_parts_add_up():
+    """Vehicles and people both have tracks whose corrections are penalised."""
+    model, picture, view = street()
+    other = actors_of(track_of(motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 2.0]] * 3), "other", (1.0, 1.0, 1.0)), seed=1)
+    both = SplatModel([*model.parts, other], model.sky)
+    terms = loss_terms(picture, view, both, TrainSettings())
+    for name, penalty in model.parts[1].penalties().items():
+        torch.testing.assert_close(terms[name], penalty + other.penalties()[name])
+        assert float(penalty.detach()) > 0.0 and float(other.penalties()[name].detach()) > 0.0
+
+
 def test_a_static_model_has_no_terms_of_dynamic_parts():
     _, _, view = street()
     model = SplatModel([a_model().parts[0]], None)
