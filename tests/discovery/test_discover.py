@@ -7,7 +7,8 @@ import pytest
 from helpers.street_scans import Mover, street_scans
 
 from drivesplat.discovery.boxes import Discovered
-from drivesplat.discovery.discover import discovered
+from drivesplat.discovery.clusters import Chain, Cluster
+from drivesplat.discovery.discover import Surroundings, discovered
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan import Scan, ScanRays
 from drivesplat.scene.scan_record import RecordedScan
@@ -59,6 +60,30 @@ def test_a_van_is_found_where_beams_are_a_metre_apart(distance):
     assert item.object_class is ObjectClass.CAR and len(item.seconds) > 20
     along, across = np.median(np.abs(offsets(item, van)), axis=0)
     assert along < 0.8 and across < 0.3
+
+
+def test_an_object_is_confirmed_where_one_beam_meets_it_and_most_scans_lack_the_ground():
+    """A wet road returns little. Where the ground is unknown, no return can be taken for one of the ground."""
+    car = Mover((20.0, 3.0), (8.0, 0.0))
+    dry, *wet = street_scans([car], SECONDS[:9], 7.0)
+    scans = [dry, *(_without_ground(scan) for scan in wet)]
+    surroundings = Surroundings(scans, [scan.objects_met == 0 for scan in scans])
+    clusters = [_of_the_lowest_beam(scan, number) for number, scan in enumerate(scans)]
+    assert surroundings.confirm(Chain(clusters))
+
+
+def _of_the_lowest_beam(recorded: RecordedScan, number: int) -> Cluster:
+    """The returns of object 0 that lie within a decimetre of the lowest."""
+    points = recorded.points()[recorded.objects_met == 0]
+    points = points[points[:, 2] < points[:, 2].min() + 0.1]
+    return Cluster(number, recorded.seconds, points, recorded.sensor_to_world[:3, 3])
+
+
+def _without_ground(recorded: RecordedScan) -> RecordedScan:
+    own = recorded.scan
+    above = own.rays.directions()[..., 2] * own.ranges + recorded.sensor_to_world[2, 3]
+    returned = own.returned & (above > 0.1)
+    return replace(recorded, scan=replace(own, returned=returned, ranges=np.where(returned, own.ranges, 0.0)))
 
 
 def _with_half_the_beams(recorded: RecordedScan) -> RecordedScan:
