@@ -22,6 +22,11 @@ WHOLE = 0.8
 """Fraction of a length or width from which extents count as seen whole."""
 SEEN = (97.0, 85.0)
 """Percentiles of lengths and widths over all clusters that count as seen: at times a cluster holds two objects."""
+BESIDE, CUT = 0.1, 0.01
+"""Weights of a coordinate of a vehicle beside the sensor whose ends were not seen, and of one that is partly too near
+to be measured."""
+NEAR_BLIND = 0.5
+"""Metres beyond the range from which returns are measured, within which a cluster may be cut off there."""
 MARGIN = 0.05
 """Metres between the outermost returns of a cluster and the surface, on average."""
 PERSON, CYCLIST, CAR, TRUCK = (
@@ -56,8 +61,9 @@ class Discovered:
         return poses
 
 
-def fitted_box(chain: Chain, grounds: Float[np.ndarray, " k"]) -> Discovered:
-    """The box of a chain; `grounds` are the heights (metres) of the ground below its clusters."""
+def fitted_box(chain: Chain, grounds: Float[np.ndarray, " k"], blind: float = 0.0) -> Discovered:
+    """The box of a chain; `grounds` are the heights (metres) of the ground below its clusters. Returns nearer than
+    `blind` metres to the sensor are missing."""
     seconds, clusters = chain.seconds, chain.clusters
     weights = np.sqrt([len(cluster.points) for cluster in clusters])
     rough = smooth_path(seconds, chain.places, np.tile(weights[:, None], 2))
@@ -68,7 +74,7 @@ def fitted_box(chain: Chain, grounds: Float[np.ndarray, " k"]) -> Discovered:
     speed = float(np.median(np.linalg.norm(rough.velocities(seconds), axis=1)))
     object_class, size = class_and_size(_seen(extents, clusters), height, speed)
     centers, trusts = zip(
-        *(_center(*of_one, size[:2]) for of_one in zip(clusters, frames, extents, strict=True)), strict=True
+        *(_center(*of_one, size[:2], blind) for of_one in zip(clusters, frames, extents, strict=True)), strict=True
     )
     in_world = np.stack([center @ frame for center, frame in zip(centers, frames, strict=True)])
     squared = np.stack([trust @ (frame**2) for trust, frame in zip(trusts, frames, strict=True)])
@@ -126,15 +132,23 @@ def _seen(extents: Float[np.ndarray, "k 2 2"], clusters: Sequence[Cluster]) -> F
 
 
 def _center(
-    cluster: Cluster, frame: np.ndarray, extents: Float[np.ndarray, "2 2"], size: Float[np.ndarray, "2"]
+    cluster: Cluster,
+    frame: np.ndarray,
+    extents: Float[np.ndarray, "2 2"],
+    size: Float[np.ndarray, "2"],
+    blind: float,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """The centre of a box of `size` by the sides that a cluster shows, along both axes, and how far each coordinate is
-    to be trusted."""
+    to be trusted. Of a cluster next to where returns are missing, the near sides may be missing, too."""
     sensor = frame @ cluster.origin[:2]
     low, high = extents.T
-    middle, whole = 0.5 * (low + high), high - low >= WHOLE * size
-    from_low, from_high = low + 0.5 * size, high - 0.5 * size
-    anchored = np.where(sensor < low, from_low, np.where(sensor > high, from_high, middle))
-    beside = (sensor >= low) & (sensor <= high)
-    trust = np.where(whole | ~beside, 1.0, 0.1)
-    return np.where(whole, middle, anchored), trust
+    before, behind = sensor < low, sensor > high
+    fits = high - low < size
+    anchored = 0.5 * (low + high)
+    anchored = np.where(before & fits, low + 0.5 * size, anchored)
+    anchored = np.where(behind & fits, high - 0.5 * size, anchored)
+    whole = high - low >= WHOLE * size
+    trust = np.where(whole | before | behind, 1.0, BESIDE)
+    if np.linalg.norm(cluster.points - cluster.origin, axis=1).min() < blind + NEAR_BLIND:
+        trust = np.where(whole, trust, CUT)
+    return anchored, trust

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from drivesplat.discovery.boxes import Discovered, fitted_box
 from drivesplat.discovery.clusters import Chain, Cluster, chains_of, clusters_of
 from drivesplat.discovery.ends import Ends
+from drivesplat.discovery.ground import Ground
 from drivesplat.discovery.merging import merged, united
 from drivesplat.discovery.seen_empty import seen_empty
 from drivesplat.discovery.separation import separated
@@ -28,17 +29,15 @@ SAME_VELOCITY, SAME_SHARE = 2.5, 0.5
 """Metres per second, and fraction of the speed, by which the velocities of parts of one object seem to differ."""
 SLACK = (1.0, 0.3)
 """Metres along and across a vehicle by which the middles of its parts may lie beyond its box."""
-NEARLY_ALWAYS = 0.75
-"""Fraction of their common time."""
+NEARLY_ALWAYS, FEW = 0.75, 0.1
+"""Fractions of their common time, and of the returns of the larger one."""
 MAX_CLEARANCE = 0.8
-"""Metres between the ground and the lowest return of an object. Far away it is the height of a kerb and the distance of
-two beams there, where that is more."""
+"""Metres between the ground and the lowest return of an object. Far away it is the height of a kerb and twice the
+distance of two beams there, where that is more."""
 MIN_MOVING = 0.4
 """Fraction of the returns in the place of an object that move."""
 BESIDE, KERB = 0.2, 0.3
 """Metres around a cluster, and above the ground, where returns are counted for it."""
-AROUND, LOWEST = 3.0, 5.0
-"""Metres around an object in which the lowest returns, by percentile, are the ground."""
 MAX_SEPARATIONS = 8
 """Rounds in which boxes and the returns that belong to them are found by turns."""
 Boxed = tuple[Chain, Discovered]
@@ -51,43 +50,42 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
     around = Surroundings(scans, moving)
     chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and around.confirm(chain)]
+    boxes = _without_overlaps([around.boxed(chain) for chain in chains], around)
+    boxes = _without_overlaps(_apart(boxes, around), around)
     ends = Ends(scans)
-    found = [ends.followed(item) for item in _apart(_without_overlaps(chains, around), around)]
-    return sorted(found, key=lambda it: it.seconds[0])
+    return sorted((ends.followed(item) for _, item in boxes), key=lambda it: it.seconds[0])
 
 
-def _apart(boxes: Sequence[Boxed], around: "Surroundings") -> list[Discovered]:
-    """The boxes of chains, refined by turns with the returns that belong to each, until these stay."""
+def _apart(boxes: Sequence[Boxed], around: "Surroundings") -> Sequence[Boxed]:
+    """Chains with their boxes, refined by turns with the returns that belong to each, until these stay."""
     for _ in range(MAX_SEPARATIONS if boxes else 0):
         before = [_counts(chain) for chain, _ in boxes]
         chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= MIN_SCANS]
         if [_counts(chain) for chain in chains] == before:
             break
-        boxes = [(chain, fitted_box(chain, around.grounds(chain))) for chain in chains]
-    return [box for _, box in boxes]
+        boxes = [around.boxed(chain) for chain in chains]
+    return boxes
 
 
 def _counts(chain: Chain) -> list[tuple[int, int]]:
     return [(cluster.scan, len(cluster.points)) for cluster in chain.clusters]
 
 
-def _without_overlaps(chains: Sequence[Chain], around: "Surroundings") -> list[Boxed]:
-    """The chains with their boxes; chains whose boxes overlap while both move are one object."""
-    boxes = [(chain, fitted_box(chain, around.grounds(chain))) for chain in chains]
+def _without_overlaps(boxes: Sequence[Boxed], around: "Surroundings") -> Sequence[Boxed]:
+    """Chains with their boxes, those whose boxes overlap while both move as one object."""
     while True:
         pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if overlap(boxes[i][1], boxes[j][1]))
         pair = next(pairs, None)
         if pair is None:
             return boxes
         whole = united(*(boxes[k][0] for k in pair))
-        boxes = [it for k, it in enumerate(boxes) if k not in pair]
-        boxes.append((whole, fitted_box(whole, around.grounds(whole))))
+        boxes = [it for k, it in enumerate(boxes) if k not in pair] + [around.boxed(whole)]
 
 
 def overlap(a: Discovered, b: Discovered) -> bool:
     """Whether two boxes are of one object: over their common time the centre of one mostly lies in the other, with
-    SLACK about vehicles, and they move alike; or it nearly always lies in a truck, on whose side patches seem to
-    slide."""
+    SLACK about vehicles, and they move alike; or it nearly always lies in a truck, on whose side patches seem to slide,
+    or in a box with many more returns."""
     first, last = max(a.seconds[0], b.seconds[0]), min(a.seconds[-1], b.seconds[-1])
     if last <= first:
         return False
@@ -97,8 +95,8 @@ def overlap(a: Discovered, b: Discovered) -> bool:
         slack = np.zeros(2) if outer.object_class.is_human else np.array(SLACK)
         if alike and _share_inside(outer, inner, seconds, slack) > 0.5:
             return True
-        is_long = outer.object_class is ObjectClass.TRUCK
-        if is_long and _share_inside(outer, inner, seconds, np.zeros(2)) > NEARLY_ALWAYS:
+        is_patch = outer.object_class is ObjectClass.TRUCK or inner.returns < FEW * outer.returns
+        if is_patch and _share_inside(outer, inner, seconds, np.zeros(2)) > NEARLY_ALWAYS:
             return True
     return False
 
@@ -140,36 +138,38 @@ def is_object(chain: Chain) -> bool:
 
 
 class Surroundings:
-    """What the scans say around clusters: the height of the ground, and returns that do not move."""
+    """What the scans say around clusters: the height of the ground, returns that do not move, and the range below which
+    nothing is measured."""
 
     def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " n"]]):
         self._scans, self._moving = scans, moving
         elevations = np.sort(scans[0].scan.rays.beam_elevations)
         self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
+        self._ground = Ground(scans, moving)
+        self._blind = max(_blind_range(scan) for scan in scans)
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
-        self._grounds: dict[tuple[int, float, float], float] = {}
 
-    def grounds(self, chain: Chain) -> Float[np.ndarray, " k"]:
-        """The height of the ground below each cluster of a chain in metres."""
-        return np.array([np.fmin(self._ground(cluster), cluster.lowest) for cluster in chain.clusters])
+    def boxed(self, chain: Chain) -> Boxed:
+        """A chain with its box."""
+        return chain, fitted_box(chain, self._grounds(chain), self._blind)
+
+    def _grounds(self, chain: Chain) -> Float[np.ndarray, " k"]:
+        """The height of the ground below each cluster of a chain in metres: where it is unknown, between known ones, or
+        that of the lowest returns."""
+        heights = np.array([self._ground.height(cluster.place) for cluster in chain.clusters])
+        known = np.isfinite(heights)
+        if not known.any():
+            return np.full(len(heights), min(cluster.lowest for cluster in chain.clusters))
+        return np.interp(chain.seconds, chain.seconds[known], heights[known])
 
     def confirm(self, chain: Chain) -> bool:
         """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
         move, as those of standing objects do not."""
-        clearances = np.array([cluster.lowest - self._ground(cluster) for cluster in chain.clusters])
-        excess = clearances - [max(MAX_CLEARANCE, KERB + self._beams_apart(cluster)) for cluster in chain.clusters]
+        clearances = np.array([cluster.lowest - self._ground.height(cluster.place) for cluster in chain.clusters])
+        excess = clearances - [max(MAX_CLEARANCE, KERB + 2 * self._beams_apart(cluster)) for cluster in chain.clusters]
         if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
             return False
         return bool(np.median([self._moving_share(cluster) for cluster in chain.clusters]) > MIN_MOVING)
-
-    def _ground(self, cluster: Cluster) -> float:
-        """The height of the ground around a cluster; NaN where too few returns are there."""
-        key = cluster.scan, *cluster.place.tolist()
-        if key not in self._grounds:
-            tree, heights = self._of_scan(cluster.scan)
-            near = tree.query_ball_point(cluster.place, AROUND)
-            self._grounds[key] = float(np.percentile(heights[near], LOWEST)) if len(near) >= 5 else float("nan")
-        return self._grounds[key]
 
     def _beams_apart(self, cluster: Cluster) -> float:
         """The vertical distance in metres of neighbouring beams at the place of a cluster."""
@@ -177,7 +177,7 @@ class Surroundings:
 
     def _moving_share(self, cluster: Cluster) -> float:
         """The fraction of the returns in a cluster's extents, above the ground where it is known, that move."""
-        ground = self._ground(cluster)
+        ground = self._ground.height(cluster.place)
         floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
         tree, heights = self._of_scan(cluster.scan)
         low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
@@ -195,3 +195,8 @@ class Surroundings:
             points = self._scans[number].points()[~self._moving[number]]
             self._standing[number] = cKDTree(points[:, :2]), points[:, 2]
         return self._standing[number]
+
+
+def _blind_range(scan: RecordedScan) -> float:
+    """The range in metres below which returns are not measured, as they are of the ego vehicle; 0 if there are none."""
+    return float(scan.scan.ranges[scan.scan.returned & ~scan.measured].max(initial=0.0))
