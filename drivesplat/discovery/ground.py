@@ -20,7 +20,7 @@ MAX_SCANS = 100
 LOWEST = 5.0
 """Percentile of the heights in a cell that is the ground."""
 AROUND, MIN_RETURNS = 3.0, 5
-"""Metres around a place whose cells count, and the least number of returns in them. A cell with as many or more has full
+"""Metres around a place whose cells count, and the least number of returns in them. Cells with as many or more have full
 weight."""
 
 

@@ -61,8 +61,8 @@ def regularization(gaussians: Gaussians, model: SplatModel, settings: TrainSetti
 def _dynamic_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The terms of dynamic parts, colours excepted; none for a model without such parts. Penalties of several parts that
-    have one name are added."""
+    """The terms of dynamic parts, colours excepted; none for a model without such parts. Penalties of one
+    name are added over the parts."""
     terms: dict[str, Float[Tensor, ""]] = {}
     for part in model.parts:
         for name, penalty in (part.penalties() | part.penalties_at(view.view.time)).items():

@@ -403,7 +403,8 @@ def test_terms_are_what_they_are_called():
 def test_penalties_of_several_parts_add_up():
     """Vehicles and people both have tracks whose corrections are penalised."""
     model, picture, view = street()
-    other = actors_of(track_of(motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 2.0]] * 3), "other", (1.0, 1.0, 1.0)), seed=1)
+    standing = motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 2.0]] * 3)
+    other = actors_of(track_of(standing, "other", (1.0, 1.0, 1.0)), seed=1)
     both = SplatModel([*model.parts, other], model.sky)
     terms = loss_terms(picture, view, both, TrainSettings())
     for name, penalty in model.parts[1].penalties().items():
