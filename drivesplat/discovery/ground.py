@@ -20,8 +20,8 @@ MAX_SCANS = 100
 LOWEST = 5.0
 """Percentile of the heights in a cell that is the ground."""
 AROUND, MIN_RETURNS = 3.0, 5
-"""Metres around a place whose cells count, and the least number of returns in them. Cells with as many or more have full
-weight."""
+"""Metres around a place whose cells count, and the least number of returns in them. Cells with as many or more have
+full weight."""
 
 
 class Ground:
