@@ -18,7 +18,8 @@ from benchmarks.speed.plain_images import ImageFiles, files_of_size
 from benchmarks.speed.plain_training import CHECKPOINT, fit
 from benchmarks.speed.plan import Task
 from benchmarks.speed.stage_clock import StageClock
-from drivesplat.evaluation.evaluate import evaluate_groups, protocol
+from drivesplat.evaluation.evaluate import protocol
+from drivesplat.evaluation.image_metrics import evaluate_groups
 from drivesplat.io.checkpoint_file import load
 from drivesplat.io.storage import read_json
 from drivesplat.machine.device import choose_device, device_name

@@ -23,8 +23,9 @@ def training_figures(summary: dict[str, Any]) -> dict[str, Any]:
 
 def holdout_figures(holdout: HoldoutSettings, key_frame_hz: float | None) -> dict[str, Any]:
     """The settings of a hold-out as far as they have an effect at this rate of key frames: without the neighbourhood
-    below NEIGHBOURHOOD_HZ."""
-    return holdout.model_dump(exclude=set() if _dense(key_frame_hz) else {"neighbourhood_s"})
+    below NEIGHBOURHOOD_HZ, and without `cameras` if all are trained on."""
+    unused = {"neighbourhood_s": not _dense(key_frame_hz), "cameras": not holdout.cameras}
+    return holdout.model_dump(mode="json", exclude={name for name, is_unused in unused.items() if is_unused})
 
 
 def rate_figures(key_frame_hz: float | None, held_out: ArrayLike, training: ArrayLike) -> dict[str, Any]:

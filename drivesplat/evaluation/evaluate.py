@@ -1,29 +1,29 @@
 """The stage `evaluate`: renderings compared with held-out images, by region."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
 
-from drivesplat.errors import DatasetError
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, training_figures
+from drivesplat.evaluation.image_metrics import (
+    evaluate_groups,
+    held_out_depths,
+    held_out_images,
+    measured_images,
+    side_camera_metrics,
+)
 from drivesplat.evaluation.lpips_map import load_lpips
-from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
-from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
+from drivesplat.evaluation.metrics import LpipsMap
 from drivesplat.evaluation.scan_evaluation import lidar_metrics
 from drivesplat.evaluation.scan_truth import ScanTruth, scan_truth_metrics
-from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered, rendered_with_depth
-from drivesplat.io.prefetch import prefetch
+from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.io.storage import Provenance
-from drivesplat.lidar.depth import depths_in, split_sweeps
-from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
 from drivesplat.model.splat_model import SplatModel
@@ -31,13 +31,12 @@ from drivesplat.model.view import view_of
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.masks import MasksRecord, read_masks_record
 from drivesplat.scene.prepared_drive import PreparedDrive, read_prepared_drive
-from drivesplat.scene.regions import REGIONS, region_mask, region_masks
+from drivesplat.scene.regions import region_mask
 from drivesplat.scene.scan_record import ScanRecords, read_scans
-from drivesplat.scene.splits import HELD_OUT_GROUPS
+from drivesplat.scene.splits import HELD_OUT_GROUPS, SIDE_CAMERA
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.method import merged
 
 STATIC_FINDING_DB = 22.0
@@ -115,6 +114,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
             spread = inputs.checkpoint.job.train.scans.beam_spread_rad
             lidar = lidar_metrics(model, inputs.recording.scene, inputs.scans, spread, device)
             groups = {group: {**metrics, "lidar": lidar[group]} for group, metrics in groups.items()}
+        aside = side_camera_metrics(model, inputs.recording, lpips_map, device)
         against_truth = truth_metrics(model, inputs, job, lpips_map, device)
         sample = render_sample_pair(model, inputs.recording, job.eval_camera, device)
     record = {
@@ -125,6 +125,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
         "drive": summarize_drive(inputs.recording, job.eval_camera, measured_images(training, job.eval_camera)),
         "result": {
             **groups,
+            **({SIDE_CAMERA: aside} if aside else {}),
             **against_truth,
             "tracks": job.tracks,
             **training_figures(inputs.summary),
@@ -195,62 +196,6 @@ def findings(group: dict[str, Any]) -> dict[str, bool | None]:
     }
 
 
-def held_out_depths(recording: PreparedDrive, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
-    """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
-    missing."""
-    scene = recording.scene
-    clouds = {cloud.sample_index: cloud for cloud in split_sweeps(scene, job, HELD_OUT_GROUPS)}
-    images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.record, group, camera)]
-    owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
-    return {i: depths_in(scene, scene.frames[i], cloud, job, recording.ego_mask(i)) for i, cloud in owned.items()}
-
-
-def evaluate_groups(
-    model: SplatModel,
-    recording: PreparedDrive,
-    camera: str,
-    lpips_map: LpipsMap | None,
-    device: torch.device,
-    depths: Mapping[int, PixelDepths] = MappingProxyType({}),
-) -> dict[str, dict[str, Any]]:
-    """The metrics of every held-out group by region. With LiDAR `depths` of images, by index, also `depth`; with
-    several cameras also `overlap` and `no_overlap`, the static pixels that other cameras see as well, and the rest."""
-    of_group = partial(_group_metrics, model, recording, lpips_map, device, depths)
-    return {group: of_group(images) for group, images in measured_images(recording.record, camera).items()}
-
-
-def _group_metrics(
-    model: SplatModel,
-    recording: PreparedDrive,
-    lpips_map: LpipsMap | None,
-    device: torch.device,
-    depths: Mapping[int, PixelDepths],
-    images: list[int],
-) -> dict[str, Any]:
-    """The metrics of a held-out group of `images`."""
-    record = recording.record
-    several_cameras = len(record.camera_names) > 1
-    metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if several_cameras else ()))), DepthErrors()
-
-    def renderings() -> Iterator[tuple[int, np.ndarray]]:
-        for index in images:
-            image, metres = rendered_with_depth(model, view_of(record, index, device))
-            if index in depths:
-                depth.add(metres, depths[index])
-            yield index, image
-
-    def measure(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:
-        index, image = one
-        masks = region_masks(recording.labels(index))
-        if several_cameras:
-            masks |= overlap_masks(record, index, masks["static"])
-        return metrics.measure(image, recording.image(index), masks)
-
-    for frame in prefetch(measure, renderings(), measuring_threads()):
-        metrics.add(frame)
-    return {**with_gap(metrics.summary()), **depth.summary()}
-
-
 def render_sample_pair(model: SplatModel, recording: PreparedDrive, camera: str, device: torch.device) -> SamplePair:
     """The held-out key frame of `camera` with the most pixels of moving vehicles, from the first group with held-out
     frames; a training key frame if nothing is held out."""
@@ -267,21 +212,3 @@ def _candidates(recording: PreparedDrive, camera: str) -> tuple[str, list[int]]:
         if images:
             return group, images
     raise ValueError(f"no key frame of {camera} takes part")
-
-
-def held_out_images(record: TrainingRecord, group: str, camera: str) -> list[int]:
-    """The indices of the images of `group` (or 'train') that are measured: key frames of the evaluated camera.
-
-    Raises DatasetError if the scene lacks that camera.
-    """
-    if camera not in record.camera_names:
-        raise DatasetError(
-            f"eval_camera {camera} is not among the cameras of this run ({', '.join(record.camera_names)})"
-        )
-    wanted = record.camera_names.index(camera)
-    return [int(i) for i in record.splits[group] if record.camera_indices[i] == wanted and record.is_key_frame[i]]
-
-
-def measured_images(record: TrainingRecord, camera: str) -> dict[str, list[int]]:
-    """The indices of the measured images by held-out group. Raises DatasetError as `held_out_images` does."""
-    return {group: held_out_images(record, group, camera) for group in HELD_OUT_GROUPS}

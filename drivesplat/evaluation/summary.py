@@ -8,6 +8,7 @@ from typing import Any
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation.comparison import GROUP_PLACES
+from drivesplat.evaluation.views_aside import LATERAL, place_of_view, views_aside
 from drivesplat.io.storage import read_json
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.scene.scene_warnings import DARK
@@ -37,10 +38,10 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
             if regions := method[group].get("lidar"):
                 others = {other: groups[group] for other, groups in metrics.get("lidar_baselines", {}).items()}
                 lines.append(f"{name}, LiDAR scans {where}: {_scans_with_baselines(regions, others)}")
-        for offset, view in method.get("lateral", {}).items():
-            if found := _lateral_figures(view):
-                metres, side = abs(float(offset)), "left" if float(offset) > 0 else "right"
-                lines.append(f"{name}, from {metres:g} m to the {side}, against truth: {', '.join(found)}")
+        for kind, key in views_aside([method]):
+            if found := _figures_of_view(method[kind][key]):
+                against = "truth" if kind == LATERAL else "images left out of training"
+                lines.append(f"{name}, from {place_of_view((kind, key))}, against {against}: {', '.join(found)}")
         removal = method.get("removal", {})
         removed, before = (_psnr(regions, "box") for regions in (removal, removal.get("not_removed", {})))
         if removed is not None and before is not None:
@@ -86,8 +87,8 @@ def _psnr(regions: dict[str, Any], region: str) -> float | None:
     return (regions.get(region) or {}).get("psnr")
 
 
-def _lateral_figures(view: dict[str, Any]) -> list[str]:
-    """The figures of a lateral view that are not null."""
+def _figures_of_view(view: dict[str, Any]) -> list[str]:
+    """The figures of a view from beside the path that are not null."""
     names = {"static": "static", "moving_vehicle": "moving vehicles"}
     psnrs = {name: _psnr(view, region) for region, name in names.items()}
     found = [f"{name} {psnr:.1f} dB" for name, psnr in psnrs.items() if psnr is not None]

@@ -10,7 +10,14 @@ from drivesplat.report.gaps import gap_report, summary_sentences
 from drivesplat.report.ghosts import render_ghosts_page
 from drivesplat.report.html import report_page
 from drivesplat.report.media import collect_media
-from drivesplat.report.tables import gap_table, lidar_tables, published_tables, whole_image_table, write_figures
+from drivesplat.report.tables import (
+    aside_tables,
+    gap_table,
+    lidar_tables,
+    published_tables,
+    whole_image_table,
+    write_figures,
+)
 from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
@@ -49,11 +56,11 @@ def _costs(results: Path, job: ReportJob) -> list[dict[str, Any]]:
 
 
 def console_table(report: dict[str, Any]) -> str:
-    """PSNR by region, the metrics of whole images and of LiDAR scans as tables with a line per scene and method and
-    means, summary sentences, and missing scenes."""
+    """PSNR by region, the metrics of whole images, of views from beside the path and of LiDAR scans as tables with a
+    line per scene and method and means, summary sentences, and missing scenes."""
     notes = [f"{item['scene']}: left out ({item['why']})" for item in report["left_out"]]
     notes += [f"{item['scene']}: {item['why']}" for item in report["missing"]]
     title = "PSNR in dB on held-out frames" + (" (partial: see below)" if report["partial"] else "")
     tables = [gap_table(report), "Whole images", whole_image_table(report)] if report["rows"] else []
-    more = [*lidar_tables(report), *published_tables(report)]
+    more = [*aside_tables(report), *lidar_tables(report), *published_tables(report)]
     return "\n".join([title, *tables, *more, *summary_sentences(report), *notes])

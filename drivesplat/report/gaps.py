@@ -14,6 +14,7 @@ from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.provenance.record import differences
+from drivesplat.report.aside import aside_report, aside_rows
 from drivesplat.report.lidar import lidar_report, lidar_rows
 from drivesplat.report.published import Measured, beside_published, measured_figures
 from drivesplat.report.statistics import PairedPsnr, gap_closed, mean_over_scenes
@@ -34,11 +35,12 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
 
     Results of other settings or code than `job` expects, or of another protocol than the first, are listed under
     `left_out`. `missing` lists the configured scenes without a result, with the reason from the jobs' `logs`.
-    `partial`: whether either is not empty. `lidar` is that of `lidar_report`; `published` has published figures beside
-    those of the same scenes.
+    `partial`: whether either is not empty. `aside` is that of `aside_report`, `lidar` that of `lidar_report`;
+    `published` has published figures beside those of the same scenes.
     """
     rows: list[dict[str, Any]] = []
     scans: list[dict[str, Any]] = []
+    aside: list[dict[str, Any]] = []
     left_out: list[dict[str, str]] = []
     measured: dict[str, Any] = {}
     protocols: dict[str, Any] = {}
@@ -49,7 +51,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
             record = read_json(path, rule="scene_metrics")
             checked_digest(path, warn=False)
             reasons = _mismatches(record, job.expected, measured)
-            scene_rows, scene_scans = _rows(record), lidar_rows(record)
+            scene_rows, scene_scans, scene_aside = _rows(record), lidar_rows(record), aside_rows(record)
             scene_figures = measured_figures(record, job.published)
             scene = record["scene"]
         except ResultError as error:
@@ -64,6 +66,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
         figures[scene] = scene_figures
         rows += scene_rows
         scans += scene_scans
+        aside += scene_aside
     named = {*measured, *(item["scene"] for item in left_out)}
     missing = [{"scene": scene, "why": why_missing(logs, scene)} for scene in job.expected if scene not in named]
     return {
@@ -73,6 +76,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
         "rows": rows,
         "means": _means(rows, job.random_seed),
         "gap_closed": _gaps_closed(rows, job.reference, job.random_seed),
+        "aside": aside_report(aside, job.random_seed),
         "lidar": lidar_report(scans, job.random_seed),
         "left_out": left_out,
         "missing": missing,

@@ -9,6 +9,7 @@ from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
 from drivesplat.io.html_page import filled_page
 from drivesplat.report import page
+from drivesplat.report.aside import aside_table
 from drivesplat.report.gaps import shows_other_tracks, shows_people, summary_sentences
 from drivesplat.report.lidar import page_table
 from drivesplat.report.media import MethodMedia, data_url, difference_position, read_image
@@ -75,6 +76,7 @@ def report_page(
             *([_table("Moving people: PSNR in dB", names, HUMAN_FIGURES, [])] if shows_people(report) else []),
             _table("Whole images, with the cost of training", names, WHOLE_IMAGE_FIGURES, COSTS),
         ],
+        aside=aside_table(report["aside"]),
         lidar=page_table(report["lidar"]),
         publications=_publications(report["published"]),
         published_columns=PUBLISHED_FIGURES,

@@ -6,6 +6,7 @@ from typing import Any
 import pandas as pd
 
 from drivesplat.io.storage import atomic_write
+from drivesplat.report.aside import aside_columns, aside_table
 from drivesplat.report.gaps import COLUMNS, HUMANS, REGIONS, shows_other_tracks, shows_people
 from drivesplat.report.lidar import LIDAR_COLUMNS, REGION_NAMES, page_table
 from drivesplat.scene.splits import HELD_OUT_GROUPS
@@ -31,12 +32,15 @@ def figures_of(report: dict[str, Any]) -> pd.DataFrame:
 
 
 def write_figures(path: str | Path, report: dict[str, Any]) -> None:
-    """Writes the figures of a report as CSV; missing ones are empty cells. Where methods render LiDAR, LIDAR_COLUMNS
-    follow, and rows of the baselines. Published figures of whole images follow, in the same columns, with their source;
-    so do the measured means that they are compared with."""
-    table = figures_of(report)
+    """Writes the figures of a report as CSV; missing ones are empty cells. Where there are views from beside the path,
+    their figures follow; where methods render LiDAR, LIDAR_COLUMNS, and rows of the baselines. Published figures of
+    whole images follow, in the same columns, with their source; so do the measured means that they are compared with.
+    """
+    table, names = figures_of(report), ["scene", "dataset", "method"]
+    if columns := aside_columns(report["aside"]["rows"]):
+        added = [dict(zip(names, key, strict=True)) | figures for key, figures in columns.items()]
+        table = table.merge(pd.DataFrame(added, dtype=object), how="left")
     if report["lidar"]["rows"]:
-        names = ["scene", "dataset", "method"]
         scans = pd.DataFrame(report["lidar"]["rows"], dtype=object)
         shown, of_baselines = [*names, *LIDAR_COLUMNS], scans["baseline"].astype(bool)
         table = pd.concat([table.merge(scans.loc[~of_baselines, shown], how="left"), scans.loc[of_baselines, shown]])
@@ -65,6 +69,21 @@ def gap_table(report: dict[str, Any]) -> str:
 def whole_image_table(report: dict[str, Any]) -> str:
     """PSNR, SSIM and LPIPS of whole images in both groups, Gaussians and training time, and the means over scenes."""
     return _as_text(report, ["psnr", "ssim", "lpips"], COSTS)
+
+
+def aside_tables(report: dict[str, Any]) -> list[str]:
+    """A heading and a table of views from beside the path: a line per view, scene and method, and the means over
+    scenes. Empty where there are none."""
+    table = aside_table(report["aside"])
+    shown = [(row["scene"], row, row) for row in table["rows"]]
+    shown += [("mean", mean, mean["figures"]) for mean in table["means"]]
+    lines = [
+        [scene, names["place"], names["method"], *(_cell(figures[c["key"]], c["form"]) for c in table["columns"])]
+        for scene, names, figures in shown
+    ]
+    heads = [column["title"].rstrip(" ↑↓") for column in table["columns"]]
+    text = pd.DataFrame(lines, columns=["scene", "view", "method", *heads], dtype=object).to_string(index=False)
+    return ["Views from beside the recorded path", text] if lines else []
 
 
 def lidar_tables(report: dict[str, Any]) -> list[str]:

@@ -8,10 +8,12 @@ import numpy as np
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.settings.images import HoldoutSettings
 
-Group = Literal["train", "interpolation", "extrapolation", "excluded"]
+Group = Literal["train", "interpolation", "extrapolation", "side_camera", "excluded"]
 NEIGHBOURHOOD_HZ = 5.0
 """Key frames a second from which `holdout.neighbourhood_s` applies."""
 HELD_OUT_GROUPS: tuple[Group, Group] = ("interpolation", "extrapolation")
+SIDE_CAMERA: Group = "side_camera"
+"""The group of images of `holdout.cameras` at times at which other cameras have training images."""
 
 
 def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[int]]:
@@ -22,8 +24,13 @@ def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[
 
 
 def frame_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
-    """The group of every image of the scene, in the order of `scene.frames`."""
-    return _groups(scene, scene.frames, holdout)
+    """The group of every image of the scene, in the order of `scene.frames`. What would be 'train' is 'side_camera' for
+    images of `holdout.cameras`."""
+    groups = _groups(scene, scene.frames, holdout)
+    return [
+        SIDE_CAMERA if group == "train" and frame.camera in holdout.cameras else group
+        for frame, group in zip(scene.frames, groups, strict=True)
+    ]
 
 
 def training_images(scene: Scene, holdout: HoldoutSettings) -> np.ndarray:

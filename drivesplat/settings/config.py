@@ -158,6 +158,11 @@ class Config(Settings):
                 f"eval_camera {self.eval_camera} is set, but cameras is empty: nothing is measured on images; write "
                 "eval_camera: null beside cameras: []"
             )
+        for camera in self.holdout.cameras:
+            if camera not in self.cameras:
+                raise ValueError(f"holdout.cameras: {camera} is not among cameras ({', '.join(self.cameras)})")
+            if camera == self.eval_camera:
+                raise ValueError(f"holdout.cameras: {camera} is eval_camera, whose images are trained on")
         if self.scans.sweeps and not self.lidar_seed.sweeps:
             raise ValueError("scans.sweeps needs lidar_seed.sweeps: true, which reads LiDAR between key frames")
         return self

@@ -22,6 +22,9 @@ class HoldoutSettings(Settings):
     neighbourhood_s: float = Field(0.25, ge=0, le=5)
     """Time in seconds around a held-out key frame in which nothing is trained on, for datasets with 5 key frames a
     second or more. Below that rate it is half the interval between key frames."""
+    cameras: tuple[str, ...] = ()
+    """Cameras of which no image is trained on: views from elsewhere at the times of training images, group
+    'side_camera'. Any of `cameras` but eval_camera."""
 
     @model_validator(mode="after")
     def _offset_within_period(self) -> "HoldoutSettings":

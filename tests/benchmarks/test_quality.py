@@ -151,7 +151,7 @@ def test_figures_against_the_truth_have_tables_of_their_own(compared):
         }
     record = compared(evals, TWO)
     plain, street = (row["truth"] for row in record["tables"][0]["rows"])
-    assert plain == {"lateral": {}, "removal": {"removed": None, "not_removed": None}}
+    assert plain == {"lateral": {}, "side_camera": {}, "removal": {"removed": None, "not_removed": None}}
     assert street["lateral"]["-2.0"]["static"]["by_seed"] == [22.0, 23.0]
     page = markdown(record)
     *_, lateral, removal, _ = rows(page)

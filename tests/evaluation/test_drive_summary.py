@@ -9,7 +9,7 @@ from helpers.tiny_world import World
 from PIL import Image
 
 from drivesplat.evaluation.drive_summary import summarize_drive
-from drivesplat.evaluation.evaluate import measured_images
+from drivesplat.evaluation.image_metrics import measured_images
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.prepared_drive import PreparedDrive

@@ -10,7 +10,7 @@ import torch
 from helpers.hand_made import looking_at, recording_of, round_gaussians
 from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
 
-from drivesplat.evaluation.evaluate import evaluate_groups, held_out_depths
+from drivesplat.evaluation.image_metrics import evaluate_groups, held_out_depths
 from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, DepthErrors
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth_record import PixelDepths

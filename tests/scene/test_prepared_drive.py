@@ -10,7 +10,7 @@ from helpers.hand_made import recording_of, round_gaussians, write_labels
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.evaluation.evaluate import evaluate_groups
+from drivesplat.evaluation.image_metrics import evaluate_groups
 from drivesplat.io.storage import write_json
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel

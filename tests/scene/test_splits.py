@@ -101,6 +101,18 @@ def test_all_cameras_images_of_a_held_out_timestamp_are_held_out():
     assert groups == {(c, i): HELD_OUT.get(i, "train") for c in ("CAM_FRONT", "CAM_BACK") for i in range(10)}
 
 
+def test_a_camera_that_is_left_out_has_a_group_of_its_own_at_training_times():
+    """What is held out or excluded anyway stays so, and the other camera's groups do not change."""
+    scene = drive(10)
+    left_out = HOLDOUT.model_copy(update={"cameras": ("CAM_BACK",)})
+    for frame, group, before in zip(
+        scene.frames, frame_groups(scene, left_out), frame_groups(scene, HOLDOUT), strict=True
+    ):
+        aside = frame.camera == "CAM_BACK" and before == "train"
+        assert group == ("side_camera" if aside else before)
+    assert sweep_groups(scene, left_out) == sweep_groups(scene, HOLDOUT)
+
+
 def test_images_between_key_frames_are_excluded_within_half_an_interval_of_a_held_out_one():
     scene = drive(10)
     between = [(f, g) for f, g in zip(scene.frames, frame_groups(scene, HOLDOUT), strict=True) if not f.is_key_frame]

@@ -1,0 +1,110 @@
+"""The metrics of the images of a recording that a model was not trained on, by group and region."""
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+
+from drivesplat.errors import DatasetError
+from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
+from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
+from drivesplat.evaluation.synthetic import rendered_with_depth
+from drivesplat.io.prefetch import prefetch
+from drivesplat.lidar.depth import depths_in, split_sweeps
+from drivesplat.lidar.depth_record import PixelDepths
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
+from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.regions import REGIONS, region_masks
+from drivesplat.scene.splits import HELD_OUT_GROUPS, SIDE_CAMERA
+from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.lidar_depth import LidarDepthJob
+
+
+def evaluate_groups(
+    model: SplatModel,
+    recording: PreparedDrive,
+    camera: str,
+    lpips_map: LpipsMap | None,
+    device: torch.device,
+    depths: Mapping[int, PixelDepths] = MappingProxyType({}),
+) -> dict[str, dict[str, Any]]:
+    """The metrics of every held-out group by region. With LiDAR `depths` of images, by index, also `depth`; with
+    several cameras also `overlap` and `no_overlap`, the static pixels that other cameras see as well, and the rest."""
+    of_group = partial(_group_metrics, model, recording, lpips_map, device, depths)
+    return {group: of_group(images) for group, images in measured_images(recording.record, camera).items()}
+
+
+def side_camera_metrics(
+    model: SplatModel, recording: PreparedDrive, lpips_map: LpipsMap | None, device: torch.device
+) -> dict[str, dict[str, Any]]:
+    """The metrics by region of each camera of `holdout.cameras`, over its key frames at which other cameras were
+    trained on. LiDAR depth of these was trained on, too, and is not measured."""
+    record = recording.record
+    left_out = [int(i) for i in record.splits[SIDE_CAMERA] if record.is_key_frame[i]]
+    cameras = sorted({record.camera_name(index) for index in left_out})
+    images = {camera: [i for i in left_out if record.camera_name(i) == camera] for camera in cameras}
+    return {name: _group_metrics(model, recording, lpips_map, device, {}, own) for name, own in images.items()}
+
+
+def _group_metrics(
+    model: SplatModel,
+    recording: PreparedDrive,
+    lpips_map: LpipsMap | None,
+    device: torch.device,
+    depths: Mapping[int, PixelDepths],
+    images: list[int],
+) -> dict[str, Any]:
+    """The metrics of a held-out group of `images`."""
+    record = recording.record
+    several_cameras = len(record.camera_names) > 1
+    metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if several_cameras else ()))), DepthErrors()
+
+    def renderings() -> Iterator[tuple[int, np.ndarray]]:
+        for index in images:
+            image, metres = rendered_with_depth(model, view_of(record, index, device))
+            if index in depths:
+                depth.add(metres, depths[index])
+            yield index, image
+
+    def measure(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:
+        index, image = one
+        masks = region_masks(recording.labels(index))
+        if several_cameras:
+            masks |= overlap_masks(record, index, masks["static"])
+        return metrics.measure(image, recording.image(index), masks)
+
+    for frame in prefetch(measure, renderings(), measuring_threads()):
+        metrics.add(frame)
+    return {**with_gap(metrics.summary()), **depth.summary()}
+
+
+def held_out_depths(recording: PreparedDrive, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
+    """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
+    missing."""
+    scene = recording.scene
+    clouds = {cloud.sample_index: cloud for cloud in split_sweeps(scene, job, HELD_OUT_GROUPS)}
+    images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.record, group, camera)]
+    owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
+    return {i: depths_in(scene, scene.frames[i], cloud, job, recording.ego_mask(i)) for i, cloud in owned.items()}
+
+
+def held_out_images(record: TrainingRecord, group: str, camera: str) -> list[int]:
+    """The indices of the images of `group` (or 'train') that are measured: key frames of the evaluated camera.
+
+    Raises DatasetError if the scene lacks that camera.
+    """
+    if camera not in record.camera_names:
+        raise DatasetError(
+            f"eval_camera {camera} is not among the cameras of this run ({', '.join(record.camera_names)})"
+        )
+    wanted = record.camera_names.index(camera)
+    return [int(i) for i in record.splits[group] if record.camera_indices[i] == wanted and record.is_key_frame[i]]
+
+
+def measured_images(record: TrainingRecord, camera: str) -> dict[str, list[int]]:
+    """The indices of the measured images by held-out group. Raises DatasetError as `held_out_images` does."""
+    return {group: held_out_images(record, group, camera) for group in HELD_OUT_GROUPS}
