@@ -30,13 +30,14 @@ class Ground:
     def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " n"]]):
         chosen = np.unique(np.linspace(0, len(scans) - 1, MAX_SCANS).round().astype(int))
         points = np.concatenate([_near(scans[k], moving[k]) for k in chosen])
-        cells, owners = np.unique(np.floor(points[:, :2] / CELL), axis=0, return_inverse=True)
-        order = np.lexsort((points[:, 2], owners.ravel()))
-        counts = np.bincount(owners.ravel(), minlength=len(cells))
-        lowest = np.cumsum(counts) - counts + (counts * LOWEST / 100.0).astype(int)
-        self._heights = points[order, 2][lowest]
+        cells = np.floor(points[:, :2] / CELL)
+        order = np.lexsort((points[:, 2], cells[:, 1], cells[:, 0]))
+        starts = np.flatnonzero(np.diff(cells[order], axis=0, prepend=np.nan).any(axis=1))  # NaN counts as a change
+        counts = np.diff(starts, append=len(order))
+        lowest = order[starts + (counts * LOWEST / 100.0).astype(int)]
+        self._heights = points[lowest, 2]
         self._weights = np.minimum(counts, MIN_RETURNS)
-        self._cells = cKDTree((cells + 0.5) * CELL)
+        self._cells = cKDTree((cells[lowest] + 0.5) * CELL)
 
     def height(self, place: Float[np.ndarray, "2"]) -> float:
         """The height in metres at a place in the world, the weighted median of the cells around; NaN where it is

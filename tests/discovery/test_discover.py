@@ -13,7 +13,8 @@ from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan import Scan, ScanRays
 from drivesplat.scene.scan_record import RecordedScan
 
-SECONDS = 0.1 * np.arange(45)
+SECONDS = 0.1 * np.arange(33)
+LONG = 0.1 * np.arange(45)
 
 
 def found_in(*movers: Mover, speed: float = 5.0, seconds: np.ndarray = SECONDS) -> list[Discovered]:
@@ -39,7 +40,7 @@ def offsets(item: Discovered, mover: Mover, seconds: np.ndarray | None = None) -
     ids=["ahead", "oncoming", "crossing", "truck"],
 )
 def test_a_vehicle_is_found_with_its_place_heading_and_size(mover):
-    (item,) = found_in(mover)
+    (item,) = found_in(mover, seconds=LONG)
     assert item.object_class in (ObjectClass.CAR, ObjectClass.TRUCK)
     assert (item.object_class is ObjectClass.TRUCK) == (mover.size[0] > 6.0)
     along, across = np.median(np.abs(offsets(item, mover)), axis=0)
@@ -109,7 +110,7 @@ def test_where_nothing_moves_nothing_is_found():
 
 def test_a_car_that_starts_is_known_while_it_moves():
     starting = Mover((15.0, 3.5), (6.0, 0.0), starts=2.0)
-    (item,) = found_in(starting, speed=3.0)
+    (item,) = found_in(starting, speed=3.0, seconds=LONG)
     moving = item.seconds[item.seconds > 2.3]
     assert len(moving) > 15 and np.median(np.abs(offsets(item, starting, moving)), axis=0).max() < 0.35
 

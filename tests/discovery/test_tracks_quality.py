@@ -2,13 +2,17 @@
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.street_scans import Mover, street_scans
 
+from drivesplat.discovery.boxes import Discovered
+from drivesplat.discovery.discover import discovered
+from drivesplat.discovery.quality import tracks_quality
 from drivesplat.discovery.record import DiscoveredTracks, read_discovered, write_discovered
-from drivesplat.discovery.tracks import discovered_tracks
+from drivesplat.discovery.tracks import discovered_tracks, searched, tracks_of
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import ScanRecords
@@ -60,27 +64,36 @@ def test_an_annotated_mover_is_found_and_a_parked_car_is_none(tiny_scene, record
     )
 
 
-def test_a_mover_elsewhere_is_missed_and_its_track_wrong(tiny_scene, records):
-    scene = scene_of(tiny_scene, annotated(AHEAD, "ahead", aside=3.0))
-    quality = discovered_tracks(scene, records, ANY).quality["vehicle"]
+@pytest.fixture(scope="module")
+def objects(records) -> list[Discovered]:
+    return discovered(records.scans)
+
+
+def quality_of(scene: Scene, objects: list[Discovered], records: ScanRecords) -> dict[str, Any]:
+    return tracks_quality(scene, tracks_of(scene, objects), records.scans, records.tracks)["vehicle"]
+
+
+def test_a_mover_elsewhere_is_missed_and_its_track_wrong(tiny_scene, records, objects):
+    quality = quality_of(scene_of(tiny_scene, annotated(AHEAD, "ahead", aside=3.0)), objects, records)
     assert (quality["movers"], quality["recall"], quality["precision"]) == (1, 0.0, 0.0)
     assert quality["lateral_m"] is None
-    near = scene_of(tiny_scene, annotated(AHEAD, "ahead", aside=1.0))
-    assert discovered_tracks(near, records, ANY).quality["vehicle"]["lateral_m"] == pytest.approx(1.0, abs=0.15)
+    near = quality_of(scene_of(tiny_scene, annotated(AHEAD, "ahead", aside=1.0)), objects, records)
+    assert near["lateral_m"] == pytest.approx(1.0, abs=0.15)
 
 
 def test_without_annotations_nothing_is_compared(tiny_scene, records):
-    found = discovered_tracks(scene_of(tiny_scene), records, ANY)
-    assert len(found.tracks) == 1 and found.quality is None
+    found = discovered_tracks(scene_of(tiny_scene), replace(records, scans=records.scans[:3]), ANY)
+    assert found.scans == 3 and found.quality is None
 
 
 def test_of_several_lidars_the_richest_or_the_named_one_is_searched(tiny_scene, records):
     few = [replace(scan, lidar="FRONT") for scan in records.scans[:3]]
-    both = replace(records, scans=[*few, *records.scans])
-    assert discovered_tracks(scene_of(tiny_scene), both, ANY).lidar == "TOP"
-    assert discovered_tracks(scene_of(tiny_scene), both, DiscoverSettings(lidar="FRONT")).scans == 3
+    scene, both = scene_of(tiny_scene), replace(records, scans=[*few, *records.scans])
+    assert searched(scene, both, None) == ("TOP", records.scans)
+    assert searched(scene, both, "FRONT") == ("FRONT", few)
+    assert discovered_tracks(scene, both, DiscoverSettings(lidar="FRONT")).scans == 3
     with pytest.raises(DatasetError, match=r"no scan of discover\.lidar BACK; choose one of FRONT, TOP"):
-        discovered_tracks(scene_of(tiny_scene), both, DiscoverSettings(lidar="BACK"))
+        discovered_tracks(scene, both, DiscoverSettings(lidar="BACK"))
 
 
 def test_without_lidar_the_search_is_refused_and_a_single_scan_tells_nothing(tiny_scene, records, caplog):
@@ -91,8 +104,9 @@ def test_without_lidar_the_search_is_refused_and_a_single_scan_tells_nothing(tin
     assert found.tracks == () and "a single scan" in caplog.text
 
 
-def test_a_record_is_read_as_it_was_written_and_others_are_refused(tmp_path, tiny_scene, records):
-    found = discovered_tracks(scene_of(tiny_scene, annotated(AHEAD, "ahead")), records, ANY)
+def test_a_record_is_read_as_it_was_written_and_others_are_refused(tmp_path, tiny_scene, records, objects):
+    scene = scene_of(tiny_scene, annotated(AHEAD, "ahead"))
+    found = DiscoveredTracks("TOP", 46, tuple(tracks_of(scene, objects)), {"vehicle": {"recall": 1.0, "along_m": None}})
     write_discovered(tmp_path / "discovered.json", found)
     again = read_discovered(tmp_path / "discovered.json")
     assert isinstance(again, DiscoveredTracks) and again.quality == found.quality

@@ -294,9 +294,9 @@ def test_an_image_corrects_positions_and_headings_by_its_gradient():
     settings = ActorSettings(sh_degree=0, fourier=2)
     actors = in_double(actors_of(track_of(motion, size=(2.0, 1.0, 1.0)), settings=settings, count=8))
     model = SplatModel([actors], None)
-    view = looking_at([2.8, 0.0, 0.0], [2.8, -5.0, 1.0], time=0.7)
+    view = looking_at([2.8, 0.0, 0.0], [2.8, -5.0, 1.0], time=0.7, width=18, height=12)
     view = dataclasses.replace(view, K=view.K.double(), camera_to_world=view.camera_to_world.double())
-    ramp = torch.linspace(-1.0, 1.0, 48, dtype=torch.float64)[:, None] * torch.tensor([1.0, -2.0, 1.5])
+    ramp = torch.linspace(-9.0, 9.0, 18, dtype=torch.float64)[:, None] * torch.tensor([1.0, -2.0, 1.5])
 
     def loss() -> torch.Tensor:
         return (model.render(view).image * ramp).sum()
