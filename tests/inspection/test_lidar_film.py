@@ -24,7 +24,7 @@ from drivesplat.inspection.lidar_frame import (
 from drivesplat.inspection.scan_picture import ERROR_COLORS, ERRORS, RANGE_COLORS, RANGES, UNMEASURED
 from drivesplat.io.video import read_footage
 from drivesplat.scene.scan import RenderedScan
-from drivesplat.scene.splits import Group
+from drivesplat.scene.splits import SIDE_CAMERA, Group
 from drivesplat.settings.render import LidarFilmJob
 
 LEVEL, AHEAD, LEFT = 2, STEPS // 2, STEPS // 2 + STEPS // 4
@@ -148,7 +148,7 @@ def test_captions_say_which_scans_are_held_out(lidar_of, tmp_path, monkeypatch):
         ["training scan"], ["held out between training frames"], ["neither trained on nor measured"],
         ["held out beyond the last training frame"],
     ]  # fmt: skip
-    assert set(NOTES) == set(get_args(Group))
+    assert {*NOTES, SIDE_CAMERA} == set(get_args(Group))
     assert captions[0].labels[0].startswith("range off by 10.0 cm (median)") and captions[3].clock == "1.5 s"
     assert captions[1].labels == ["0.0 % of returns and drops right"], "nothing was recorded there"
 

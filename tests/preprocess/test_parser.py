@@ -70,7 +70,7 @@ def test_cameras_are_counted_in_order_of_appearance(tiny_scene, seed):
 
 def test_splits_are_disjoint_and_cover_every_image(tiny_scene, seed):
     record = training_record(tiny_scene, seed, job())
-    assert record.splits.keys() == {"train", "interpolation", "extrapolation", "excluded"}
+    assert record.splits.keys() == {"train", "interpolation", "extrapolation", "side_camera", "excluded"}
     together = np.concatenate(list(record.splits.values()))
     np.testing.assert_array_equal(np.sort(together), np.arange(19))
     groups = frame_groups(tiny_scene, HOLDOUT)
