@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from drivesplat.discovery.boxes import Discovered, fitted_box
 from drivesplat.discovery.clusters import Chain, Cluster, chains_of, clusters_of
 from drivesplat.discovery.ends import Ends
-from drivesplat.discovery.ground import Ground
+from drivesplat.discovery.ground import ground_of
 from drivesplat.discovery.merging import merged, united
 from drivesplat.discovery.seen_empty import seen_empty
 from drivesplat.discovery.separation import separated
@@ -141,11 +141,11 @@ class Surroundings:
     """What the scans say around clusters: the height of the ground, returns that do not move, and the range below which
     nothing is measured."""
 
-    def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " n"]]):
+    def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " _"]]):
         self._scans, self._moving = scans, moving
         elevations = np.sort(scans[0].scan.rays.beam_elevations)
         self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
-        self._ground = Ground(scans, moving)
+        self._ground = ground_of(scans, moving)
         self._blind = max(_blind_range(scan) for scan in scans)
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
 

@@ -137,9 +137,12 @@ class CoarseToFineSettings(Settings):
 class RoadSettings(Settings):
     """Selection of the background Gaussians that train.road_weight acts on."""
 
+    surface: Literal["path", "lidar"] = "path"
+    """'path': the road under the path of the vehicle, which follows from its poses. 'lidar': the ground wherever LiDAR
+    seed points show it."""
     half_width: float = Field(1.2, gt=0, le=10)
-    """Maximum lateral distance from the path of the vehicle's centre (metres). The weight falls with this distance,
-    since kerbs and grass may begin beside the vehicle."""
+    """Maximum lateral distance from the path of the vehicle's centre (metres), with `surface: path`. The weight falls
+    with this distance, since kerbs and grass may begin beside the vehicle."""
     reach: float = Field(0.3, gt=0, le=2)
     """Maximum height of a centre above or below the road surface (metres)."""
 
@@ -223,8 +226,7 @@ class TrainSettings(Settings):
     flatness_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean thickness of background Gaussians (their smallest scale, metres)."""
     road_weight: float = Field(0.0, ge=0)
-    """Loss weight of the distance (metres) between Gaussians under the vehicle's path and the road surface there, which
-    follows from the ego poses."""
+    """Loss weight of the distance (metres) between Gaussians near the road and its surface (docs/off_the_lane.md)."""
     road: RoadSettings = RoadSettings()
     sky_alpha_weight: float = Field(0.05, ge=0)
     """Loss weight of -log(1 - alpha) in sky pixels, with `sky: mask` only."""

@@ -1,27 +1,34 @@
-"""The road under the ego vehicle's path: a known surface, since the vehicle stood on it.
+"""The road: a known surface under the ego vehicle's path, where the vehicle stood on it, or wherever a LiDAR saw it.
 
 The ego frame lies on the ground under the rear axle. Between two poses its origin and its vertical axis are
 interpolated linearly. The road at a place is the plane through the nearest point of that path, perpendicular to the
-vertical there.
+vertical there. By LiDAR it is the nearest plane of `drivesplat.lidar.ground.GroundMap`.
 """
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drivesplat.kernels.quaternions import rotated_back
+from drivesplat.lidar.ground import GroundMap
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP
 from drivesplat.training.sparse_grid import SparseGrid
 
-CELL = 0.1
-"""Edge in metres of the horizontal cells in each of which the road is a plane."""
+log = logging.getLogger(__name__)
+
+CELL, LIDAR_CELL = 0.1, 0.25
+"""Edges in metres of the horizontal cells in each of which the road is a plane, under the path and by LiDAR."""
+NEAR_PLANE = 1.0
+"""Metres from the place of a plane by LiDAR within which the ground lies in it."""
 ROUGHNESS = 0.05
 """Tolerated error of road and poses in metres: the transition of the loss from quadratic to linear."""
 
@@ -65,7 +72,9 @@ def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
 
 
 def road_of(record: TrainingRecord, settings: RoadSettings) -> Road:
-    """The road under the training images' poses of a training record, on the CPU."""
+    """The road under the training images' poses of a training record, or that of its LiDAR seed points, on the CPU."""
+    if settings.surface == "lidar":
+        return lidar_road(record.points[: record.seed.lidar], settings)
     images = record.splits["train"]
     in_time = images[np.argsort(record.timestamps[images], kind="stable")]
     return driven_road(record.ego_to_world[in_time], settings)
@@ -91,6 +100,26 @@ def driven_road(ego_to_world: np.ndarray, settings: RoadSettings) -> Road:
     planes = (torch.from_numpy(values[nearest]).float() for values in (normals, offsets))
     return Road(
         SparseGrid.from_numpy(lower, CELL, shape, keys), *planes, torch.from_numpy(weights).float(), settings.reach
+    )
+
+
+def lidar_road(points: Float[np.ndarray, "n 3"], settings: RoadSettings) -> Road:
+    """The ground wherever LiDAR points of the static world (metres) show it, on the CPU; without any the road has no
+    cell, which is logged."""
+    planes = GroundMap(points).planes()
+    if not len(planes.places):
+        log.warning("no LiDAR point shows the ground: train.road_weight has no effect with train.road.surface: lidar")
+        nothing = SparseGrid.from_numpy(np.zeros(2), LIDAR_CELL, np.ones(2, dtype=np.int64), np.zeros(0, np.int64))
+        return Road(nothing, torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), settings.reach)
+    lower = np.floor((planes.places.min(axis=0) - NEAR_PLANE) / LIDAR_CELL) * LIDAR_CELL
+    shape = np.ceil((planes.places.max(axis=0) + NEAR_PLANE - lower) / LIDAR_CELL).astype(np.int64)
+    cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
+    centres = lower + (cells + 0.5) * LIDAR_CELL
+    distances, nearest = cKDTree(planes.places).query(centres, distance_upper_bound=NEAR_PLANE)
+    keys = np.flatnonzero(np.isfinite(distances))
+    normals, offsets = (torch.from_numpy(values[nearest[keys]]).float() for values in (planes.normals, planes.offsets))
+    return Road(
+        SparseGrid.from_numpy(lower, LIDAR_CELL, shape, keys), normals, offsets, torch.ones(len(keys)), settings.reach
     )
 
 

@@ -13,10 +13,11 @@ from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import rigid
+from drivesplat.scene.training_record import SeedInfo, TrainingRecord
 from drivesplat.settings.train import RoadSettings, TrainSettings
 from drivesplat.training.floaters import LARGEST_STEP
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_priors, geometry_terms, thickness
-from drivesplat.training.road import CELL, ROUGHNESS, Road, driven_road, road_loss, road_of
+from drivesplat.training.road import CELL, ROUGHNESS, Road, driven_road, lidar_road, road_loss, road_of
 
 WIDE = RoadSettings(half_width=1.2, reach=0.3)
 
@@ -178,6 +179,44 @@ def test_the_road_is_that_of_training_images_in_time_order():
     road = road_of(record, WIDE)
     points = torch.tensor([[1.0, 0.0], [4.0, 0.0], [7.5, 0.0], [12.0, 8.0], [10.0, 4.0]])
     assert road.cells.lookup(points)[1].tolist() == [True, True, True, False, False]
+
+
+def ground_points() -> np.ndarray:
+    """Points (n, 3) on ground that rises to the left by 5 %, 40 m x 40 m."""
+    places = np.random.default_rng(7).uniform(-20.0, 20.0, (6000, 2))
+    return np.column_stack([places, 0.05 * places[:, 1]]).astype(np.float32)
+
+
+def with_points(points: np.ndarray, seed: SeedInfo) -> TrainingRecord:
+    return training_record_of(2, points=points, points_rgb=np.zeros(points.shape, np.uint8), seed=seed)
+
+
+BY_LIDAR = RoadSettings(surface="lidar", reach=0.3)
+
+
+def test_by_lidar_the_road_is_the_ground_far_from_the_path_too():
+    road = lidar_road(ground_points(), BY_LIDAR)
+    random = np.random.default_rng(8)
+    places, above = random.uniform(-15.0, 15.0, (500, 2)), random.uniform(-0.2, 0.2, 500)
+    means = np.column_stack([places, 0.05 * places[:, 1] + above])
+    found = distance(road, torch.from_numpy(means).float())
+    np.testing.assert_allclose(found.numpy(), above, atol=0.04)
+    assert not road.cells.lookup(torch.tensor([[40.0, 0.0]]))[1].any()
+
+
+def test_by_lidar_seed_points_of_other_sources_do_not_count():
+    """Far points lie anywhere."""
+    far = np.random.default_rng(9).uniform(-20.0, 20.0, (3000, 3)).astype(np.float32)
+    record = with_points(np.concatenate([ground_points(), far]), SeedInfo(lidar=6000, far=3000))
+    road, alone = road_of(record, BY_LIDAR), lidar_road(ground_points(), BY_LIDAR)
+    torch.testing.assert_close(road.offsets, alone.offsets, rtol=0.0, atol=0.0)
+
+
+def test_without_lidar_points_the_road_by_lidar_has_no_effect_and_this_is_logged(caplog):
+    record = with_points(np.ones((50, 3), np.float32), SeedInfo(far=50))
+    road = road_of(record, BY_LIDAR)
+    assert "train.road_weight has no effect" in caplog.text
+    assert float(road_loss(round_at(torch.ones(4, 3)), road)) == 0.0
 
 
 # ---- the terms
