@@ -4,7 +4,7 @@
 # actors, scans.npz if it renders LiDAR.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png, compare.mp4 and compare.json;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
-# ghost_panel.png and .json;
+# of synthetic worlds truth.mp4 and truth.json; ghost_panel.png and .json;
 # with_car.png, without_car.png, removal.png and removal.json; of methods that render LiDAR lidar.png, lidar.mp4 and
 # lidar.json.
 
@@ -114,6 +114,47 @@ rule film_parts:
         code=plan.code("film_parts"),
     script:
         "../workflow_scripts/film_parts.py"
+
+
+rule truth_film:
+    """
+    Shows the true images of a synthetic world from beside the recorded path, the renderings with their PSNR, and their
+    error, as a film.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.annotated_scene,
+        parser=plan.of_tracks("parser.pkl"),
+        masks="<results>/{scene}/masks/masks.json",
+        truth=plan.truth,
+    output:
+        film=report(
+            "<results>/{scene}/{method}/truth.mp4",
+            caption="../report/truth_film.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "film: from beside the path, with the truth"},
+        ),
+        figures="<results>/{scene}/{method}/truth.json",
+    log:
+        "<logs>/{scene}/{method}/truth_film.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/truth_film.tsv"
+    wildcard_constraints:
+        scene=plan.known(plan.worlds.values()),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("truth_film"),
+        code=plan.code("truth_film"),
+    script:
+        "../workflow_scripts/truth_film.py"
 
 
 rule compare:

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib import colormaps
 
-from drivesplat.errors import DatasetError, ResultError
+from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.evaluation.synthetic import rendered
-from drivesplat.inspection.drawing import MAX_ERROR
+from drivesplat.inspection.beside_truth import even_size, finite_image, image_rate, panel_pictures, with_psnr
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
@@ -48,19 +47,10 @@ class _Comparison:
         for index in images:
             truth, measured = self.recording.image(index), ~self.recording.ego_mask(index)
             view = view_of(self.recording.record, index, self.device)
-            found = {name: self._rendering(model, name, view) for name, model in self.models.items()}
+            found = {name: finite_image(rendered(model, view), name) for name, model in self.models.items()}
             quality = {name: psnr_record(image, truth, measured) for name, image in found.items()}
-            error = np.abs([*found.values()][-1] - truth).mean(axis=2)
-            colored = colormaps["inferno"](error / MAX_ERROR)[..., :3]
-            width, height = self.panels.size
-            pictures = [_to_bytes(image[:height, :width]) for image in (truth, *found.values(), colored)]
+            pictures = panel_pictures(truth, *found.values(), panels=self.panels)
             yield self.panels.assembled(pictures), self._caption(index, quality)
-
-    def _rendering(self, model: SplatModel, name: str, view: Any) -> np.ndarray:
-        image = rendered(model, view)
-        if not np.isfinite(image).all():
-            raise ResultError(f"a rendering of {name} contains NaN or Inf; delete its checkpoint.npz and rerun")
-        return image.clip(0.0, 1.0)
 
     def _caption(self, index: int, quality: Mapping[str, dict[str, Any] | None]) -> Caption:
         record, split = self.recording.record, self.recording.split(index)
@@ -68,7 +58,7 @@ class _Comparison:
         values = {name: found["psnr"] if found else None for name, found in quality.items()}
         self.figures.append({"second": seconds, "split": split, "psnr": values})
         first, *methods, last = self.panels.labels
-        texts = [_with_psnr(name, found) for name, found in zip(methods, quality.values(), strict=True)]
+        texts = [with_psnr(name, found) for name, found in zip(methods, quality.values(), strict=True)]
         notes = [NOTES.get(split or "", ""), *("" for _ in (*methods, last))]
         return Caption([first, *texts, last], notes, f"{seconds:.1f} s")
 
@@ -88,9 +78,8 @@ def render_comparison(
     or a rendering contains NaN or Inf.
     """
     images = images_of(recording, job.eval_camera)
-    width, height = recording.size(images[0])
     labels = ("ground truth", *checkpoints, f"error of {[*checkpoints][-1]}")
-    panels = Panels(labels, (max(2, width // 2 * 2), max(2, height // 2 * 2)))
+    panels = Panels(labels, even_size(recording.size(images[0])))
     opened = {name: open_model(checkpoint, device_settings) for name, checkpoint in checkpoints.items()}
     models, (_, device) = {name: model for name, (model, _) in opened.items()}, next(iter(opened.values()))
     encoding = FilmEncoding(fps=image_rate(recording, images), crf=job.crf, captions=job.captions)
@@ -117,20 +106,3 @@ def images_of(recording: PreparedDrive, camera: str) -> list[int]:
         )
     found = np.flatnonzero(record.camera_indices == record.camera_names.index(camera))
     return [int(index) for index in found[np.argsort(record.timestamps[found], kind="stable")]]
-
-
-def image_rate(recording: PreparedDrive, images: Sequence[int]) -> int:
-    """Images a second, rounded, at least 1."""
-    times = recording.record.timestamps[list(images)]
-    return max(1, round(1e6 / float(np.median(np.diff(times))))) if len(images) > 1 else 1
-
-
-def _with_psnr(name: str, found: dict[str, Any] | None) -> str:
-    if found is None:
-        return name
-    return f"{name}, identical" if found["psnr"] is None else f"{name}, {found['psnr']:.1f} dB"
-
-
-def _to_bytes(colors: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] as the nearest uint8."""
-    return (colors * 255.0 + 0.5).astype(np.uint8)

@@ -7,11 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
+from drivesplat.inspection.beside_truth import MAX_ERROR
 from drivesplat.inspection.figures import draw_outline, image_grid, show
 from drivesplat.inspection.ghost_panel import GhostPanel
 from drivesplat.inspection.removal import RemovalPair
 
-MAX_ERROR = 0.5
 PATH_COLOR = "#1d6fd1"
 _FIXES = "\n".join(
     [f"Published fixes of ghosts ({GHOSTS_DOCUMENT}):", *(f"{fix.method}: {fix.adds}" for fix in PUBLISHED_FIXES)]

@@ -51,6 +51,10 @@ def _default_methods() -> dict[str, MethodSettings]:
     return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=held)}
 
 
+KEPT_NAMES = {"parts": "a method's parts", "lidar": "LiDAR scans", "truth": "views beside the truth"}
+"""The names of films that are no trajectories, and what these show."""
+
+
 class Config(Settings):
     datasets: dict[str, DatasetSettings] = Field(default_factory=default_datasets, min_length=1)
     """Datasets, each under a name of your choice."""
@@ -145,7 +149,7 @@ class Config(Settings):
         for kind, names in (("method", self.methods), ("trajectory", self.render.trajectories)):
             for name in names:
                 require_name(name, kind)
-        for name, film in (("parts", "a method's parts"), ("lidar", "LiDAR scans")):
+        for name, film in KEPT_NAMES.items():
             if name in self.render.trajectories:
                 raise ValueError(f"a trajectory cannot be called {name!r}: the name is kept for the film of {film}")
         for scene in self.subjects:

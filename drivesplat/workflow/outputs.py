@@ -40,6 +40,8 @@ EXPORTS: dict[ExportFormat, tuple[str, ...]] = {
 """The files of every format, one or two for each rule that makes them."""
 PARTS_FILM = "parts"
 """The film of a method's parts."""
+TRUTH_FILM = "truth"
+"""The film of a method beside the truth of a synthetic world. It is made on request."""
 COMPARE_FILM = "compare.mp4"
 """The film of all methods of a scene."""
 

@@ -24,7 +24,7 @@ from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, no_such_edit, no
 from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
-from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, Outputs
+from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
@@ -159,6 +159,10 @@ class Plan(Outputs):
             return
         if path in ([f"{LIDAR}.png"], [f"{LIDAR}.mp4"], [f"{LIDAR}.json"]):
             self._refuse_without_lidar(scene, method)
+            return
+        if path in ([f"{TRUTH_FILM}.mp4"], [f"{TRUTH_FILM}.json"]):
+            if scene not in self.worlds.values():
+                raise ConfigError(f"{path[0]} needs the truth of a synthetic world, and scene {scene} is none")
             return
         edit = Path(path[-1]).stem if len(path) == 2 and path[0] in ("edits", "quad") else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]

@@ -261,6 +261,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "film": (FilmJob, film_fields.film),
     "film_parts": (FilmFormat, film_fields.film_format),
     "compare": (CompareJob, film_fields.encoding),
+    "truth_film": (CompareJob, film_fields.encoding),
     "edit": (EditJob, film_fields.edited_film),
     "quad": (EditJob, film_fields.quad),
     "drive_folder": (DriveJob, film_fields.drive_folder),

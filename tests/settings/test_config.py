@@ -16,7 +16,7 @@ from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_sett
 
 LOOKS = (
     "tracks", "film", "compare", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd",
-    "export_viewer", "export_colmap", "export_spz", "export_sog", "lidar_picture", "lidar_film",
+    "export_viewer", "export_colmap", "export_spz", "export_sog", "lidar_picture", "lidar_film", "truth_film",
 )  # fmt: skip
 OF_SCENES = (
     *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "tracks", "compare",
@@ -351,7 +351,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car evaluate"),
         (
             {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
-            "extract own_car evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer",
+            "extract own_car evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer truth_film",
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate"),
@@ -393,8 +393,8 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("lpips.timeout_s", 5), ""),
         (at("render.fps", 60), "film"),
         (at("render.width", 64), "film"),
-        (at("render.crf", 20), "film compare lidar_film"),
-        (at("render.captions", False), "film compare lidar_film"),
+        (at("render.crf", 20), "film compare lidar_film truth_film"),
+        (at("render.captions", False), "film compare lidar_film truth_film"),
         (at("render.lidar", False), ""),
         (at("render.trajectories.original.lateral", 1.0), "film"),
         (at("render.trajectories.aside", {"lateral": -1.0}), ""),
