@@ -522,3 +522,8 @@ def test_scans_get_the_holdout_and_what_holds_for_all_lidar():
     assert record["holdout"]["every_nth"] == 8 and record["scans"]["spin"] == "dataset"
     spin = {"revolution_s": 0.1, "start_azimuth_deg": 180.0}
     assert stage_record("scans", scans={"spin": spin})["scans"]["spin"] == {**spin, "clockwise": True, "timestamp": 1.0}
+
+
+def test_a_film_beside_the_truth_is_refused_for_a_recorded_drive():
+    with pytest.raises(ConfigError, match=r"truth\.mp4 needs the truth of a synthetic world, and scene a1 is none"):
+        plan().refuse_unknown(["elsewhere/a1/vanilla/truth.mp4"])
