@@ -70,6 +70,11 @@ class DriveTruth:
                 offset = inverse(true_pose) @ np.array(truth.camera_to_global)
                 yield index, dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ offset), truth
 
+    def view(self, index: int, frame: Frame, device: torch.device) -> View:
+        """The view of a recorded image as if taken from the pose of `frame`."""
+        pose = torch.from_numpy(frame.camera_to_world).float().to(device)
+        return dataclasses.replace(view_of(self.recording.record, index, device), camera_to_world=pose)
+
     def image(self, name: str, size: tuple[int, int]) -> np.ndarray:
         """A true image (h, w, 3) in [0, 1] at `size` (width, height)."""
         return read_image(truth_image(self.path, name), size) / 255.0
@@ -161,8 +166,7 @@ def _lateral_view_metrics(
 
     def renderings() -> Iterator[LateralRendering]:
         for index, frame, truth in frames:
-            pose = torch.from_numpy(frame.camera_to_world).float().to(device)
-            seen = dataclasses.replace(view_of(recording.record, index, device), camera_to_world=pose)
+            seen = known.view(index, frame, device)
             yield LateralRendering(index, frame, truth, *rendered_with_depth(model, seen))
 
     def measure(one: LateralRendering) -> tuple[dict[str, FrameErrors], np.ndarray, PixelDepths]:

@@ -1,6 +1,5 @@
 """The stage `truth_film`: a method from beside the recorded path, beside the truth of a synthetic world, as a film."""
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +16,6 @@ from drivesplat.inspection.beside_truth import even_size, finite_image, image_ra
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import view_of
 from drivesplat.readers.truth import TruthFrame
 from drivesplat.rendering.captions import Caption
 from drivesplat.rendering.film import encode_film
@@ -45,9 +43,7 @@ class _Sideways:
         """The picture and the caption of each place."""
         record = self.known.recording.record
         for key, index, camera, truth in places:
-            pose = torch.from_numpy(camera.camera_to_world).float().to(self.device)
-            view = dataclasses.replace(view_of(record, index, self.device), camera_to_world=pose)
-            image = finite_image(rendered(self.model, view), self.method)
+            image = finite_image(rendered(self.model, self.known.view(index, camera, self.device)), self.method)
             true = self.known.image(truth.image, record.image_size(index))
             found = psnr_record(image, true, np.ones(image.shape[:2], dtype=bool))
             seconds = record.seconds(index)

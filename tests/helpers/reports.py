@@ -1,8 +1,10 @@
 """Metrics files as a report reads them."""
 
+import json
 from pathlib import Path
 from typing import Any
 
+from drivesplat.report.gaps import gap_report
 from drivesplat.settings.report import ReportJob
 
 PROTOCOL = {
@@ -74,3 +76,13 @@ def expecting(*scenes: str, methods=("vanilla",)) -> ReportJob:
 
 def report_job(expected: dict[str, Any], reference: str | None = "vanilla") -> ReportJob:
     return ReportJob(expected=expected, reference=reference, random_seed=0)
+
+
+def report_of(folder: Path, *records: dict[str, Any], methods: tuple[str, ...]) -> dict[str, Any]:
+    """The report of metrics files, which are written into `folder`."""
+    for one in records:
+        (folder / one["scene"]).mkdir(parents=True, exist_ok=True)
+        (folder / one["scene"] / "metrics.json").write_text(json.dumps(one))
+    scenes = [one["scene"] for one in records]
+    paths = [str(folder / scene / "metrics.json") for scene in scenes]
+    return gap_report(paths, expecting(*scenes, methods=methods), NO_LOGS)

@@ -3,14 +3,12 @@
 import csv
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.reports import NO_LOGS, expecting, group, method, metrics
+from helpers.reports import group, method, metrics, report_of
 
 from drivesplat.report.files import console_table
-from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import report_page
 from drivesplat.report.tables import write_figures
 
@@ -36,18 +34,9 @@ def record(scene: str, better: float) -> dict[str, Any]:
     return metrics(scene, by_method)
 
 
-def report_of(folder: Path, *records: dict[str, Any]) -> dict[str, Any]:
-    for one in records:
-        (folder / one["scene"]).mkdir(parents=True, exist_ok=True)
-        (folder / one["scene"] / "metrics.json").write_text(json.dumps(one))
-    scenes = [one["scene"] for one in records]
-    paths = [str(folder / scene / "metrics.json") for scene in scenes]
-    return gap_report(paths, expecting(*scenes, methods=METHODS), NO_LOGS)
-
-
 @pytest.fixture
 def report(tmp_path) -> dict[str, Any]:
-    return report_of(tmp_path, record("0061", 1.0), record("0103", 3.0))
+    return report_of(tmp_path, record("0061", 1.0), record("0103", 3.0), methods=METHODS)
 
 
 def test_rows_are_by_scene_view_and_method_and_means_over_scenes(report):
@@ -77,10 +66,10 @@ def test_the_page_has_a_row_for_each_view_and_means_of_several_scenes(report):
 
 
 def test_one_scene_has_no_means_and_a_drive_without_such_views_no_table(tmp_path):
-    one = report_of(tmp_path / "one", record("0061", 1.0))
+    one = report_of(tmp_path / "one", record("0061", 1.0), methods=METHODS)
     assert len(page_rows(report_page(one, {}))) == 6
     bare = metrics("0061", {name: method(group(24.0, 17.0), group(22.0, 14.0)) for name in METHODS})
-    none = report_of(tmp_path / "none", bare)
+    none = report_of(tmp_path / "none", bare, methods=METHODS)
     assert none["aside"] == {"rows": [], "means": []}
     assert 'id="aside"' not in report_page(none, {}) and "beside the recorded path" not in console_table(none)
 
@@ -105,6 +94,6 @@ def test_the_console_lists_views(report):
 def test_a_figure_that_is_no_number_leaves_the_scene_out(tmp_path):
     broken = record("0061", 1.0)
     broken["methods"]["street"]["lateral"]["2.0"]["static"]["psnr"] = "high"
-    found = report_of(tmp_path, broken, record("0103", 1.0))
+    found = report_of(tmp_path, broken, record("0103", 1.0), methods=METHODS)
     assert [item["scene"] for item in found["left_out"]] == ["0061"]
     assert "'high', not a number" in found["left_out"][0]["why"]

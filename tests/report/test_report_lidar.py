@@ -5,15 +5,13 @@ import csv
 import json
 import math
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.reports import NO_LOGS, expecting, group, method, metrics
+from helpers.reports import group, method, metrics, report_of
 
 from drivesplat.evaluation.scan_metrics import FIGURES, SCAN_REGIONS
 from drivesplat.report.files import console_table
-from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import report_page
 from drivesplat.report.tables import write_figures
 
@@ -47,18 +45,9 @@ def record(scene: str, medians: tuple[float, float, float], moving: bool = True)
 RECORDS = (record("0061", (0.04, 0.06, 0.05)), record("0103", (0.08, 0.07, 0.09), moving=False))
 
 
-def report_of(folder: Path, *records: dict[str, Any]) -> dict[str, Any]:
-    for one in records:
-        (folder / one["scene"]).mkdir(parents=True, exist_ok=True)
-        (folder / one["scene"] / "metrics.json").write_text(json.dumps(one))
-    scenes = [one["scene"] for one in records]
-    paths = [str(folder / scene / "metrics.json") for scene in scenes]
-    return gap_report(paths, expecting(*scenes, methods=METHODS), NO_LOGS)
-
-
 @pytest.fixture
 def report(tmp_path) -> dict[str, Any]:
-    return report_of(tmp_path, *RECORDS)
+    return report_of(tmp_path, *RECORDS, methods=METHODS)
 
 
 def test_rows_are_of_methods_that_render_lidar_and_of_the_baselines(report):
@@ -109,7 +98,7 @@ def test_a_reason_of_one_method_names_it(tmp_path):
     broken = copy.deepcopy(RECORDS[0])
     figures = broken["methods"]["street_lidar"]["extrapolation"]["lidar"]["all"]
     figures |= {**dict.fromkeys(FIGURES), "drop_accuracy": 0.2, "unavailable": "no ray returns in both scans"}
-    page = report_page(report_of(tmp_path, broken), {})
+    page = report_page(report_of(tmp_path, broken, methods=METHODS), {})
     said = "0061, all rays, beyond the last training frame (street_lidar): no ray returns in both scans."
     assert f"A dash: {said}" in page
     assert page_rows(page)[0][8:] == ["–", "–", "20.0", "–", "34,720"]
@@ -146,7 +135,7 @@ def test_the_console_has_a_table_of_all_rays(report):
 
 def test_without_a_method_that_renders_lidar_nothing_is_said_of_it(tmp_path):
     without = metrics("0061", {name: method(group(24.0), group(22.0)) for name in METHODS})
-    report = report_of(tmp_path, without)
+    report = report_of(tmp_path, without, methods=METHODS)
     assert report["lidar"] == {"rows": [], "means": []}
     assert "LiDAR" not in console_table(report) and 'id="lidar"' not in report_page(report, {})
     write_figures(tmp_path / "gap_report.csv", report)
@@ -160,7 +149,7 @@ def test_without_a_method_that_renders_lidar_nothing_is_said_of_it(tmp_path):
 def test_a_scene_whose_figures_of_scans_are_no_numbers_is_left_out_and_named(tmp_path, value, why):
     broken = copy.deepcopy(RECORDS[1])
     broken["lidar_baselines"]["nearest_scan"]["interpolation"]["all"]["chamfer_m"] = value
-    report = report_of(tmp_path, RECORDS[0], broken)
+    report = report_of(tmp_path, RECORDS[0], broken, methods=METHODS)
     assert {row["scene"] for row in report["rows"]} == {row["scene"] for row in report["lidar"]["rows"]} == {"0061"}
     (item,) = report["left_out"]
     assert item["scene"] == "0103" and why in item["why"]
