@@ -62,7 +62,7 @@ class GroundMap:
         near, found, distances = _neighbours(ground[:, :2])
         offsets = ground[near, :2] - ground[:, None, :2]
         design, heights = np.concatenate([np.ones((*near.shape, 1)), offsets], axis=2), ground[near, 2]
-        by_distance = np.where(found, np.exp(-0.5 * np.square(distances / DECAY, where=found)), 0.0)
+        by_distance = np.exp(-0.5 * np.square(distances / DECAY))
         weights = by_distance
         for _ in range(ROUNDS):
             normal = np.einsum("nk,nki,nkj->nij", weights, design, design) + np.diag([0.0, 1e-2, 1e-2])

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.model.part import Part
-from drivesplat.training.sparse_grid import SparseGrid
 
 LARGEST_STEP = 15.0
 """Maximum distance in metres between consecutive positions that a path connects."""

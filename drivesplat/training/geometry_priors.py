@@ -6,14 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.road_distance import Road, road_distance
+from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.road import Road, road_loss, road_of
-from drivesplat.training.sparse_grid import SparseGrid
+from drivesplat.training.road import road_of
 
 
 @dataclass(frozen=True)
@@ -60,3 +61,8 @@ def thickness(gaussians: Gaussians) -> Float[Tensor, ""]:
     """The mean smallest scale in metres, 0 for disc-shaped Gaussians: the regulariser of NeuSG (Chen et al. 2023,
     arXiv 2312.00846) and PGSR (Chen et al. 2024, arXiv 2406.06521)."""
     return gaussians.scales.min(dim=1).values.mean()
+
+
+def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
+    """The weighted mean distance in metres of the road's Gaussians from its surface: see `road_distance`."""
+    return road_distance(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, road)

@@ -6,22 +6,18 @@ vertical there. By LiDAR it is the nearest plane of `drivesplat.lidar.ground.Gro
 """
 
 import logging
-from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from torch import Tensor
 
-from drivesplat.kernels.quaternions import rotated_back
+from drivesplat.kernels.road_distance import Road
+from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.ground import GroundMap
-from drivesplat.model.gaussians import Gaussians
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP
-from drivesplat.training.sparse_grid import SparseGrid
 
 log = logging.getLogger(__name__)
 
@@ -29,46 +25,6 @@ CELL, LIDAR_CELL = 0.1, 0.25
 """Edges in metres of the horizontal cells in each of which the road is a plane, under the path and by LiDAR."""
 NEAR_PLANE = 1.0
 """Metres from the place of a plane by LiDAR within which the ground lies in it."""
-ROUGHNESS = 0.05
-"""Tolerated error of road and poses in metres: the transition of the loss from quadratic to linear."""
-
-
-@dataclass(frozen=True)
-class Road:
-    """The road by horizontal `cells`, each with a plane: its unit normal (`normals`, (k, 3)), its offset along the
-    normal in metres (`offsets`, (k,)) and its weight in [0, 1] (`weights`, (k,)). Gaussians with centres within `reach`
-    metres of the plane belong to the road."""
-
-    cells: SparseGrid
-    normals: Float[Tensor, "k 3"]
-    offsets: Float[Tensor, " k"]
-    weights: Float[Tensor, " k"]
-    reach: float
-
-    def to(self, device: torch.device) -> "Road":
-        tensors = {name: getattr(self, name).to(device) for name in ("cells", "normals", "offsets", "weights")}
-        return replace(self, **tensors)
-
-
-def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
-    """The distance in metres of the road's Gaussians from its surface: the weighted mean of the pseudo-Huber norm
-    sqrt(d² + nᵀ Σ n + c²) - c.
-
-    With the plane's normal n, d the height of the centre over it, and Σ the covariance, d² + nᵀ Σ n is the mean square
-    distance of a Gaussian's mass from the plane, minimal for a centre in the plane and the shortest axis along its
-    normal. c is ROUGHNESS. Gaussians farther away than `reach` and those of opacity 0 do not count. 0 where no Gaussian
-    counts.
-    """
-    if len(road.weights) == 0:
-        return gaussians.means.sum() * 0.0
-    index, on_road = road.cells.lookup(gaussians.means[:, :2])
-    normals = road.normals[index]
-    heights = (gaussians.means * normals).sum(dim=1) - road.offsets[index]
-    on_road &= (heights.detach().abs() < road.reach) & (gaussians.opacities.detach() > 0.0)
-    weights = road.weights[index] * on_road
-    along = rotated_back(F.normalize(gaussians.quats, dim=1), normals) * gaussians.scales
-    distance = torch.sqrt(heights.square() + along.square().sum(dim=1) + ROUGHNESS**2) - ROUGHNESS
-    return (weights * distance).sum() / weights.sum().clamp(min=1e-6)
 
 
 def road_of(record: TrainingRecord, settings: RoadSettings) -> Road:

@@ -29,6 +29,8 @@ from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import mean_opacity_and_scale
+from drivesplat.kernels.road_distance import Road, road_distance
+from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.kernels.time_varying_colors import colors_in_world
 from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.harmonics import rotation_of_harmonics
@@ -163,6 +165,26 @@ def test_regularized_means_and_their_gradients_agree_with_torch():
     expected, found = both_ways(mean_opacity_and_scale, *inputs)
     torch.testing.assert_close(found, expected)
     assert_same_gradients([expected, found], inputs, atol=1e-9, rtol=1e-5)
+
+
+@pytest.mark.parametrize("listed", [1, 37, 64])
+def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed):
+    """A road of one cell, with gaps, and of all cells; Gaussians out of reach, outside and of opacity 0 among them."""
+    torch.manual_seed(listed)
+    keys = torch.randperm(64)[:listed].sort().values
+    normals = F.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.1 * torch.randn(listed, 3), dim=1)
+    cells = SparseGrid(torch.tensor([-4.0, -4.0]), 1.0, (8, 8), keys)
+    road = Road(cells, normals, 0.1 * torch.randn(listed), torch.rand(listed), 0.4).to(DEVICE)
+    means = torch.rand(1500, 3, device=DEVICE) * torch.tensor([10.0, 10.0, 1.0], device=DEVICE) - 0.5
+    means[:, :2] -= 4.5
+    scales, quats = 0.3 * torch.rand(1500, 3, device=DEVICE), 2.0 * torch.randn(1500, 4, device=DEVICE)
+    opacities = torch.rand(1500, device=DEVICE)
+    opacities[::3] = 0.0
+    inputs = [values.requires_grad_() for values in (means, quats, scales)]
+    expected, found = both_ways(lambda *given: [road_distance(*given, opacities, road)], *inputs)
+    assert float(expected[0].detach()) > 0.0
+    torch.testing.assert_close(found, expected)
+    assert_same_gradients([expected, found], inputs, atol=1e-7, rtol=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -15,6 +15,7 @@ from helpers.tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.array_file import write_arrays
+from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.lidar.traversal import OCCUPIED, count_passing
 from drivesplat.poses.triangulated import TriangulatedPoints
@@ -22,7 +23,6 @@ from drivesplat.preprocess.free_space import Rays, camera_rays, free_space_recor
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.free_space import FreeSpaceJob, FreeSpaceSettings
-from drivesplat.training.sparse_grid import SparseGrid
 
 SENSOR = np.array([0.0, 0.0, 1.8])
 GOING = Thing("vehicle.car", (4.0, 2.0, 1.6), (9.0, 0.0, 0.8), (6.0, 0.0))

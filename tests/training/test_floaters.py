@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.model.background import Background
 from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
 from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, fade_floaters, near_path, sensor_path
-from drivesplat.training.sparse_grid import SparseGrid
 
 
 def distance_to_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:

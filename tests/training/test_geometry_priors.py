@@ -9,6 +9,7 @@ from helpers.hand_made import actors_of, looking_at, motion_through, round_gauss
 from helpers.records import training_record_of
 from scipy.spatial.transform import Rotation
 
+from drivesplat.kernels.road_distance import ROUGHNESS, Road
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
@@ -16,8 +17,15 @@ from drivesplat.scene.rigid import rigid
 from drivesplat.scene.training_record import SeedInfo, TrainingRecord
 from drivesplat.settings.train import RoadSettings, TrainSettings
 from drivesplat.training.floaters import LARGEST_STEP
-from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_priors, geometry_terms, thickness
-from drivesplat.training.road import CELL, ROUGHNESS, Road, driven_road, lidar_road, road_loss, road_of
+from drivesplat.training.geometry_priors import (
+    NO_PRIORS,
+    GeometryPriors,
+    geometry_priors,
+    geometry_terms,
+    road_loss,
+    thickness,
+)
+from drivesplat.training.road import CELL, driven_road, lidar_road, road_of
 
 WIDE = RoadSettings(half_width=1.2, reach=0.3)
 

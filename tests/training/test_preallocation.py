@@ -16,10 +16,10 @@ from drivesplat.settings.train import McmcSettings, RoadSettings, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier
-from drivesplat.training.geometry_priors import NO_PRIORS, geometry_terms
+from drivesplat.training.geometry_priors import NO_PRIORS, geometry_terms, road_loss
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import Optimizers, make_optimizers
-from drivesplat.training.road import driven_road, road_loss
+from drivesplat.training.road import driven_road
 
 
 def grown(preallocates: bool, steps: int, **changes: Any) -> tuple[SplatModel, Densifier, Optimizers, list[float]]:

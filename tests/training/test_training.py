@@ -49,6 +49,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.io import checkpoint_file
+from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
@@ -69,7 +70,6 @@ from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.road import driven_road
 from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
-from drivesplat.training.sparse_grid import SparseGrid
 from drivesplat.training.train import TrainingSummary, train
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import Guides, TrainingView, load_views, view_index
