@@ -24,6 +24,8 @@ SAME, ROUNDS = 0.05, 4
 """Metres beyond which a deviation counts linearly (Huber), and rounds of reweighting."""
 ROUGH = 0.06
 """Metres of root mean square deviation from a plane beyond which the ground there is no plane."""
+NEAR = 0.1
+"""Metres from the plane through low points within which points are ground."""
 
 
 class Planes(NamedTuple):
@@ -45,6 +47,7 @@ class GroundMap:
         self._lowest = points[order[starts + (counts * LOWEST / 100.0).astype(int)]].astype(np.float64)
         self._weights = np.minimum(counts, MIN_POINTS)
         self._tree = cKDTree(self._lowest[:, :2])
+        self._points = points
 
     def height(self, place: Float[np.ndarray, "2"]) -> float:
         """The height in metres at a place in the world, the weighted median of the cells around; NaN where it is
@@ -54,27 +57,14 @@ class GroundMap:
         return float(np.median(heights)) if len(heights) >= MIN_POINTS else float("nan")
 
     def planes(self) -> Planes:
-        """A plane through the ground around each cell, where it is known and even enough: weighted least squares,
-        iteratively reweighted (Huber)."""
+        """A plane through the ground around each cell, where it is known and even enough.
+
+        The low points show which points are ground, but they lie below it by the noise of ranges. A plane through them
+        is therefore followed by one through the mean of each cell's points within NEAR metres of it.
+        """
         if not len(self._lowest):
             return Planes(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0))
-        ground = self._lowest[self._is_ground()]
-        near, found, distances = _neighbours(ground[:, :2])
-        offsets = ground[near, :2] - ground[:, None, :2]
-        design, heights = np.concatenate([np.ones((*near.shape, 1)), offsets], axis=2), ground[near, 2]
-        by_distance = np.exp(-0.5 * np.square(distances / DECAY))
-        weights = by_distance
-        for _ in range(ROUNDS):
-            normal = np.einsum("nk,nki,nkj->nij", weights, design, design) + np.diag([0.0, 1e-2, 1e-2])
-            fitted = np.linalg.solve(normal, np.einsum("nk,nki,nk->ni", weights, design, heights)[..., None])[..., 0]
-            off = np.abs(np.einsum("nki,ni->nk", design, fitted) - heights)
-            weights = by_distance * np.minimum(1.0, SAME / np.maximum(off, 1e-9))
-        rough = np.sqrt((weights * off**2).sum(axis=1) / weights.sum(axis=1))
-        known = (found.sum(axis=1) >= MIN_NEIGHBOURS) & (rough < ROUGH)
-        normals = np.column_stack([-fitted[:, 1:], np.ones(len(fitted))])
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        through = np.column_stack([ground[:, :2], fitted[:, 0]])
-        return Planes(ground[known, :2], normals[known], (normals * through).sum(axis=1)[known])
+        return _planes_through(_means_near(_planes_through(self._lowest[self._is_ground()]), self._points))
 
     def _is_ground(self) -> Bool[np.ndarray, " k"]:
         """Which cells are as low as their neighbours."""
@@ -82,6 +72,42 @@ class GroundMap:
         heights = np.sort(np.where(found, self._lowest[near, 2], np.inf), axis=1)
         chosen = (LOW * (found.sum(axis=1) - 1)).astype(int)
         return np.abs(self._lowest[:, 2] - heights[np.arange(len(heights)), chosen]) < ABOVE
+
+
+def _planes_through(ground: Float[np.ndarray, "k 3"]) -> Planes:
+    """A plane through the points around each of these, where they are many and even enough: weighted least squares,
+    iteratively reweighted (Huber)."""
+    near, found, distances = _neighbours(ground[:, :2])
+    offsets = ground[near, :2] - ground[:, None, :2]
+    design, heights = np.concatenate([np.ones((*near.shape, 1)), offsets], axis=2), ground[near, 2]
+    by_distance = np.where(found, np.exp(-0.5 * np.square(distances / DECAY)), 0.0)
+    weights = by_distance
+    for _ in range(ROUNDS):
+        normal = np.einsum("nk,nki,nkj->nij", weights, design, design) + np.diag([0.0, 1e-2, 1e-2])
+        fitted = np.linalg.solve(normal, np.einsum("nk,nki,nk->ni", weights, design, heights)[..., None])[..., 0]
+        off = np.abs(np.einsum("nki,ni->nk", design, fitted) - heights)
+        weights = by_distance * np.minimum(1.0, SAME / np.maximum(off, 1e-9))
+    rough = np.sqrt((weights * off**2).sum(axis=1) / weights.sum(axis=1))
+    known = (found.sum(axis=1) >= MIN_NEIGHBOURS) & (rough < ROUGH)
+    normals = np.column_stack([-fitted[:, 1:], np.ones(len(fitted))])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    through = np.column_stack([ground[:, :2], fitted[:, 0]])
+    return Planes(ground[known, :2], normals[known], (normals * through).sum(axis=1)[known])
+
+
+def _means_near(planes: Planes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+    """The mean of the points near each plane: of those to which it is the nearest in the horizontal, within CELL
+    metres there, and which lie within NEAR metres of it."""
+    if not len(planes.places):
+        return np.zeros((0, 3))
+    distances, nearest = cKDTree(planes.places).query(points[:, :2], distance_upper_bound=CELL)
+    inside = np.isfinite(distances)
+    points, nearest = points[inside].astype(np.float64), nearest[inside]
+    close = np.abs((points * planes.normals[nearest]).sum(axis=1) - planes.offsets[nearest]) < NEAR
+    points, nearest = points[close], nearest[close]
+    counts = np.bincount(nearest, minlength=len(planes.places))
+    sums = np.stack([np.bincount(nearest, weights=column, minlength=len(counts)) for column in points.T], axis=1)
+    return sums[counts > 0] / counts[counts > 0, None]
 
 
 def _neighbours(
