@@ -74,7 +74,7 @@ def _distances(
     normal = _load(normals, first, inside)
     height = dot((x, y, z), normal) - tl.load(offsets + first, mask=inside, other=0.0)
     inside = inside & (tl.abs(height) < reach)
-    _, _, along, _ = _along(quats, scales, i, inside, normal)
+    _, _, _, _, along = _along(quats, scales, i, inside, normal)
     distance = tl.sqrt(height * height + dot(along, along) + roughness * roughness) - roughness
     weight = tl.load(weights + first, mask=inside, other=0.0)
     tl.store(cells + i, tl.where(inside, first, -1), mask=i < count)
@@ -94,7 +94,8 @@ def _distances_backward(
     inside = cell >= 0
     normal = _load(normals, cell, inside)
     height = dot(_load(means, i, inside), normal) - tl.load(offsets + cell, mask=inside, other=0.0)
-    (w, x, y, z), length, along, (scale, in_own) = _along(quats, scales, i, inside, normal)
+    quat, length, scale, in_own, along = _along(quats, scales, i, inside, normal)
+    w, x, y, z = quat
     weight = tl.load(weights + cell, mask=inside, other=0.0) * tl.load(v_distance) / tl.load(weight_sum)
     by_square = weight / tl.sqrt(height * height + dot(along, along) + roughness * roughness)
     _store(v_means, i, valid, scaled(by_square * height, normal))
@@ -123,7 +124,7 @@ def _along(quats, scales, i, mask, normal):
     scale = _load(scales, i, mask)
     in_own = turned_back(rotation_rows(w, x, y, z), normal)
     along = scale[0] * in_own[0], scale[1] * in_own[1], scale[2] * in_own[2]
-    return (w, x, y, z), length, along, (scale, in_own)
+    return (w, x, y, z), length, scale, in_own, along
 
 
 @triton.jit
