@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drivesplat.kernels import triton_support
@@ -31,6 +31,19 @@ class Road:
         tensors = {name: getattr(self, name).to(device) for name in ("cells", "normals", "offsets", "weights")}
         return replace(self, **tensors)
 
+    @torch.no_grad()
+    def is_above(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """Whether the road passes more than `reach` metres above points in world coordinates (metres); False where
+        there is no road. No host synchronisation."""
+        if len(self.weights) == 0:
+            return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        cell, known = self.cells.lookup(points[:, :2])
+        return known & (self.heights(points, cell) < -self.reach)
+
+    def heights(self, points: Float[Tensor, "n 3"], cell: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """The heights in metres of points above the planes of given cells."""
+        return (points * self.normals[cell]).sum(dim=1) - self.offsets[cell]
+
 
 def road_distance(
     means: Float[Tensor, "n 3"],
@@ -55,13 +68,11 @@ def road_distance(
 
         return RoadDistance.apply(means, quats, scales, opacities, road, ROUGHNESS)
     cell, on_road = road.cells.lookup(means[:, :2])
-    heights = (means.detach() * road.normals[cell]).sum(dim=1) - road.offsets[cell]
-    on_road &= (heights.abs() < road.reach) & (opacities.detach() > 0.0)
+    on_road &= (road.heights(means.detach(), cell).abs() < road.reach) & (opacities.detach() > 0.0)
     if not means.is_cuda:  # a GPU would wait for the number of these rows
         rows = on_road.nonzero()[:, 0]
         means, quats, scales, cell, on_road = (values[rows] for values in (means, quats, scales, cell, on_road))
-    normals, weights = road.normals[cell], road.weights[cell] * on_road
-    heights = (means * normals).sum(dim=1) - road.offsets[cell]
-    along = rotated_back(F.normalize(quats, dim=1), normals) * scales
+    heights, weights = road.heights(means, cell), road.weights[cell] * on_road
+    along = rotated_back(F.normalize(quats, dim=1), road.normals[cell]) * scales
     distance = torch.sqrt(heights.square() + along.square().sum(dim=1) + ROUGHNESS**2) - ROUGHNESS
     return (weights * distance).sum() / weights.sum().clamp(min=1e-6)

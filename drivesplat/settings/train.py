@@ -182,6 +182,9 @@ class FloaterSettings(Settings):
     drove there, so the space is empty. 0 = off."""
     free_space: bool = False
     """Also fade out Gaussians whose centres lie in space that LiDAR rays prove empty (see `free_space`)."""
+    below_road: bool = False
+    """Also fade out Gaussians whose centres lie more than `train.road.reach` below the road, where it is known
+    (`train.road_weight` above 0). A wet road mirrors what is above it: there, leave this off."""
     every: int = Field(100, ge=1)
     """Iterations between these steps."""
 

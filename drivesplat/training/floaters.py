@@ -1,5 +1,5 @@
-"""Floaters: Gaussians in space that is known to be empty, since the ego vehicle drove or LiDAR rays passed through
-it."""
+"""Floaters: Gaussians where nothing is seen, since the ego vehicle drove or LiDAR rays passed through the space, or the
+road hides it."""
 
 from dataclasses import dataclass
 
@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.model.part import Part
 
@@ -43,24 +44,27 @@ def near_path(
 
 @dataclass(frozen=True)
 class EmptySpace:
-    """Space known to be empty: within `radius` metres (0: none) of the path of sensors from `starts` to `ends` (m, 3),
-    and the cells of `free` in world metres (None: none)."""
+    """Space in which nothing is seen: within `radius` metres (0: none) of the path of sensors from `starts` to `ends`
+    (m, 3), the cells of `free` in world metres (None: none), and below the `road` (None: unknown)."""
 
     starts: Float[Tensor, "m 3"]
     ends: Float[Tensor, "m 3"]
     radius: float
     free: SparseGrid | None = None
+    road: Road | None = None
 
     @property
     def known(self) -> bool:
         """Whether any space is known to be empty."""
-        return self.radius > 0 or self.free is not None
+        return self.radius > 0 or self.free is not None or self.road is not None
 
     def holds(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """The mask of points in empty space."""
         segments = (self.starts, self.ends) if self.radius > 0 else (self.starts[:0], self.ends[:0])
-        near = near_path(points, *segments, self.radius)
-        return near if self.free is None else near | self.free.lookup(points)[1]
+        held = near_path(points, *segments, self.radius)
+        if self.free is not None:
+            held = held | self.free.lookup(points)[1]
+        return held if self.road is None else held | self.road.is_above(points)
 
 
 @torch.no_grad()

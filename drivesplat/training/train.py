@@ -190,7 +190,8 @@ class TrainingRun:
 def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     sensors = trainer.sensor_positions
-    empty = EmptySpace(*sensor_path(sensors), settings.floaters.radius, trainer.priors.free)
+    below = trainer.priors.road if settings.floaters.below_road else None
+    empty = EmptySpace(*sensor_path(sensors), settings.floaters.radius, trainer.priors.free, below)
     reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
     while trainer.step < trainer.iterations:
         with trainer.clock.stage(ITERATION):

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 
+from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.model.background import Background
-from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
+from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings, RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, fade_floaters, near_path, sensor_path
+from drivesplat.training.road import driven_road
 
 
 def distance_to_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
@@ -107,7 +110,19 @@ def test_gaussians_fade_whose_centres_lie_in_space_proven_empty(radius, faded):
     assert (opacities < 1e-3).nonzero()[:, 0].tolist() == faded
 
 
+def test_gaussians_fade_that_the_road_hides():
+    """Those more than `reach` below it, and not where there is no road. It rises by 10 % along x."""
+    normal = F.normalize(torch.tensor([[-0.1, 0.0, 1.0]]), dim=1)
+    cells = SparseGrid.from_numpy(np.zeros(2), 10.0, np.array([1, 1]), np.array([0]))
+    road = Road(cells, normal, torch.zeros(1), torch.ones(1), 0.3)
+    positions = np.array([[8.0, 5.0, 0.4], [8.0, 5.0, 0.6], [1.0, 1.0, -5.0], [8.0, 5.0, 3.0], [-1.0, 5.0, -5.0]])
+    part = Background.from_points(positions, np.full((5, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
+    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 0.0, road=road))
+    assert (part.at(0.0).opacities.detach() < 1e-3).nonzero()[:, 0].tolist() == [0, 2]
+
+
 def test_nothing_is_known_to_be_empty_without_a_radius_and_free_space():
     path = sensor_path(torch.zeros(1, 3))
     assert not EmptySpace(*path, 0.0).known
     assert EmptySpace(*path, 1.0).known and EmptySpace(*path, 0.0, free_cells()).known
+    assert EmptySpace(*path, 0.0, road=driven_road(np.eye(4)[None], RoadSettings())).known
