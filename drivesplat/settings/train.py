@@ -226,6 +226,9 @@ class TrainSettings(Settings):
     """Loss weight of the mean opacity. It fades Gaussians that the images do not need."""
     scale_reg: float = Field(0.01, ge=0)
     """Loss weight of the mean scale (metres)."""
+    dropout: float = Field(0.0, ge=0, lt=1)
+    """Fraction of the Gaussians of static parts that each iteration leaves out at random. Then no single image can rely
+    on a Gaussian that others do not see (docs/off_the_lane.md)."""
     flatness_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean thickness of background Gaussians (their smallest scale, metres)."""
     road_weight: float = Field(0.0, ge=0)
@@ -237,6 +240,9 @@ class TrainSettings(Settings):
     """Loss weight of the binary cross entropy between alpha and the inverse sky mask, for every kind of sky."""
     depth_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean absolute difference from LiDAR depth (metres), without the worst 5 % of pixels."""
+    smoothness_weight: float = Field(0.0, ge=0)
+    """Loss weight of the unevenness of rendered surfaces: the mean second difference of inverse depth between
+    neighbouring pixels, relative to it, without edges (docs/off_the_lane.md)."""
     entropy_weight: float = Field(0.1, ge=0)
     """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
     consist of objects."""

@@ -17,6 +17,11 @@ from drivesplat.training.views import LidarDepth, TrainingView
 IGNORED_DEPTHS = 0.05
 """Fraction of the depths that the loss ignores: those with the largest errors."""
 
+MIN_DEPTH = 1.0
+"""Metres: nearer depths count as this where their inverse is compared."""
+MAX_CURVATURE, EDGE_DECAY, OPAQUE = 0.1, 10.0, 0.8
+"""Of `depth_roughness`."""
+
 
 def loss_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
@@ -39,6 +44,8 @@ def loss_terms(
         terms["sky_bce"] = settings.sky_bce_weight * sky_cross_entropy(alpha, view.sky)
     if view.lidar is not None and picture.depth is not None:
         terms["depth"] = settings.depth_weight * depth_loss(picture.depth, view.lidar)
+    if picture.depth is not None and settings.smoothness_weight:
+        terms["smoothness"] = settings.smoothness_weight * depth_roughness(picture.depth, alpha, view.target())
     logits = model.class_logits(picture, view.view) if view.classes is not None else None
     if logits is not None:
         terms["semantic"] = settings.semantic_weight * class_cross_entropy(logits, view.classes)
@@ -92,6 +99,31 @@ def depth_loss(depth: Float[Tensor, "h w"], lidar: LidarDepth) -> Float[Tensor, 
     errors = (depth.reshape(-1).index_select(0, lidar.pixels) - lidar.depth).abs()
     kept = max(1, int(len(errors) * (1.0 - IGNORED_DEPTHS)))
     return torch.topk(errors, kept, largest=False, sorted=False).values.mean()
+
+
+def depth_roughness(
+    depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], image: Float[Tensor, "h w 3"]
+) -> Float[Tensor, ""]:
+    """How uneven the surfaces of a depth image (metres) are: the mean over rows and columns of the absolute second
+    difference of inverse depth between neighbouring pixels, relative to it.
+
+    Inverse depth of a plane is a linear function of the pixel, whatever its slope. Pixels weigh exp(-EDGE_DECAY d) with
+    d the difference of brightness between both neighbours, after Godard et al. (2017, arXiv 1609.03677, equation 3):
+    where colours change a surface may end. Differences above MAX_CURVATURE count as that, so that edges of objects stay
+    as they are; pixels with an `alpha` of at most OPAQUE, of themselves or of a neighbour, do not count.
+    """
+    inverse, brightness, opaque = 1.0 / depth.clamp(min=MIN_DEPTH), image.mean(dim=2), alpha.detach() > OPAQUE
+    total = depth.new_zeros(())
+    for axis in (0, 1):
+        count = depth.shape[axis] - 2
+        if count < 1:
+            continue
+        before, at, after = (inverse.narrow(axis, start, count) for start in range(3))
+        curvature = ((before - 2.0 * at + after) / at.detach()).abs().clamp(max=MAX_CURVATURE)
+        edge = (brightness.narrow(axis, 2, count) - brightness.narrow(axis, 0, count)).abs()
+        inside = opaque.narrow(axis, 0, count) & opaque.narrow(axis, 1, count) & opaque.narrow(axis, 2, count)
+        total = total + (curvature * torch.exp(-EDGE_DECAY * edge) * inside).mean()
+    return total
 
 
 def entropy(alpha: Float[Tensor, "h w"]) -> Float[Tensor, ""]:

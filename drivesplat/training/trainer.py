@@ -22,6 +22,7 @@ from drivesplat.training.cuda_graph.iteration_graphs import (
 )
 from drivesplat.training.cuda_graph.scan_inputs import SharedScanInputs
 from drivesplat.training.densify import Densifier
+from drivesplat.training.dropout import with_dropout
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
@@ -165,11 +166,15 @@ class Trainer:
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # gradients of an iteration that ran out of memory
         with stage("render"):
+            gaussians = self.model.gaussians_in(view.view)
+            if self.settings.dropout:
+                gaussians = with_dropout(gaussians, self.model, self.settings.dropout)
             picture = self.model.render(
                 view.view,
                 self.sh_degree(),
+                gaussians=gaussians,
                 absgrad=by_gradient and self.settings.default.absgrad,
-                with_depth=view.lidar is not None,
+                with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self.settings)

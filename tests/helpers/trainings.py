@@ -158,7 +158,13 @@ def guided_views(device: torch.device = CPU) -> list[TrainingView]:
     return views
 
 
-ALL_TERMS = {"sky_bce_weight": 0.05, "depth_weight": 0.01, "entropy_weight": 0.1, "dynamic_weight": 0.1}
+ALL_TERMS = {
+    "sky_bce_weight": 0.05,
+    "depth_weight": 0.01,
+    "smoothness_weight": 0.1,
+    "entropy_weight": 0.1,
+    "dynamic_weight": 0.1,
+}
 
 
 def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:

@@ -16,8 +16,10 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.training.losses import (
+    MAX_CURVATURE,
     class_cross_entropy,
     depth_loss,
+    depth_roughness,
     entropy,
     loss_terms,
     sky_alpha_loss,
@@ -261,6 +263,43 @@ def test_depths_left_out_pull_on_nothing():
     pulled = set(gradient.nonzero()[:, 0].tolist())
     assert pulled == set(lidar.pixels.tolist()) - worst
     assert all(abs(float(value)) == pytest.approx(1 / 95) for value in gradient[list(pulled)])
+
+
+def depth_of_plane(normal: tuple[float, float, float], offset: float, size: int = 24) -> torch.Tensor:
+    """The depths (size, size) at which the rays of a camera with a focal length of `size` pixels meet the plane of
+    points p with normal · p = offset."""
+    rows, columns = torch.meshgrid(*[(torch.arange(size) + 0.5) / size - 0.5] * 2, indexing="ij")
+    return offset / (normal[0] * columns + normal[1] * rows + normal[2])
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, -0.2, 0.5), (0.0, 1.2, 0.9)])
+def test_a_plane_is_even_and_a_bumpy_one_is_not(normal):
+    depth, grey, opaque = depth_of_plane(normal, 5.0), torch.full((24, 24, 3), 0.5), torch.ones(24, 24)
+    assert float(depth_roughness(depth, opaque, grey)) < 1e-5
+    bumps = 1.0 + 0.01 * torch.from_numpy(np.random.default_rng(0).choice([-1.0, 1.0], (24, 24))).float()
+    bumpy, transparent = depth * bumps, opaque.clone()
+    found = float(depth_roughness(bumpy, opaque, grey))
+    inverse = (1.0 / bumpy).double().numpy()
+    expected = sum(
+        np.abs(np.diff(values, 2, axis=0) / values[1:-1]).clip(max=MAX_CURVATURE).mean()
+        for values in (inverse, inverse.T)
+    )
+    assert found == pytest.approx(expected, rel=1e-4)
+    transparent[:, 12:] = 0.5
+    assert float(depth_roughness(bumpy, transparent, grey)) < 0.6 * found
+    spotted = grey.clone()
+    spotted[:, ::3] = 0.0
+    assert float(depth_roughness(bumpy, opaque, spotted)) < found
+
+
+def test_edges_of_objects_are_not_smoothed():
+    depth = torch.full((6, 20), 10.0)
+    depth[:, 8:] = 4.0
+    depth[:, 13:] = 4.1
+    depth.requires_grad_()
+    depth_roughness(depth, torch.ones(6, 20), torch.full((6, 20, 3), 0.5)).backward()
+    pulled = depth.grad.abs().sum(dim=0).nonzero()[:, 0].tolist()
+    assert pulled == [11, 12, 13, 14]
 
 
 def test_entropy_is_that_of_a_coin():
