@@ -31,7 +31,6 @@ from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import (
     DefaultSettings,
-    FloaterSettings,
     GaussianSettings,
     McmcSettings,
     PartName,
@@ -39,6 +38,7 @@ from drivesplat.settings.train import (
     TrainJob,
     TrainSettings,
 )
+from drivesplat.settings.train_geometry import FloaterSettings
 from drivesplat.training.run import (
     TrainingFiles,
     TrainingInputs,

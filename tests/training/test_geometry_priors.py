@@ -15,7 +15,8 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.training_record import SeedInfo, TrainingRecord
-from drivesplat.settings.train import RoadSettings, TrainSettings
+from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP
 from drivesplat.training.geometry_priors import (
     NO_PRIORS,

@@ -12,7 +12,8 @@ from helpers.trainings import settings_of as settings_of_training
 from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.settings.train import McmcSettings, RoadSettings, TrainSettings
+from drivesplat.settings.train import McmcSettings, TrainSettings
+from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training import strategies
 from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier

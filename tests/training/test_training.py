@@ -60,10 +60,10 @@ from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train import (
     ActorSettings,
     DefaultSettings,
-    FloaterSettings,
     GaussianSettings,
     TrainJob,
 )
+from drivesplat.settings.train_geometry import FloaterSettings
 from drivesplat.training import resume_state
 from drivesplat.training.geometry_priors import GeometryPriors
 from drivesplat.training.monitor import FiniteGuard

@@ -1,0 +1,33 @@
+"""Settings of what is known of the geometry of a scene beside its images: empty space and the road."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from drivesplat.settings import Settings
+
+
+class FloaterSettings(Settings):
+    radius: float = Field(1.0, ge=0, le=10)
+    """Distance from the path of the training cameras (metres) within which Gaussians are faded out: the ego vehicle
+    drove there, so the space is empty. 0 = off."""
+    free_space: bool = False
+    """Also fade out Gaussians whose centres lie in space that LiDAR rays prove empty (see `free_space`)."""
+    below_road: bool = False
+    """Also fade out Gaussians whose centres lie more than `train.road.reach` below the road, where it is known
+    (`train.road_weight` above 0). A wet road mirrors what is above it: there, leave this off."""
+    every: int = Field(100, ge=1)
+    """Iterations between these steps."""
+
+
+class RoadSettings(Settings):
+    """Selection of the background Gaussians that train.road_weight acts on."""
+
+    surface: Literal["path", "lidar"] = "path"
+    """'path': the road under the path of the vehicle, which follows from its poses. 'lidar': the ground wherever LiDAR
+    seed points show it."""
+    half_width: float = Field(1.2, gt=0, le=10)
+    """Maximum lateral distance from the path of the vehicle's centre (metres), with `surface: path`. The weight falls
+    with this distance, since kerbs and grass may begin beside the vehicle."""
+    reach: float = Field(0.3, gt=0, le=2)
+    """Maximum height of a centre above or below the road surface (metres)."""
