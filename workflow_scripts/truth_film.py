@@ -7,17 +7,14 @@ from drivesplat.evaluation.synthetic import DriveTruth
 from drivesplat.inspection.truth_film import render_truth_film
 from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.model.checkpoint import read_checkpoint
-from drivesplat.readers.truth import read_truth
 from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.render import CompareJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, settings = current.input, current.settings(CompareJob)
     recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
-    checkpoint, truth = read_checkpoint(files.checkpoint), Path(files.truth[0])
-    known = DriveTruth(read_truth(truth), truth, recording)
-    provenance = current.provenance(*upstream, checkpoint.provenance, inputs={"truth": sha256_file(truth)})
-    record = render_truth_film(
-        checkpoint, known, current.wildcards.method, settings, current.device(), Path(current.output.film)
-    )
+    checkpoint, known = read_checkpoint(files.checkpoint), DriveTruth.read(files.truth[0], recording)
+    provenance = current.provenance(*upstream, checkpoint.provenance, inputs={"truth": sha256_file(known.path)})
+    film, method = Path(current.output.film), current.wildcards.method
+    record = render_truth_film(checkpoint, known, method, settings, current.device(), film)
     write_json(current.output.figures, {**record, "provenance": provenance})

@@ -27,6 +27,7 @@ from drivesplat.readers.truth import (
     Truth,
     TruthFrame,
     TruthView,
+    read_truth,
     truth_image,
 )  # fmt: skip
 from drivesplat.scene.images import continuous_intrinsics, read_image
@@ -47,6 +48,11 @@ class DriveTruth:
     truth: Truth
     path: Path
     recording: PreparedDrive
+
+    @classmethod
+    def read(cls, path: str | Path, recording: PreparedDrive) -> "DriveTruth":
+        """Reads truth.json. Raises ResultError that names the file and its rule if it is invalid."""
+        return cls(read_truth(path), Path(path), recording)
 
     def frames(self, view: TruthView) -> Iterator[tuple[int, TruthFrame]]:
         """The indices of the recorded images that a view has truth for, each with its truth."""

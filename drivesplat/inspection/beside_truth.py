@@ -10,6 +10,7 @@ from matplotlib import colormaps
 from drivesplat.errors import ResultError
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.settings.render import FilmEncoding
 
 MAX_ERROR = 0.5
 """The absolute error, of colours in [0, 1], that is drawn brightest."""
@@ -37,6 +38,22 @@ def panel_pictures(
     error = colormaps["inferno"](np.abs(renderings[-1] - truth).mean(axis=2) / MAX_ERROR)[..., :3]
     width, height = panels.size
     return [_to_bytes(image[:height, :width]) for image in (truth, *renderings, error)]
+
+
+def film_record(
+    camera: str, encoding: FilmEncoding, panels: Panels, figures: Sequence[dict[str, Any]], written: dict[str, Any]
+) -> dict[str, Any]:
+    """The JSON beside a film, without provenance: its camera and panels, the `figures` of each frame, and what
+    `encode_film` has `written`."""
+    return {
+        "schema": 1,
+        "camera": camera,
+        "fps": encoding.fps,
+        "frames": len(figures),
+        "film": panels.record(),
+        "images": list(figures),
+        **written,
+    }
 
 
 def even_size(size: tuple[int, int]) -> tuple[int, int]:

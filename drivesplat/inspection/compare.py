@@ -11,7 +11,14 @@ import torch
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.evaluation.synthetic import rendered
-from drivesplat.inspection.beside_truth import even_size, finite_image, image_rate, panel_pictures, with_psnr
+from drivesplat.inspection.beside_truth import (
+    even_size,
+    film_record,
+    finite_image,
+    image_rate,
+    panel_pictures,
+    with_psnr,
+)
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
@@ -85,16 +92,8 @@ def render_comparison(
     encoding = FilmEncoding(fps=image_rate(recording, images), crf=job.crf, captions=job.captions)
     comparison = _Comparison(recording, models, device, panels)
     with explain_out_of_memory(lambda: sum(map(len, models.values()))):
-        figures = encode_film(path, comparison.frames(images), len(images), panels, encoding)
-    return {
-        "schema": 1,
-        "camera": job.eval_camera,
-        "fps": encoding.fps,
-        "frames": len(images),
-        "film": panels.record(),
-        "images": comparison.figures,
-        **figures,
-    }
+        written = encode_film(path, comparison.frames(images), len(images), panels, encoding)
+    return film_record(job.eval_camera, encoding, panels, comparison.figures, written)
 
 
 def images_of(recording: PreparedDrive, camera: str) -> list[int]:

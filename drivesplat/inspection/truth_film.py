@@ -12,7 +12,14 @@ from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.evaluation.synthetic import DriveTruth, rendered
 from drivesplat.evaluation.views_aside import LATERAL, place_of_view
-from drivesplat.inspection.beside_truth import even_size, finite_image, image_rate, panel_pictures, with_psnr
+from drivesplat.inspection.beside_truth import (
+    even_size,
+    film_record,
+    finite_image,
+    image_rate,
+    panel_pictures,
+    with_psnr,
+)
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
@@ -78,15 +85,7 @@ def render_truth_film(
     sideways = _Sideways(known, model, method, device, panels)
     with explain_out_of_memory(lambda: len(model)):
         written = encode_film(path, sideways.frames(places), len(places), panels, encoding)
-    return {
-        "schema": 1,
-        "camera": job.eval_camera,
-        "fps": encoding.fps,
-        "frames": len(places),
-        "film": panels.record(),
-        "images": sideways.figures,
-        **written,
-    }
+    return film_record(job.eval_camera, encoding, panels, sideways.figures, written)
 
 
 def places_of(known: DriveTruth, camera: str) -> list[Place]:

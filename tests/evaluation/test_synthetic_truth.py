@@ -59,7 +59,7 @@ def known(tmp_path_factory) -> DriveTruth:
     labels[90 - EGO_ROWS :] = LABELS["own_car"]
     masks = write_labels(tmp_path_factory.mktemp("masks"), scene, labels)
     path = write_truth(root, WORLD, scene)
-    return DriveTruth(read_truth(path), path, recording_of(scene, masks, **HOLDOUT.model_dump()))
+    return DriveTruth.read(path, recording_of(scene, masks, **HOLDOUT.model_dump()))
 
 
 def flat_model(color=GREY, parts=()) -> SplatModel:

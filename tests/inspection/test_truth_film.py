@@ -16,7 +16,6 @@ from drivesplat.errors import DatasetError
 from drivesplat.evaluation.synthetic import DriveTruth
 from drivesplat.inspection import truth_film
 from drivesplat.inspection.truth_film import places_of, render_truth_film
-from drivesplat.readers.truth import read_truth
 from drivesplat.rendering.captions import Caption
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import CompareJob
@@ -30,7 +29,7 @@ def known(tmp_path_factory) -> DriveTruth:
     root = write_world(tmp_path_factory.mktemp("tiny"), SMALL)
     scene = scene_at(root, sweeps=False)
     path = write_truth(root, SMALL, scene)
-    return DriveTruth(read_truth(path), path, recording_of(scene, every_nth=2, offset=1))
+    return DriveTruth.read(path, recording_of(scene, every_nth=2, offset=1))
 
 
 def film(known: DriveTruth, path: Path, **changes: Any) -> dict[str, Any]:
