@@ -33,10 +33,15 @@ def over_cube_map(
     with rolling shutter is `turning`: a, b, c and its angular velocity (3,) about its own axes, which at the pixel (x,
     y) has lasted for a x + b y + c seconds. Gradients reach the image, alpha and texels, and the camera through `rays`.
     """
-    if triton_support.usable_for(image) and not camera_to_world.requires_grad:
-        from drivesplat.kernels.triton.cube_map import OverCubeMap
+    if not camera_to_world.requires_grad:
+        if triton_support.usable_for(image):
+            from drivesplat.kernels.triton.cube_map import OverCubeMap
 
-        return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
+            return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
+        if image.device.type == "cpu":
+            from drivesplat.kernels.numba.cube_map import OverCubeMap
+
+            return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
     return image + (1.0 - alpha) * cube_map_colors(cube, rays())
 
 
