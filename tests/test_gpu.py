@@ -54,6 +54,7 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import DefaultSettings, DeformableSettings, GaussianSettings, McmcSettings, TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training import trainer as trainer_module
+from drivesplat.training.dropout import with_dropout
 from drivesplat.training.scans import initial_echo, load_scans
 from drivesplat.training.trainer import Trainer
 
@@ -621,6 +622,22 @@ def test_a_growing_training_learns_the_same_by_cuda_graphs():
     assert [len(part) for part in captured.model.parts] == [len(part) for part in eager.model.parts]
     assert captured.model.parts[0].preallocated and not eager.model.parts[0].preallocated
     assert mine[-1] == pytest.approx(theirs[-1], rel=0.1) and mine[-1] < 0.8 * mine[0]
+
+
+def test_each_replay_drops_out_other_gaussians():
+    model = untrained_street(settings_of()).to(GPU)
+    gaussians = model.gaussians_at(0.5)
+    with capture_stream(GPU), torch.no_grad():
+        graph = capture(lambda: with_dropout(gaussians, model, 0.5).opacities, [], new_pool(), GPU, "dropout")
+        assert graph is not None
+        left_out = []
+        for _ in range(3):
+            graph.replay()
+            left_out.append((graph.result != gaussians.opacities).clone())
+    torch.cuda.synchronize()
+    assert all(a.any() and not torch.equal(a, b) for a, b in pairwise(left_out))
+    trainer, losses = trained_with(True, dropout=0.1)
+    assert len(trainer.graphs._graphs) == len(trainer.images.views) and losses[-1] < losses[0]
 
 
 def test_overflowed_lists_are_detected(monkeypatch):
