@@ -1,7 +1,6 @@
 """Smooth paths through noisy places, with outliers among them."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -10,9 +9,10 @@ from scipy.interpolate import BSpline
 DEGREE = 3
 KNOT_S = 0.5
 """Seconds between knots, or more where places are rarer."""
-STIFFNESS = 0.02
-"""Weight of squared accelerations (m/s²) per second, in places of weight 1 (m²)."""
-OUTLIER = 0.3
+STIFFNESS = 0.0125
+"""Weight of squared jerks (m/s³), in places of weight 1 (m²). Their errors last: where an object is seen in part they
+are those of many places one after the other, so that more places per second say hardly more."""
+OUTLIER = 0.2
 """Metres beyond which a deviation counts linearly (Huber)."""
 ROUNDS = 6
 
@@ -38,18 +38,19 @@ def smooth_path(
     seconds: Float[np.ndarray, " k"], places: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, "k 2"]
 ) -> Path:
     """The path that is near `places` at increasing `seconds`, by the least sum of weighted squared deviations and of
-    squared accelerations. `weights` are those of each coordinate."""
+    squared jerks: neither a constant velocity nor a constant acceleration costs anything. `weights` are those of each
+    coordinate."""
     first, last = float(seconds[0]), float(seconds[-1])
     spans = max(1, min(int(np.ceil((last - first) / KNOT_S)), len(seconds)))
     inner = np.linspace(first, max(last, first + 1e-3), spans + 1)
     knots = np.concatenate([np.full(DEGREE, inner[0]), inner, np.full(DEGREE, inner[-1])])
     design = BSpline.design_matrix(np.clip(seconds, inner[0], inner[-1]), knots, DEGREE).toarray()
-    penalty = _accelerations(knots, inner)
+    penalty = STIFFNESS * len(seconds) / max(last - first, 1e-3) * _jerks(knots, inner)
     coefficients = np.zeros((design.shape[1], 2))
     for axis in range(2):
         own = weights[:, axis].copy()
         for _ in range(ROUNDS):
-            normal = design.T @ (own[:, None] * design) + STIFFNESS * penalty
+            normal = design.T @ (own[:, None] * design) + penalty
             normal += 1e-9 * np.trace(normal) * np.eye(len(normal))
             coefficients[:, axis] = np.linalg.solve(normal, design.T @ (own * places[:, axis]))
             off = np.abs(places[:, axis] - design @ coefficients[:, axis])
@@ -57,14 +58,8 @@ def smooth_path(
     return Path(BSpline(knots, coefficients, DEGREE), first, last)
 
 
-def _accelerations(knots: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """The quadratic form of the integral of squared accelerations; exact, as these are linear between knots."""
+def _jerks(knots: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """The quadratic form of the integral of squared third derivatives, which are constant between knots."""
     count = len(knots) - DEGREE - 1
-    second = BSpline(knots, np.eye(count), DEGREE).derivative(2)
-    found = np.zeros((count, count))
-    for start, end in pairwise(inner):
-        middle, half = 0.5 * (start + end), 0.5 * (end - start)
-        for place in (middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)):
-            value = second(place)
-            found += half * np.outer(value, value)
-    return found
+    values = BSpline(knots, np.eye(count), DEGREE).derivative(3)(0.5 * (inner[:-1] + inner[1:]))
+    return values.T @ (np.diff(inner)[:, None] * values)

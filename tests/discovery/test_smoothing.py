@@ -1,6 +1,7 @@
 """Smooth paths: exact where places are, robust where some are wrong."""
 
 import numpy as np
+import pytest
 
 from drivesplat.discovery.smoothing import smooth_path
 
@@ -38,3 +39,35 @@ def test_places_of_little_weight_yield_to_others():
 def test_two_places_are_enough():
     path = smooth_path(np.array([1.0, 1.5]), np.array([[0.0, 1.0], [1.0, 1.0]]), weights(2))
     np.testing.assert_allclose(path.places(np.array([1.0, 1.5])), [[0.0, 1.0], [1.0, 1.0]], atol=0.05)
+
+
+def of_scans(truth: np.ndarray, per_second: float, seed: int) -> np.ndarray:
+    """Places with noise, and with errors that last for half a second, as of a side that is hidden for a while."""
+    rng = np.random.default_rng(seed)
+    lasting = max(1, round(0.5 * per_second))
+    shifts = np.repeat(rng.normal(0.0, 0.06, (len(truth) // lasting + 1, 2)), lasting, axis=0)[: len(truth)]
+    return truth + rng.normal(0.0, 0.04, truth.shape) + shifts
+
+
+@pytest.mark.parametrize("per_second", [20.0, 2.0])
+def test_a_vehicle_that_brakes_hard_is_followed(per_second):
+    """From 12 m/s with 6 m/s² to a stop."""
+    seconds = np.arange(0.0, 8.01, 1.0 / per_second)
+    braking = np.clip(seconds - 2.0, 0.0, 2.0)
+    truth = np.stack([12.0 * np.minimum(seconds, 2.0) + 12.0 * braking - 3.0 * braking**2, 0.0 * seconds], axis=1)
+    for seed in range(3):
+        path = smooth_path(seconds, of_scans(truth, per_second, seed), np.full(truth.shape, 10.0))
+        assert np.linalg.norm(path.places(seconds) - truth, axis=1).max() < 0.3
+
+
+def test_errors_that_last_for_half_a_second_do_not_bend_the_path():
+    """A cyclist at constant speed whom somebody passes: what counts is how far a place lies off its neighbours half
+    a second before and after."""
+    seconds = np.arange(0.0, 8.01, 0.05)
+    truth = np.stack([4.2 * seconds, 0.3 * np.sin(0.3 * seconds)], axis=1)
+    bends = []
+    for seed in range(5):
+        path = smooth_path(seconds, of_scans(truth, 20.0, seed), np.full(truth.shape, 10.0))
+        off = path.places(seconds) - truth
+        bends.append(off[10:-10] - 0.5 * (off[:-20] + off[20:]))
+    assert np.sqrt(np.mean(np.square(bends))) < 0.025
