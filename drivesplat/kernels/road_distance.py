@@ -13,6 +13,8 @@ from drivesplat.kernels.sparse_grid import SparseGrid
 
 ROUGHNESS = 0.05
 """Tolerated error of road and poses in metres: the transition of the loss from quadratic to linear."""
+DEEPEST = 5.0
+"""Metres below the road beyond which there may be another road, as below a bridge."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +35,16 @@ class Road:
 
     @torch.no_grad()
     def is_above(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Whether the road passes more than `reach` metres above points in world coordinates (metres); False where
+        """Whether the road passes `reach` to DEEPEST metres above points in world coordinates (metres); False where
         there is no road. No host synchronisation."""
         if len(self.weights) == 0:
             return torch.zeros(len(points), dtype=torch.bool, device=points.device)
         cell, known = self.cells.lookup(points[:, :2])
-        return known & (self.heights(points, cell) < -self.reach)
+        heights = self.heights(points, cell)
+        return known & (heights < -self.reach) & (heights > -DEEPEST)
 
     def heights(self, points: Float[Tensor, "n 3"], cell: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """The heights in metres of points above the planes of given cells."""
+        """The signed distances in metres of points from the planes of given cells, positive above them."""
         return (points * self.normals[cell]).sum(dim=1) - self.offsets[cell]
 
 
@@ -55,11 +58,11 @@ def road_distance(
     """The weighted mean distance in metres of the road's Gaussians from its surface: sqrt(d² + nᵀ Σ n + c²) - c, the
     pseudo-Huber norm.
 
-    With the plane's normal n, d the height of the centre over it, and Σ the covariance, d² + nᵀ Σ n is the mean square
-    distance of a Gaussian's mass from the plane, minimal for a centre in the plane and the shortest axis along its
-    normal. c is ROUGHNESS. `means` are in world coordinates (metres), `quats` of any length, `scales` standard
-    deviations in metres. Gaussians farther away than `reach` and those of opacity 0 do not count. 0 where no Gaussian
-    counts.
+    With the plane's normal n, d the signed distance of the centre from it, and Σ the covariance, d² + nᵀ Σ n is the
+    mean square distance of a Gaussian's mass from the plane, minimal for a centre in the plane and the shortest axis
+    along its normal. c is ROUGHNESS. `means` are in world coordinates (metres), `quats` of any length, `scales`
+    standard deviations in metres. Gaussians farther away than `reach` and those of opacity 0 do not count. 0 where no
+    Gaussian counts.
     """
     if len(road.weights) == 0 or len(means) == 0:
         return means.sum() * 0.0

@@ -60,7 +60,7 @@ class GroundMap:
         """A plane through the ground around each cell, where it is known and even enough.
 
         The low points show which points are ground, but they lie below it by the noise of ranges. A plane through them
-        is therefore followed by one through the mean of each cell's points within NEAR metres of it.
+        is therefore followed by one through the mean of the points nearest to it, within NEAR metres of it.
         """
         if not len(self._lowest):
             return Planes(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0))

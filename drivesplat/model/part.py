@@ -280,10 +280,9 @@ class Sky(nn.Module, ABC):
         splats: Float[Tensor, "h w 3"],
         alpha: Float[Tensor, "h w 1"],
         view: View,
-        rays: Float[Tensor, "h w 3"] | None = None,
     ) -> Float[Tensor, "h w 3"]:
-        """Composites `splats`, premultiplied by `alpha`, over this sky. `rays` are `view.rays()` if already known."""
-        return splats + (1.0 - alpha) * self.colors(view.rays() if rays is None else rays)
+        """Composites `splats`, premultiplied by `alpha`, over this sky."""
+        return splats + (1.0 - alpha) * self.colors(view.rays())
 
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:

@@ -50,11 +50,9 @@ class CubemapSky(Sky):
         splats: Float[Tensor, "h w 3"],
         alpha: Float[Tensor, "h w 1"],
         view: View,
-        rays: Float[Tensor, "h w 3"] | None = None,
     ) -> Float[Tensor, "h w 3"]:
-        directions = view.rays if rays is None else lambda: rays
         return over_cube_map(
-            splats, alpha, self._cube_map, view.K, view.camera_to_world, directions, view.turning_by_line
+            splats, alpha, self._cube_map, view.K, view.camera_to_world, view.rays, view.turning_by_line
         )
 
     @property

@@ -203,11 +203,10 @@ class SplatModel(nn.Module):
         gaussians: Gaussians | None = None,
         absgrad: bool = False,
         with_depth: bool = False,
-        rays: Tensor | None = None,
     ) -> Picture:
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
-        `gaussians` replace `gaussians_in(view)`; `rays` (h, w, 3) are `view.rays()` if already known.
+        `gaussians` replace `gaussians_in(view)`.
         """
         shown = self.gaussians_in(view) if gaussians is None else gaussians
         seen_from = self.seen_from(view)
@@ -221,7 +220,7 @@ class SplatModel(nn.Module):
         splats, alpha = rendering.image[0], rendering.alpha[0]
         image = splats
         if self.sky is not None:
-            image = self.sky.behind(splats, alpha, seen_from, rays if seen_from is view else None)
+            image = self.sky.behind(splats, alpha, seen_from)
         if self.exposure is not None:
             image = self.exposure.applied(image, view.camera)
         depth = None if rendering.depth is None else depth_at_lines(rendering.depth[0, ..., 0], seen_from)

@@ -202,8 +202,8 @@ class TrainSettings(Settings):
     scale_reg: float = Field(0.01, ge=0)
     """Loss weight of the mean scale (metres)."""
     dropout: float = Field(0.0, ge=0, lt=1)
-    """Fraction of the Gaussians of static parts that each iteration leaves out at random. Then no single image can rely
-    on a Gaussian that others do not see (docs/off_the_lane.md)."""
+    """Fraction of the Gaussians of static parts that each iteration with an image leaves out at random: no surface may
+    depend on a single Gaussian (docs/off_the_lane.md)."""
     flatness_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean thickness of background Gaussians (their smallest scale, metres)."""
     road_weight: float = Field(0.0, ge=0)
@@ -216,8 +216,8 @@ class TrainSettings(Settings):
     depth_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean absolute difference from LiDAR depth (metres), without the worst 5 % of pixels."""
     smoothness_weight: float = Field(0.0, ge=0)
-    """Loss weight of the unevenness of rendered surfaces: the mean second difference of inverse depth between
-    neighbouring pixels, relative to it, without edges (docs/off_the_lane.md)."""
+    """Loss weight of the unevenness of rendered surfaces: the mean absolute second difference of inverse depth between
+    neighbouring pixels, divided by inverse depth; clipped and down-weighted at edges (docs/off_the_lane.md)."""
     entropy_weight: float = Field(0.1, ge=0)
     """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
     consist of objects."""
@@ -255,6 +255,12 @@ class TrainSettings(Settings):
     def _scans_need_mcmc(self) -> "TrainSettings":
         if self.scans.per_image and self.strategy != "mcmc":
             raise ValueError("scans.per_image needs strategy: mcmc, since densification by gradient knows images alone")
+        return self
+
+    @model_validator(mode="after")
+    def _below_road_needs_a_road(self) -> "TrainSettings":
+        if self.floaters.below_road and not self.road_weight:
+            raise ValueError("floaters.below_road needs road_weight above 0: without it the road is not known")
         return self
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":

@@ -14,8 +14,8 @@ class FloaterSettings(Settings):
     free_space: bool = False
     """Also fade out Gaussians whose centres lie in space that LiDAR rays prove empty (see `free_space`)."""
     below_road: bool = False
-    """Also fade out Gaussians whose centres lie more than `train.road.reach` below the road, where it is known
-    (`train.road_weight` above 0). A wet road mirrors what is above it: there, leave this off."""
+    """Also fade out Gaussians whose centres lie `train.road.reach` to 5 m below the road. Needs `train.road_weight`
+    above 0. Leave this off on wet roads, which mirror what is above them."""
     every: int = Field(100, ge=1)
     """Iterations between these steps."""
 

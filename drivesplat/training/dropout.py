@@ -1,4 +1,4 @@
-"""Dropout of Gaussians: each iteration leaves some of them out at random, so that none is needed by a single image."""
+"""Dropout of Gaussians: each iteration with an image leaves some of them out at random."""
 
 from dataclasses import replace
 
@@ -12,7 +12,8 @@ def with_dropout(gaussians: Gaussians, model: SplatModel, share: float) -> Gauss
     """The Gaussians of a model with a random `share` of those of its static parts left out: their opacity is 0.
 
     As DropGaussian (Park et al., CVPR 2025), but with a constant share and without raising the opacity of the others.
-    Uses torch's global random generator. No host synchronisation.
+    Loss terms that ignore Gaussians of opacity 0 (opacity, scale, road) ignore these, too, and pictures of the training
+    lack them. Uses torch's global random generator. No host synchronisation.
     """
     kept = torch.rand_like(gaussians.opacities) >= share
     for part, rows in zip(model.parts, model.rows, strict=True):

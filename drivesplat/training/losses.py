@@ -20,7 +20,8 @@ IGNORED_DEPTHS = 0.05
 MIN_DEPTH = 1.0
 """Metres: nearer depths count as this where their inverse is compared."""
 MAX_CURVATURE, EDGE_DECAY, OPAQUE = 0.1, 10.0, 0.8
-"""Of `depth_roughness`."""
+"""Of `depth_roughness`: the relative second difference of inverse depth as which larger ones count, the decay of
+weights per unit of brightness in [0, 1], and the alpha that pixels must exceed."""
 
 
 def loss_terms(
@@ -45,7 +46,8 @@ def loss_terms(
     if view.lidar is not None and picture.depth is not None:
         terms["depth"] = settings.depth_weight * depth_loss(picture.depth, view.lidar)
     if picture.depth is not None and settings.smoothness_weight:
-        terms["smoothness"] = settings.smoothness_weight * depth_roughness(picture.depth, alpha, view.target())
+        opaque = picture.alpha if view.ego_mask is None else picture.alpha.masked_fill(view.ego_mask, 0.0)
+        terms["smoothness"] = settings.smoothness_weight * depth_roughness(picture.depth, opaque, view.target())
     logits = model.class_logits(picture, view.view) if view.classes is not None else None
     if logits is not None:
         terms["semantic"] = settings.semantic_weight * class_cross_entropy(logits, view.classes)
@@ -104,8 +106,8 @@ def depth_loss(depth: Float[Tensor, "h w"], lidar: LidarDepth) -> Float[Tensor, 
 def depth_roughness(
     depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], image: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, ""]:
-    """How uneven the surfaces of a depth image (metres) are: the mean over rows and columns of the absolute second
-    difference of inverse depth between neighbouring pixels, relative to it.
+    """How uneven the surfaces of a depth image (metres) are: the absolute second difference of inverse depth between
+    neighbouring pixels, divided by inverse depth. The sum of its means along rows and along columns.
 
     Inverse depth of a plane is a linear function of the pixel, whatever its slope. Pixels weigh exp(-EDGE_DECAY d) with
     d the difference of brightness between both neighbours, after Godard et al. (2017, arXiv 1609.03677, equation 3):

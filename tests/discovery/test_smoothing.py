@@ -71,3 +71,21 @@ def test_errors_that_last_for_half_a_second_do_not_bend_the_path():
         off = path.places(seconds) - truth
         bends.append(off[10:-10] - 0.5 * (off[:-20] + off[20:]))
     assert np.sqrt(np.mean(np.square(bends))) < 0.025
+
+
+@pytest.mark.parametrize("weight", [0.1, 1.0, 30.0])
+@pytest.mark.parametrize("duration", [0.1, 0.3, 1.0, 20.0])
+def test_a_straight_way_far_from_the_origin_is_reproduced(duration, weight):
+    seconds = np.arange(0.0, duration + 0.01, 0.05)
+    places = np.array([1000.0, -2000.0]) + np.outer(seconds, [8.0, -3.0])
+    path = smooth_path(seconds, places, np.full(places.shape, weight))
+    np.testing.assert_allclose(path.places(seconds), places, atol=0.02)
+    later = path.places(seconds[-1:] + 0.5)[0]
+    np.testing.assert_allclose(later, places[-1] + np.array([4.0, -1.5]), atol=0.05)
+
+
+def test_few_noisy_places_make_no_sharp_turn():
+    """Three scans of a car at 10 m/s: half a second later it is where it would go straight on."""
+    seconds, noise = np.array([0.0, 0.05, 0.1]), np.array([[0.0, 0.03], [0.0, -0.03], [0.0, 0.03]])
+    path = smooth_path(seconds, np.outer(seconds, [10.0, 0.0]) + noise, np.full((3, 2), 3.0))
+    assert np.linalg.norm(path.places(np.array([0.6])) - [[6.0, 0.0]]) < 1.0

@@ -155,14 +155,6 @@ def test_the_sky_is_composited_behind_the_gaussians(sky):
     assert picture.depth.shape == picture.alpha.shape and without.depth is None
 
 
-def test_given_rays_replace_those_of_the_view():
-    model = SplatModel([Background.from_points(*seed_points(10), GaussianSettings(), 1.0)], shaken_cubemap())
-    view = a_view()
-    torch.testing.assert_close(model.render(view, 0, rays=view.rays()).image, model.render(view, 0).image)
-    mirrored = model.render(view, 0, rays=-view.rays()).image
-    assert not torch.allclose(mirrored, model.render(view, 0).image)
-
-
 def shaken_cubemap() -> CubemapSky:
     return shaken(CubemapSky(4, torch.full((3,), 0.5), 1e-2))
 

@@ -112,12 +112,14 @@ def test_gaussians_fade_whose_centres_lie_in_space_proven_empty(radius, faded):
 
 
 def test_gaussians_fade_that_the_road_hides():
-    """Those more than `reach` below it, and not where there is no road. It rises by 10 % along x."""
+    """Those `reach` to 5 m below it, and not where there is no road. It rises by 10 % along x."""
     normal = F.normalize(torch.tensor([[-0.1, 0.0, 1.0]]), dim=1)
     cells = SparseGrid.from_numpy(np.zeros(2), 10.0, np.array([1, 1]), np.array([0]))
     road = Road(cells, normal, torch.zeros(1), torch.ones(1), 0.3)
-    positions = np.array([[8.0, 5.0, 0.4], [8.0, 5.0, 0.6], [1.0, 1.0, -5.0], [8.0, 5.0, 3.0], [-1.0, 5.0, -5.0]])
-    part = Background.from_points(positions, np.full((5, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
+    positions = np.array(
+        [[8.0, 5.0, 0.4], [8.0, 5.0, 0.6], [1.0, 1.0, -4.0], [8.0, 5.0, 3.0], [-1.0, 5.0, -4.0], [5.0, 5.0, -6.0]]
+    )
+    part = Background.from_points(positions, np.full((6, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 0.0, road=road))
     assert (part.at(0.0).opacities.detach() < 1e-3).nonzero()[:, 0].tolist() == [0, 2]
 

@@ -302,6 +302,18 @@ def test_edges_of_objects_are_not_smoothed():
     assert pulled == [11, 12, 13, 14]
 
 
+def test_what_the_ego_vehicle_hides_is_not_smoothed():
+    model = a_model()
+    _, view = a_case(model)
+    body = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    body[10:] = True
+    depth = torch.from_numpy(np.random.default_rng(8).uniform(9.5, 10.5, (HEIGHT, WIDTH))).float().requires_grad_()
+    picture = picture_of(model, random_image(3), torch.ones(HEIGHT, WIDTH), depth)
+    terms = loss_terms(picture, dataclasses.replace(view, ego_mask=body), model, TrainSettings(smoothness_weight=1.0))
+    terms["smoothness"].backward()
+    assert not depth.grad[10:].any() and depth.grad[:10].any()
+
+
 def test_entropy_is_that_of_a_coin():
     alpha = torch.tensor([[0.5, 0.1], [0.9, 0.3]])
     expected = np.mean([-(o * np.log(o) + (1 - o) * np.log(1 - o)) for o in (0.5, 0.1, 0.9, 0.3)])

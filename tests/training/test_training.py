@@ -63,7 +63,7 @@ from drivesplat.settings.train import (
     GaussianSettings,
     TrainJob,
 )
-from drivesplat.settings.train_geometry import FloaterSettings
+from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.training import resume_state
 from drivesplat.training.geometry_priors import GeometryPriors
 from drivesplat.training.monitor import FiniteGuard
@@ -217,6 +217,33 @@ def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
     train(model, recorded_views(), settings, 0, CPU, folders, GeometryPriors(free=free))
     still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
     assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
+
+
+@pytest.mark.parametrize("fades", [False, True])
+def test_gaussians_below_the_road_fade_where_wanted(tmp_path, fades):
+    """The road lies above all Gaussians."""
+    poses = np.eye(4)[None] + np.array([[0.0, 0.0, 0.0, 0.0]] * 2 + [[0.0, 0.0, 0.0, 4.5]] + [[0.0] * 4])
+    wide = RoadSettings(half_width=10.0, reach=0.01)
+    floaters = FloaterSettings(every=7, radius=0, below_road=fades)
+    settings = settings_of(iterations=7, refine_start=1.0, floaters=floaters, road_weight=0.1)
+    model, priors = untrained_street(settings), GeometryPriors(road=driven_road(poses, wide))
+    low = priors.road.is_above(model.parts[0].params["means"].detach())
+    assert low.any()
+    train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "of this training"), priors)
+    still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
+    assert bool((still[low] < 1e-3).all()) == fades and not (actors < 1e-3).any()
+
+
+def test_an_iteration_with_dropout_leaves_out_static_gaussians_and_others_next_time():
+    settings = settings_of(dropout=0.3)
+    trainer = Trainer.begin(untrained_street(settings), recorded_views(), settings, 0, CPU)
+    still, _ = trainer.model.rows
+    left_out = []
+    for _ in range(2):
+        _, picture, _ = trainer.fit_one()
+        left_out.append(picture.gaussians.opacities[still] == 0.0)
+    assert all(0.1 < float(mask.float().mean()) < 0.5 for mask in left_out) and not torch.equal(*left_out)
+    assert (trainer.model.gaussians_at(0.0).opacities[still] > 0.0).all()
 
 
 @pytest.mark.parametrize(("limit", "farthest"), [(50.0, 50.0), (None, 7e5)])

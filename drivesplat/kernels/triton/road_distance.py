@@ -115,8 +115,8 @@ def _distances_backward(
 @triton.jit
 @no_type_check
 def _along(quats, scales, i, mask, normal):
-    """The unit quaternions and their lengths before, the normal in Gaussians' own axes times their scales, and both
-    factors, of the Gaussians i of a mask."""
+    """The unit quaternions of the Gaussians i of a mask, their lengths before normalisation, their scales, the normal
+    in their own axes, and its product with the scales."""
     w, x = tl.load(quats + 4 * i, mask=mask, other=1.0), tl.load(quats + 4 * i + 1, mask=mask, other=0.0)
     y, z = tl.load(quats + 4 * i + 2, mask=mask, other=0.0), tl.load(quats + 4 * i + 3, mask=mask, other=0.0)
     length = tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
