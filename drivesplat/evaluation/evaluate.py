@@ -28,7 +28,6 @@ from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
-from drivesplat.readers.truth import read_truth
 from drivesplat.scene.masks import MasksRecord, read_masks_record
 from drivesplat.scene.prepared_drive import PreparedDrive, read_prepared_drive
 from drivesplat.scene.regions import region_mask
@@ -144,8 +143,8 @@ def truth_metrics(
     renders it; empty for a recorded drive."""
     if inputs.truth is None or job.removal is None:
         return {}
-    truth, margin = read_truth(inputs.truth), job.removal.margin
-    known = DriveTruth(truth, inputs.truth, inputs.recording)
+    known, margin = DriveTruth.read(inputs.truth, inputs.recording), job.removal.margin
+    truth = known.truth
     lateral = lateral_metrics(model, known, job.eval_camera, lpips_map, device)
     removal = removal_metrics(model, known, job.eval_camera, margin, lpips_map, device)
     found = {"lateral": lateral or {}, "removal": removal or {}}

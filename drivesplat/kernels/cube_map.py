@@ -33,16 +33,14 @@ def over_cube_map(
     with rolling shutter is `turning`: a, b, c and its angular velocity (3,) about its own axes, which at the pixel (x,
     y) has lasted for a x + b y + c seconds. Gradients reach the image, alpha and texels, and the camera through `rays`.
     """
-    if not camera_to_world.requires_grad:
-        if triton_support.usable_for(image):
-            from drivesplat.kernels.triton.cube_map import OverCubeMap
-
-            return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
-        if image.device.type == "cpu":
-            from drivesplat.kernels.numba.cube_map import OverCubeMap
-
-            return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
-    return image + (1.0 - alpha) * cube_map_colors(cube, rays())
+    learned = camera_to_world.requires_grad
+    if not learned and triton_support.usable_for(image):
+        from drivesplat.kernels.triton.cube_map import OverCubeMap
+    elif not learned and image.device.type == "cpu":
+        from drivesplat.kernels.numba.cube_map import OverCubeMap
+    else:
+        return image + (1.0 - alpha) * cube_map_colors(cube, rays())
+    return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
 
 
 def cube_map_colors(cube: CubeMap, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

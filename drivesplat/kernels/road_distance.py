@@ -71,11 +71,12 @@ def road_distance(
 
         return RoadDistance.apply(means, quats, scales, opacities, road, ROUGHNESS)
     cell, on_road = road.cells.lookup(means[:, :2])
-    on_road &= (road.heights(means.detach(), cell).abs() < road.reach) & (opacities.detach() > 0.0)
+    heights = road.heights(means, cell)
+    on_road &= (heights.detach().abs() < road.reach) & (opacities.detach() > 0.0)
     if not means.is_cuda:  # a GPU would wait for the number of these rows
         rows = on_road.nonzero()[:, 0]
-        means, quats, scales, cell, on_road = (values[rows] for values in (means, quats, scales, cell, on_road))
-    heights, weights = road.heights(means, cell), road.weights[cell] * on_road
+        heights, quats, scales, cell, on_road = (values[rows] for values in (heights, quats, scales, cell, on_road))
+    weights = road.weights[cell] * on_road
     along = rotated_back(F.normalize(quats, dim=1), road.normals[cell]) * scales
     distance = torch.sqrt(heights.square() + along.square().sum(dim=1) + ROUGHNESS**2) - ROUGHNESS
     return (weights * distance).sum() / weights.sum().clamp(min=1e-6)

@@ -222,8 +222,8 @@ def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
 @pytest.mark.parametrize("fades", [False, True])
 def test_gaussians_below_the_road_fade_where_wanted(tmp_path, fades):
     """The road lies above all Gaussians."""
-    poses = np.eye(4)[None] + np.array([[0.0, 0.0, 0.0, 0.0]] * 2 + [[0.0, 0.0, 0.0, 4.5]] + [[0.0] * 4])
-    wide = RoadSettings(half_width=10.0, reach=0.01)
+    poses, wide = np.eye(4)[None], RoadSettings(half_width=10.0, reach=0.01)
+    poses[0, 2, 3] = 4.5
     floaters = FloaterSettings(every=7, radius=0, below_road=fades)
     settings = settings_of(iterations=7, refine_start=1.0, floaters=floaters, road_weight=0.1)
     model, priors = untrained_street(settings), GeometryPriors(road=driven_road(poses, wide))
