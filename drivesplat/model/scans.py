@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drivesplat.errors import ResultError
+from drivesplat.kernels.echoes import echo_values
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
@@ -77,10 +78,8 @@ def scan_picture(gaussians: Gaussians, view: ScanView, before: Float[Tensor, "b 
     that the vehicle blocks, is not returned. Raises ResultError for Gaussians without echoes."""
     if gaussians.echoes is None:
         raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
-    toward = torch.nn.functional.normalize(gaussians.means.detach() - view.sensor_to_world[:3, 3], dim=-1)
-    along = (toward[:, :, None] * gaussians.echoes[:, 1:]).sum(dim=1)  # a GPU multiplies small matrices slowly
-    logits = gaussians.echoes[:, 0] + along
-    rendering = _rasterized(gaussians, view, torch.sigmoid(logits), before)
+    values = echo_values(gaussians.echoes, gaussians.means, view.sensor_to_world[:3, 3])
+    rendering = _rasterized(gaussians, view, values, before)
     intensity, returned = rendering.values.unbind(dim=-1)
     if view.blocked is not None:
         returned = torch.where(view.blocked, 0.0, returned)

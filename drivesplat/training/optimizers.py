@@ -127,6 +127,19 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
+FINE_TUNED = ("echoes", *OFFSETS.values())
+"""The parameters of Gaussians that only the LiDAR sees."""
+
+
+def choose_learned(optimizers: ModelOptimizers, fine_tunes: bool) -> None:
+    """Makes gradients reach what the next iteration learns: where it `fine_tunes`, of parts only what only the LiDAR
+    sees, and before that everything but OFFSETS. What is constant costs an iteration nothing."""
+    for group in (*optimizers.parts, *optimizers.shared):
+        for name, optimizer in group.items():
+            learned = name in FINE_TUNED if fine_tunes else name not in OFFSETS.values()
+            optimizer.parameter.requires_grad_(learned)
+
+
 def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float, settings: TrainSettings) -> None:
     """Sets the learning rates after the fraction `done` of the training. Those of cameras and of what parts name in
     `decaying` decay exponentially, and that of exposures is 0 until they start; the others are constant."""
@@ -148,7 +161,7 @@ def set_fine_tuning_rates(model: SplatModel, optimizers: ModelOptimizers, done: 
     decay exponentially."""
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         rates = part.learning_rates()
-        for name in ("echoes", *OFFSETS.values()):
+        for name in FINE_TUNED:
             if name in group:
                 begin = FINE_TUNED_MEANS if name == OFFSETS["means"] else FINE_TUNED_OTHERS
                 group[name].param_groups[0]["lr"] = rates[name] * begin * DECAY**done

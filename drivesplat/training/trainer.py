@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.splat_model import Picture, ScanTimeStates, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
@@ -29,6 +28,7 @@ from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import (
     DeviceSchedule,
     ModelOptimizers,
+    choose_learned,
     make_optimizers,
     set_fine_tuning_rates,
     set_learning_rates,
@@ -114,6 +114,7 @@ class Trainer:
         """The first half of an iteration: render a view or a scan, compare, step. Returns its loss terms, the picture
         and the view, both None after a scan. Without `with_picture` the iteration may be that of a scan or a replayed
         CUDA graph, and the picture is None; without images, and where it fine-tunes, it is that of a scan."""
+        choose_learned(self.optimizers, self.fine_tunes)
         self._set_learning_rates()
         step, rates = self.schedule.update(self.step, self.optimizers)
         if self.fits_scan and (self.fine_tunes or not (with_picture and self.images.views)):
@@ -133,16 +134,14 @@ class Trainer:
     def _fit_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
         """An iteration with the scan whose turn it is, by its CUDA graph where there is one."""
         number = scan_index(len(self.scans), self.scan_schedule.scans_before(self.step), self.seed)
-        scan, fine = self.scans[number], self.fine_tunes
+        scan = self.scans[number]
         states = self.model.scan_states(scan.view.time) if self.graphs.enabled else None
         if states is None:
-            return self.graphs.retry_without_graphs(lambda: self._learn_scan(scan, None, step, rates, fine))
+            return self.graphs.retry_without_graphs(lambda: self._learn_scan(scan, None, step, rates))
         inputs = self.graphs.retry_without_graphs(lambda: self.scan_inputs.load(scan, states))
         recording = Recording("scan", inputs.number, MEASURED_SCANS)
-        layout = fine, *self._addresses()
-        return self._captured(
-            recording, lambda: self._learn_scan(inputs.scan, inputs.states, step, rates, fine), layout
-        )
+        layout = self.fine_tunes, *self._addresses()
+        return self._captured(recording, lambda: self._learn_scan(inputs.scan, inputs.states, step, rates), layout)
 
     def _set_learning_rates(self) -> None:
         if self.fine_tunes:
@@ -190,7 +189,6 @@ class Trainer:
         states: ScanTimeStates | None,
         step: int | Tensor,
         rates: Mapping[str, Tensor] | None,
-        fine_tunes: bool,
     ) -> Terms:
         """An iteration with a scan, as `_learn`; `states` are those of its time (None: to be looked up)."""
         stage, settings = self.clock.stage, self.settings.scans
@@ -204,7 +202,7 @@ class Trainer:
             if not self.images.views:
                 terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
-        return self._follow(loss, terms, step, rates, lambda: self._limit_gradients(fine_tunes))
+        return self._follow(loss, terms, step, rates, self._limit_gradients)
 
     def _follow(
         self,
@@ -226,14 +224,11 @@ class Trainer:
             self.optimizers.step(rates)
         return {name: value.detach() for name, value in terms.items()}
 
-    def _limit_gradients(self, fine_tunes: bool) -> None:
-        """Multiplies a scan's gradients of what images show by `scans.geometry`, and leaves the LiDAR's offsets
-        unchanged. Fine-tuning leaves unchanged what images show."""
-        factor = 0.0 if fine_tunes else self.settings.scans.geometry
+    def _limit_gradients(self) -> None:
+        """Multiplies a scan's gradients of what images show, too, by `scans.geometry`; what is fine-tuned has none."""
         for part in self.model.parts:
-            _scale_gradients([*(part.params[name] for name in part.geometry), *part.shared.values()], factor)
-            offsets = [part.params[name] for name in OFFSETS.values() if name in part.params]
-            _scale_gradients(offsets, 1.0 if fine_tunes else 0.0)
+            geometry = [*(part.params[name] for name in part.geometry), *part.shared.values()]
+            _scale_gradients(geometry, self.settings.scans.geometry)
 
     @property
     def _image_step(self) -> int:

@@ -24,6 +24,7 @@ from torch import nn
 from drivesplat.kernels import triton_support
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
+from drivesplat.kernels.echoes import echo_values
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
@@ -165,6 +166,18 @@ def test_regularized_means_and_their_gradients_agree_with_torch():
     expected, found = both_ways(mean_opacity_and_scale, *inputs)
     torch.testing.assert_close(found, expected)
     assert_same_gradients([expected, found], inputs, atol=1e-9, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [0, 1, 700])
+def test_values_of_echoes_and_their_gradients_agree_with_torch(count):
+    torch.manual_seed(count)
+    means, sensor = 20.0 * torch.randn(count, 3, device=DEVICE), torch.tensor([1.0, -2.0, 1.8], device=DEVICE)
+    means[:1] = sensor
+    echoes = (2.0 * torch.randn(count, 4, 2, device=DEVICE)).requires_grad_()
+    expected, found = both_ways(lambda: [echo_values(echoes, means.requires_grad_(), sensor)])
+    torch.testing.assert_close(found, expected)
+    assert_same_gradients([expected, found], [echoes, means], atol=1e-7, rtol=1e-5)
+    assert expected[0].shape == (count, 2)
 
 
 @pytest.mark.parametrize("listed", [1, 37, 64])
@@ -328,7 +341,7 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.kernels.triton import adam, chunks, color_difference, cube_map, exploration, placement, probe
+from drivesplat.kernels.triton import adam, chunks, color_difference, cube_map, echoes, exploration, placement, probe
 from drivesplat.kernels.triton import regularizers, tiles, time_varying_colors, view_colors
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_tiles
 
@@ -367,6 +380,8 @@ for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
     compiled(view_colors._colors, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
     compiled(view_colors._colors_backward, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
 compiled(adam._step, BLOCK=adam.BLOCK)
+compiled(echoes._values, BLOCK=echoes.BLOCK)
+compiled(echoes._values_backward, BLOCK=echoes.BLOCK)
 compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
 compiled(regularizers._spread, BLOCK=regularizers.BLOCK)
 compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)

@@ -300,22 +300,45 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
     assert torch.equal(again, image) and better < 0.7 * error
 
 
-def test_a_factor_scales_the_gradients_of_what_images_show():
-    shown, offsets = {"means", "quats", "scales", "opacities"}, {*OFFSETS.values()}
-    for factor, fine_tunes in ((0.25, False), (0.0, False), (0.25, True)):
-        settings = settings_of(scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.2, geometry=factor))
-        model = with_echoes(settings, offsets=True)
-        trainer = Trainer.begin(model, [], settings, 0, CPU, scans=load_scans([scan_of_a_wall()], settings.scans, CPU))
-        for parameter in model.parts[0].params.values():
-            parameter.grad = torch.ones_like(parameter)
-        trainer._limit_gradients(fine_tunes)
-        for name, parameter in model.parts[0].params.items():
-            of_images = 0.0 if fine_tunes else factor
-            expected = of_images if name in shown else float(fine_tunes) if name in offsets else 1.0
-            if expected:
-                assert (parameter.grad == expected).all(), name
-            else:
-                assert parameter.grad is None, "a step of Adam would move it on"
+def scan_trainer(factor: float = 0.25) -> Trainer:
+    """300 iterations with images and as many with scans, and 60 that fine-tune."""
+    of_scans = ScanTrainingSettings(per_image=1.0, fine_tune=0.2, geometry=factor)
+    settings = settings_of(iterations=300, scans=of_scans)
+    scans, views = load_scans([scan_of_a_wall()], settings.scans, CPU), recorded_views(2)
+    return Trainer.begin(with_echoes(settings, offsets=True), views, settings, 0, CPU, scans=scans)
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.0])
+def test_a_factor_scales_the_gradients_of_what_images_show(factor):
+    trainer = scan_trainer(factor)
+    params = trainer.model.parts[0].params
+    for parameter in params.values():
+        parameter.grad = torch.ones_like(parameter)
+    trainer._limit_gradients()
+    for name in ("means", "quats", "scales", "opacities"):
+        if factor:
+            assert (params[name].grad == factor).all(), name
+        else:
+            assert params[name].grad is None, "a step of Adam would move it on"
+    assert (params["echoes"].grad == 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("step", "learned"),
+    [
+        pytest.param(0, {"means", "quats", "scales", "opacities", "sh0"}, id="an image"),
+        pytest.param(1, {"means", "quats", "scales", "opacities", "echoes"}, id="a scan"),
+        pytest.param(600, {"echoes", *OFFSETS.values()}, id="fine-tuning"),
+    ],
+)
+def test_each_kind_of_iteration_learns_its_own_parameters(step, learned):
+    trainer = scan_trainer()
+    params = trainer.model.parts[0].params
+    before = {name: parameter.detach().clone() for name, parameter in params.items()}
+    trainer.step = step
+    assert trainer.fits_scan == (step > 0) and trainer.fine_tunes == (step == 600)
+    trainer.fit_one(with_picture=False)
+    assert {name for name, parameter in params.items() if not torch.equal(parameter, before[name])} == learned
 
 
 def test_cameras_do_not_see_what_lidar_sees_elsewhere():

@@ -1,0 +1,78 @@
+"""What Gaussians send back to a LiDAR in one pass, and the gradient of their echoes in another."""
+
+from typing import Any, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from drivesplat.kernels.triton.rows import three
+from drivesplat.kernels.triton.vectors import dot, scaled
+
+BLOCK = 256
+"""Gaussians per program."""
+
+
+class EchoValues(torch.autograd.Function):
+    """`drivesplat.kernels.echoes.echo_values`. Gradients reach the echoes."""
+
+    @staticmethod
+    def forward(ctx: Any, echoes: Tensor, means: Tensor, sensor: Tensor) -> Tensor:
+        means, sensor, count = means.contiguous(), sensor.contiguous(), len(means)
+        values = echoes.new_empty(count, 2)
+        if count:
+            _values[(triton.cdiv(count, BLOCK),)](echoes.contiguous(), means, sensor, values, count, BLOCK)
+        ctx.save_for_backward(means, sensor, values)
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_values: Tensor) -> tuple[Tensor, None, None]:
+        means, sensor, values = ctx.saved_tensors
+        count = len(means)
+        v_echoes = values.new_empty(count, 4, 2)
+        if count:
+            grid = (triton.cdiv(count, BLOCK),)
+            _values_backward[grid](means, sensor, values, v_values.contiguous(), v_echoes, count, BLOCK)
+        return v_echoes, None, None
+
+
+@triton.jit(do_not_specialize=["count"])
+@no_type_check
+def _values(echoes, means, sensor, measured, count, BLOCK: tl.constexpr):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    valid = i < count
+    x, y, z = _direction(means, sensor, i, valid)
+    for channel in tl.static_range(2):
+        own = echoes + 8 * i + channel
+        along = x * tl.load(own + 2, mask=valid, other=0.0) + y * tl.load(own + 4, mask=valid, other=0.0)
+        along += z * tl.load(own + 6, mask=valid, other=0.0)
+        logit = tl.load(own, mask=valid, other=0.0) + along
+        tl.store(measured + 2 * i + channel, tl.sigmoid(logit), mask=valid)
+
+
+@triton.jit(do_not_specialize=["count"])
+@no_type_check
+def _values_backward(means, sensor, measured, v_measured, v_echoes, count, BLOCK: tl.constexpr):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    valid = i < count
+    x, y, z = _direction(means, sensor, i, valid)
+    for channel in tl.static_range(2):
+        value = tl.load(measured + 2 * i + channel, mask=valid, other=0.0)
+        given = tl.load(v_measured + 2 * i + channel, mask=valid, other=0.0) * value * (1.0 - value)
+        own = v_echoes + 8 * i + channel
+        tl.store(own, given, mask=valid)
+        tl.store(own + 2, given * x, mask=valid)
+        tl.store(own + 4, given * y, mask=valid)
+        tl.store(own + 6, given * z, mask=valid)
+
+
+@triton.jit
+@no_type_check
+def _direction(means, sensor, i, valid):
+    """The unit vector from the sensor to Gaussian i."""
+    x, y, z = three(means, i, valid)
+    toward = x - tl.load(sensor), y - tl.load(sensor + 1), z - tl.load(sensor + 2)
+    return scaled(1.0 / tl.maximum(tl.sqrt(dot(toward, toward)), 1e-12), toward)
