@@ -176,7 +176,7 @@ def test_values_of_echoes_and_their_gradients_agree_with_torch(count):
     echoes = (2.0 * torch.randn(count, 4, 2, device=DEVICE)).requires_grad_()
     expected, found = both_ways(lambda: [echo_values(echoes, means.requires_grad_(), sensor)])
     torch.testing.assert_close(found, expected)
-    assert_same_gradients([expected, found], [echoes, means], atol=1e-7, rtol=1e-5)
+    assert_same_gradients([expected, found], [echoes, means], atol=1e-6, rtol=1e-4)
     assert expected[0].shape == (count, 2)
 
 
