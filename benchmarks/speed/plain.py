@@ -1,10 +1,14 @@
 """The plain recipe: the settings of gsplat's example trainer in its configuration `mcmc` (gsplat 1.5, examples/
 simple_trainer.py), and its initial Gaussians.
 
-It is the baseline of this workflow's training, so improvements there are not adopted here.
+It is the baseline of this workflow's training, so improvements there are not adopted here. Variants of it change one
+thing each.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -13,9 +17,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from drivesplat.model.background import Background
+from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train import GaussianSettings, TrainSettings
 
 FULL_LENGTH = 30_000
 """The length of the example's schedule."""
@@ -36,6 +41,22 @@ LOGGED_EVERY = 100
 SAVED_AT = (7_000, 30_000)
 MIN_SPACING = 1e-7
 """Minimum distance in metres that is assumed between seed points: the logarithm of a scale must be finite."""
+
+PlainName = Literal["plain", "plain_packed", "plain_sky"]
+
+
+class Variant(NamedTuple):
+    """What a variant of the plain recipe changes: `packed`, the rasterizer's lists of visible Gaussians alone, and Adam
+    for these alone (the example's options `packed` and `visible_adam`); `sky`, this workflow's sky behind them."""
+
+    packed: bool = False
+    sky: bool = False
+
+
+PLAIN = Variant()
+VARIANTS: Mapping[PlainName, Variant] = MappingProxyType(
+    {"plain": PLAIN, "plain_packed": Variant(packed=True), "plain_sky": Variant(sky=True)}
+)
 
 Splats = nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
@@ -70,12 +91,13 @@ class Schedule:
 
 @dataclass(frozen=True)
 class PlainRecipe:
-    """A training by the plain recipe, of at most `cap_max` Gaussians."""
+    """A training by a variant of the plain recipe, of at most `cap_max` Gaussians."""
 
     schedule: Schedule
     cap_max: int
     seed: int
     workers: int = WORKERS
+    variant: Variant = PLAIN
 
     def strategy(self) -> MCMCStrategy:
         """gsplat's own densification."""
@@ -115,15 +137,24 @@ def as_splats(values: dict[str, Tensor]) -> Splats:
     return nn.ParameterDict({name: nn.Parameter(value) for name, value in values.items()})
 
 
-def make_optimizers(splats: Splats, scale: float) -> Optimizers:
-    """An Adam for each parameter, as gsplat's strategies require; fused, as in later versions of the example."""
-    units = {"means": scale}
-    return {
-        name: torch.optim.Adam([splats[name]], lr=rate * units.get(name, 1.0), eps=1e-15, fused=True)
-        for name, rate in RATES.items()
-    }
+def make_optimizers(splats: Splats, scale: float, variant: Variant = PLAIN) -> Optimizers:
+    """An Adam for each parameter, as gsplat's strategies require; fused, as in later versions of the example. Packed,
+    gsplat's own, which steps visible Gaussians alone."""
+    units, same = {"means": scale}, {"eps": 1e-15, "betas": (0.9, 0.999)}
+    groups = {name: [{"params": [splats[name]], "lr": rate * units.get(name, 1.0)}] for name, rate in RATES.items()}
+    if variant.packed:
+        from gsplat.optimizers import SelectiveAdam
+
+        return {name: SelectiveAdam(group, **same) for name, group in groups.items()}
+    return {name: torch.optim.Adam(group, fused=True, **same) for name, group in groups.items()}
 
 
-def as_model(splats: dict[str, Tensor], record: TrainingRecord) -> SplatModel:
-    """The trained Gaussians as a model of this workflow: a background before black."""
-    return SplatModel([Background(dict(splats), GaussianSettings(), record.scene_scale)], sky=None)
+def make_sky(variant: Variant, settings: TrainSettings) -> CubemapSky | None:
+    """The sky of a variant, grey, with the resolution and learning rate of `settings`; None: black."""
+    return CubemapSky(settings.sky_resolution, torch.full((3,), 0.5), settings.lr_sky) if variant.sky else None
+
+
+def as_model(splats: Mapping[str, Tensor], extent: float, sky: CubemapSky | None = None) -> SplatModel:
+    """Gaussians that spread over `extent` metres as a model of this workflow: a background before its sky, or before
+    black. It shares their memory."""
+    return SplatModel([Background(dict(splats), GaussianSettings(), extent)], sky)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from gsplat import rasterization
+from jaxtyping import Bool
 from torch import Tensor
 from torch.utils.data import Dataset
 from torch.utils.tensorboard import SummaryWriter
@@ -26,14 +27,18 @@ from benchmarks.speed.plain import (
     Optimizers,
     PlainRecipe,
     Splats,
+    as_model,
     make_optimizers,
 )
 from benchmarks.speed.plain_images import endless, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim
 from drivesplat.io.checkpoint_file import save
 from drivesplat.kernels.gsplat_private import cpu_strategies
+from drivesplat.model.sky import CubemapSky
+from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
+from drivesplat.training.visits import NO_VISITS, Visits
 
 CHECKPOINT = "ckpt.npz"
 
@@ -51,24 +56,28 @@ class PlainSummary:
 
 
 def fit(
-    splats: Splats, images: Dataset, scale: float, recipe: PlainRecipe, folder: Path, clock: Clock = UNTIMED
+    splats: Splats,
+    images: Dataset,
+    scale: float,
+    recipe: PlainRecipe,
+    folder: Path,
+    clock: Clock = UNTIMED,
+    sky: CubemapSky | None = None,
+    visits: Visits = NO_VISITS,
 ) -> PlainSummary:
-    """Fits Gaussians to `images` on their device; `scale` is the scene's. Scalars and checkpoints go to `folder`.
-    `clock` times the stages of an iteration."""
+    """Fits Gaussians, and the `sky` behind them, to `images` on their device; `scale` is the scene's. Scalars and
+    checkpoints go to `folder`. `clock` times the stages of an iteration; `visits` see the model during the training."""
     device = splats["means"].device
     on_gpu = device.type == "cuda"
     torch.manual_seed(recipe.seed)
     if on_gpu:
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
-    training = PlainTraining(splats, make_optimizers(splats, scale), recipe, device, chosen_ssim(device), clock)
+    optimizers = make_optimizers(splats, scale, recipe.variant)
+    training = PlainTraining(splats, optimizers, recipe, device, chosen_ssim(device), clock, sky)
     data = endless(loader_of(images, recipe.workers, device))
     with SummaryWriter(str(folder / "tensorboard")) as writer:
-        began = time.monotonic()
-        training.run(data, writer, folder)
-        if on_gpu:
-            torch.cuda.synchronize(device)
-        seconds = time.monotonic() - began
+        seconds = training.run(data, writer, folder, scale, visits)
     save(folder / CHECKPOINT, training.state())
     ended = time.monotonic()  # without the seconds that the decoding processes take to exit
     peak = torch.cuda.max_memory_reserved(device) / 1e9 if on_gpu else None
@@ -86,17 +95,27 @@ class PlainTraining:
         device: torch.device,
         ssim: Ssim,
         clock: Clock = UNTIMED,
+        sky: CubemapSky | None = None,
     ):
         self.splats, self.optimizers, self.recipe, self.device = splats, optimizers, recipe, device
-        self.ssim, self.clock, self.step = ssim, clock, 0
+        self.ssim, self.clock, self.sky, self.step = ssim, clock, sky, 0
+        self._beside = [] if sky is None else [adam_of(sky)]
         self._strategy = recipe.strategy()
         self._strategy.check_sanity(splats, optimizers)
         self._strategy_state = self._strategy.initialize_state()
         decay = DECAY ** (1.0 / recipe.schedule.iterations)
         self._schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=decay)
 
-    def run(self, data: Iterator[dict[str, Tensor]], writer: SummaryWriter, folder: Path) -> None:
-        """All iterations."""
+    def run(
+        self,
+        data: Iterator[dict[str, Tensor]],
+        writer: SummaryWriter,
+        folder: Path,
+        extent: float,
+        visits: Visits = NO_VISITS,
+    ) -> float:
+        """All iterations. Returns their seconds, without those of visits, which see Gaussians of this `extent`."""
+        began = time.monotonic()
         bar = tqdm(range(self.recipe.schedule.iterations), desc="plain", disable=not sys.stderr.isatty())
         for _ in bar:
             with self.clock.stage(ITERATION):
@@ -107,6 +126,19 @@ class PlainTraining:
                 if self.step + 1 in SAVED_AT:
                     save(folder / CHECKPOINT, self.state())
                 self.learn(info)
+            if visits.due(self.step, self.recipe.schedule.iterations):
+                self._finish()
+                seconds = time.monotonic() - began
+                with torch.no_grad():
+                    visits.see(self.step, seconds, as_model(self.state()["splats"], extent, self.sky))
+                began = time.monotonic() - seconds
+        self._finish()
+        return time.monotonic() - began
+
+    def _finish(self) -> None:
+        """Waits until the GPU has done what was launched."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
 
     def fit_one(self, data: Iterator[dict[str, Tensor]]) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The first half of an iteration: renders the next image and computes gradients. Returns the terms of the loss,
@@ -126,7 +158,11 @@ class PlainTraining:
     def learn(self, info: dict[str, Any]) -> None:
         """The second half: optimizer steps and densification."""
         with self.clock.stage("optimizer"):
+            visible = (_visible(info, len(self.splats["means"])),) if self.recipe.variant.packed else ()
             for optimizer in self.optimizers.values():
+                optimizer.step(*visible)
+                optimizer.zero_grad(set_to_none=True)
+            for optimizer in self._beside:
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
             self._schedule.step()
@@ -139,10 +175,12 @@ class PlainTraining:
 
     def state(self) -> dict[str, Any]:
         """The content of a checkpoint."""
-        return {"step": self.step, "splats": {name: value.detach() for name, value in self.splats.items()}}
+        splats = {name: value.detach() for name, value in self.splats.items()}
+        sky = {} if self.sky is None else {"sky": self.sky.state_dict()}
+        return {"step": self.step, "splats": splats, **sky}
 
     def _render(self, camtoworlds: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, dict[str, Any]]:
-        """The image (1, h, w, 3) before black, and the rasterizer's output for densification."""
+        """The image (1, h, w, 3) before the sky or black, and the rasterizer's output for densification."""
         gaussians = (
             self.splats["means"],
             self.splats["quats"],
@@ -152,10 +190,15 @@ class PlainTraining:
         )
         cameras, degree = (torch.linalg.inv(camtoworlds), Ks, width, height), self.recipe.schedule.sh_degree(self.step)
         if self.device.type == "cuda":
-            colors, _, info = rasterization(*gaussians, *cameras, sh_degree=degree, packed=False)
-            return colors, info
-        rendering = rasterize(*gaussians, *cameras, sh_degree=degree)
-        return rendering.image, rendering.info
+            packed = self.recipe.variant.packed
+            colors, alphas, info = rasterization(*gaussians, *cameras, sh_degree=degree, packed=packed)
+        else:
+            rendering = rasterize(*gaussians, *cameras, sh_degree=degree)
+            colors, alphas, info = rendering.image, rendering.alpha, rendering.info
+        if self.sky is not None:
+            view = View(Ks[0], camtoworlds[0], width, height, time=0.0)
+            colors = self.sky.behind(colors[0], alphas[0], view)[None]
+        return colors, info
 
     def _loss(self, colors: Tensor, pixels: Tensor) -> dict[str, Tensor]:
         l1 = F.l1_loss(colors, pixels)
@@ -176,3 +219,15 @@ class PlainTraining:
     def _kernels(self) -> AbstractContextManager[None]:
         """On a CPU, replaces the two CUDA kernels that gsplat's strategies call by torch functions."""
         return nullcontext() if self.device.type == "cuda" else cpu_strategies()
+
+
+def adam_of(sky: CubemapSky) -> torch.optim.Optimizer:
+    """The Adam of a sky, with its own learning rate."""
+    (rate,) = sky.learning_rates().values()
+    return torch.optim.Adam(sky.parameters(), lr=rate, eps=1e-15, fused=True)
+
+
+def _visible(info: dict[str, Any], count: int) -> Bool[Tensor, " n"]:
+    """The mask of the Gaussians that a packed rasterization listed."""
+    ids = info["gaussian_ids"]
+    return torch.zeros(count, dtype=torch.bool, device=ids.device).scatter_(0, ids.long(), True)

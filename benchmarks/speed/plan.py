@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
 from benchmarks.files import read_file
 from benchmarks.snakemake_run import ConfigLayers, SnakemakeRun
@@ -16,9 +16,6 @@ from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.method import with_seed
 from drivesplat.settings.train import TrainJob
 from drivesplat.workflow.stages import stage_settings
-
-RecipeName = Literal["plain", "ours"]
-RECIPES: tuple[RecipeName, ...] = ("plain", "ours")
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class Task:
     length and seed, `evaluate` is the job of the rule `evaluate`. Output goes to `folder`; reduced images lie in
     `images`."""
 
-    recipe: RecipeName
+    recipe: str
     stage: str
     train: TrainJob
     code: str
@@ -53,6 +50,7 @@ class Task:
     folder: Path
     images: Path
     workers: int
+    visits: int
 
     @property
     def iterations(self) -> int:
@@ -115,14 +113,14 @@ def targets_of(run: SnakemakeRun) -> list[str]:
 
 
 def tasks_of(file: SpeedFile, run: SnakemakeRun, out: Path) -> Iterator[Task]:
-    """Both recipes for each length and seed; which one is first alternates."""
+    """All recipes for each length and seed; their order alternates."""
     for iterations in file.iterations:
         for turn, seed in enumerate(file.seeds):
-            for recipe in RECIPES if turn % 2 == 0 else RECIPES[::-1]:
+            for recipe in file.recipes if turn % 2 == 0 else file.recipes[::-1]:
                 yield _task(file, run, out, (recipe, iterations, seed))
 
 
-def _task(file: SpeedFile, run: SnakemakeRun, out: Path, which: tuple[RecipeName, int, int]) -> Task:
+def _task(file: SpeedFile, run: SnakemakeRun, out: Path, which: tuple[str, int, int]) -> Task:
     recipe, iterations, seed = which
     method = with_seed(name_of(file.method, iterations), seed)
     config, at = run.plan.config, SimpleNamespace(scene=run.scene, method=method)
@@ -137,4 +135,5 @@ def _task(file: SpeedFile, run: SnakemakeRun, out: Path, which: tuple[RecipeName
         out / "trainings" / with_seed(f"{recipe}-{iterations}", seed),
         out / "images",
         file.workers,
+        file.visits,
     )

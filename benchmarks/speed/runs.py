@@ -8,16 +8,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from benchmarks.speed.cpu_load import CpuSample, busy_elsewhere
-from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, as_splats, init_splats, scene_scale
+from benchmarks.speed.curves import QualityCurve, held_out_frames
+from benchmarks.speed.plain import (
+    VARIANTS,
+    PlainName,
+    PlainRecipe,
+    Schedule,
+    Variant,
+    as_model,
+    as_splats,
+    init_splats,
+    make_sky,
+    scene_scale,
+)
 from benchmarks.speed.plain_images import ImageFiles, files_of_size
 from benchmarks.speed.plain_training import CHECKPOINT, fit
 from benchmarks.speed.plan import Task
+from benchmarks.speed.settings import OURS
 from benchmarks.speed.stage_clock import StageClock
+from drivesplat.errors import DeviceError
 from drivesplat.evaluation.evaluate import protocol
 from drivesplat.evaluation.image_metrics import evaluate_groups
 from drivesplat.io.checkpoint_file import load
@@ -25,6 +39,7 @@ from drivesplat.io.storage import read_json
 from drivesplat.machine.device import choose_device, device_name
 from drivesplat.model.build import gaussian_cap, random_subset
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
+from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.provenance.record import provenance
 from drivesplat.rasterization import rasterize
@@ -36,6 +51,7 @@ from drivesplat.settings.train import CoarseToFineSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
 from drivesplat.training.train import TrainingFolders, train
+from drivesplat.training.visits import Visits
 from drivesplat.workflow.gpus import hold_gpu
 
 Times = dict[str, Any]
@@ -49,17 +65,21 @@ def run(task: Task) -> dict[str, Any]:
     parser.pkl to the written files; `busy_elsewhere`, the mean number of `processors` that other programs kept busy
     (None if unknown); `result`, the metrics per group of held-out frames under `protocol`; and more.
 
-    The rasterizer's kernels and the reduced images, which both recipes need once, are prepared before timing.
+    The rasterizer's kernels and the reduced images, which all recipes need once, are prepared before timing.
     """
     shutil.rmtree(task.folder, ignore_errors=True)
     with held_device(task.device) as device:
         record = read_training_record(task.files.parser)
         paths = files_of_size(record, task.images)
-        before = CpuSample.now()
-        times, model = plain(task, device, paths) if task.recipe == "plain" else ours(task, device)
-        elsewhere = busy_elsewhere(before, CpuSample.now())
         recording, _ = read_prepared_drive(task.files.scene, task.files.parser, task.files.masks)
         masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
+        curve = QualityCurve(held_out_frames(recording, camera, device) if task.visits else [])
+        visits, before = Visits(task.visits, curve.see), CpuSample.now()
+        if task.recipe == OURS:
+            times, model = ours(task, device, visits)
+        else:
+            times, model = plain(task, device, paths, visits)
+        elsewhere = busy_elsewhere(before, CpuSample.now())
         groups = evaluate_groups(model.to(device).requires_grad_(False), recording, camera, None, device)
         return {
             "recipe": task.recipe,
@@ -70,27 +90,44 @@ def run(task: Task) -> dict[str, Any]:
             "busy_elsewhere": elsewhere,
             "cap_max": gaussian_cap(record, task.train.train),
             **times,
+            "whole": times["whole"] - curve.spent,
             "dataset": record.scene.dataset,
             "protocol": protocol(record, masks, task.evaluate),
             "result": groups,
+            "curve": curve.points,
         }
 
 
-def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, SplatModel]:
-    """Times of a training by the plain recipe, and its model."""
+def plain(task: Task, device: torch.device, paths: list[str], visits: Visits) -> tuple[Times, SplatModel]:
+    """Times of a training by a variant of the plain recipe, and its model. Raises DeviceError for a packed one without
+    a GPU."""
+    variant = _variant(task)
+    if variant.packed and device.type != "cuda":
+        raise DeviceError(f"{task.recipe}: gsplat's Adam of visible Gaussians needs a GPU; drop it from baselines")
     began = time.monotonic()
     record = read_training_record(task.files.parser)
     cap = gaussian_cap(record, task.train.train)
     kept = random_subset(len(record.points), cap)
     splats = init_splats(record.points[kept], record.points_rgb[kept], task.seed).to(device)
-    recipe = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers)
-    summary = fit(splats, ImageFiles(record, paths), scene_scale(record), recipe, task.folder)
+    recipe, sky = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers, variant), _sky(task, device)
+    scale = scene_scale(record)
+    summary = fit(splats, ImageFiles(record, paths), scale, recipe, task.folder, sky=sky, visits=visits)
     costs = {key: getattr(summary, key) for key in ("gaussians", "peak_gpu_memory_gb", "ssim")}
     times = {"loop": summary.seconds, "whole": summary.ended - began, **costs}
-    return times, as_model({name: value.detach() for name, value in splats.items()}, record)
+    return times, as_model({name: value.detach() for name, value in splats.items()}, scale, sky)
 
 
-def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
+def _variant(task: Task) -> Variant:
+    return VARIANTS[cast(PlainName, task.recipe)]
+
+
+def _sky(task: Task, device: torch.device) -> CubemapSky | None:
+    """The untrained sky of a plain task."""
+    sky = make_sky(_variant(task), task.train.train)
+    return None if sky is None else sky.to(device)
+
+
+def ours(task: Task, device: torch.device, visits: Visits) -> tuple[Times, SplatModel]:
     """Times of a training by the function of the rule `train`, and its model. Two iterations before it load its
     kernels."""
     _continue(task, device, 2)
@@ -99,7 +136,7 @@ def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
     settings = json.loads(task.train.model_dump_json())
     made = provenance(task.stage, settings, task.code, upstream, {})
     files = training_files(task)
-    run_training(inputs, task.train, task.device, files, made, task.label)
+    run_training(inputs, task.train, task.device, files, made, task.label, visits)
     whole, summary = time.monotonic() - began, read_json(files.summary, rule="train")
     model = trained_model(read_checkpoint(files.checkpoint))
     costs = {key: summary[key] for key in ("gaussians", "peak_gpu_memory_gb")}
@@ -114,7 +151,7 @@ def training_files(task: Task) -> TrainingFiles:
 def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:
     """`device_ms` and `host_ms` of each stage (`benchmarks.speed.stage_clock`) in milliseconds per iteration, over
     iterations that continue a task's training. The continued model is discarded."""
-    profiled = _profile_plain if task.recipe == "plain" else _profile_ours
+    profiled = _profile_ours if task.recipe == OURS else _profile_plain
     with held_device(task.device) as device:
         clock = StageClock(device, WARM_UP)
         profiled(task, device, WARM_UP + iterations, clock)
@@ -123,11 +160,14 @@ def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:
 
 def _profile_plain(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
     record = read_training_record(task.files.parser)
-    splats = as_splats(load(task.folder / CHECKPOINT, rule="train")["splats"]).to(device)
+    trained, sky = load(task.folder / CHECKPOINT, rule="train"), _sky(task, device)
+    splats = as_splats(trained["splats"]).to(device)
+    if sky is not None:
+        sky.load_state_dict(trained["sky"])
     cap = gaussian_cap(record, task.train.train)
-    recipe = PlainRecipe(Schedule.continued(iterations), cap, task.seed, task.workers)
+    recipe = PlainRecipe(Schedule.continued(iterations), cap, task.seed, task.workers, _variant(task))
     images = ImageFiles(record, files_of_size(record, task.images))
-    fit(splats, images, scene_scale(record), recipe, _profile_folder(task), clock)
+    fit(splats, images, scene_scale(record), recipe, _profile_folder(task), clock, sky)
     shutil.rmtree(_profile_folder(task))
 
 

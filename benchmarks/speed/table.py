@@ -3,7 +3,9 @@
 from typing import Any
 
 from benchmarks.speed.compare import FIGURES
-from benchmarks.speed.plan import RECIPES
+from benchmarks.speed.curves import NEAR_DB
+from benchmarks.speed.plain_ssim import FUSED
+from benchmarks.speed.settings import OURS
 from benchmarks.speed.stage_clock import OTHER
 from drivesplat.evaluation.comparison import (
     GROUP_PLACES,
@@ -24,6 +26,15 @@ LEGEND = (
 STAGES = (
     "Milliseconds per iteration, over {profiled} iterations that continue from the trained models of seed {seed} after "
     "the runs above:"
+)
+TIME_TO_QUALITY = (
+    "Time to quality: static PSNR in dB on held-out frames {where} at {visits} stops of each training, and the seconds "
+    "of training until it is within {near:.1f} dB of its own best, and until it reaches the best of `plain`. The stops "
+    "do not count; between two of them PSNR is taken as linear."
+)
+HANDICAPPED = (
+    "**The plain recipe is handicapped:** gsplat's example needs the package `fused_ssim`, which is not installed. Its "
+    "SSIM in torch takes much longer."
 )
 BUSY = (
     "Other programs kept up to {busy_elsewhere:.1f} of the {processors} processors busy: without them training takes "
@@ -47,9 +58,15 @@ def _page(table: dict[str, Any], record: dict[str, Any]) -> list[str]:
     """A training length: the protocol, times with quality, quality of further groups, and time per stage."""
     groups = measured_groups(table["rows"], FIGURES)
     first = groups[0] if groups else "interpolation"
-    parts = [f"## {table['iterations']:,} iterations", _protocol(table, record)]
+    parts = [f"## {table['iterations']:,} iterations"]
+    if table["ssim_of_plain"] != FUSED and table["rows"][0]["peak_gpu_memory_gb"] is not None:  # on a GPU
+        parts.append(HANDICAPPED)
+    parts.append(_protocol(table, record))
     parts += [LEGEND.format(where=GROUP_PLACES[first]), _times(table, record, first)]
     parts += [_quality(table, record, group) for group in groups[1:]]
+    if any(row["time_to_quality"]["best"] for row in table["rows"]):
+        title = TIME_TO_QUALITY.format(where=GROUP_PLACES[first], visits=record["visits"], near=NEAR_DB)
+        parts += [title, _time_to_quality(table, record)]
     if table["stages"]:
         title = STAGES.format(profiled=record["profiled"], seed=record["seeds"][0])
         parts += [title, _stages(table["stages"], record["method"])]
@@ -77,7 +94,7 @@ def _times(table: dict[str, Any], record: dict[str, Any], group: str) -> str:
     ]
     lines = []
     for row in table["rows"]:
-        fast = None if row["recipe"] == "plain" else table["times_as_fast"]["loop"]
+        fast = row["times_as_fast"] and row["times_as_fast"]["loop"]
         cells = [_name(row["recipe"], record["method"])]
         cells += [_seconds(row["loop"]), _seconds(row["whole"]), format_mean(row["iterations_per_second"], "{:.1f}")]
         cells += [_spread(fast, 2), format_mean(row["gaussians"], "{:,.0f}")]
@@ -91,9 +108,20 @@ def _quality(table: dict[str, Any], record: dict[str, Any], group: str) -> str:
     return group_table(group, ["recipe", "static", "difference", "all", "difference"], lines)
 
 
+def _time_to_quality(table: dict[str, Any], record: dict[str, Any]) -> str:
+    """The best quality of each recipe, and when its trainings reach it."""
+    header = ["recipe", "best static", f"within {NEAR_DB:.1f} dB of it", "best of `plain`"]
+    lines = []
+    for row in table["rows"]:
+        found = row["time_to_quality"]
+        near, as_plain = (found[name] and _seconds(found[name]) for name in ("near_best", "best_of_plain"))
+        lines.append([_name(row["recipe"], record["method"]), _spread(found["best"]), near or "-", as_plain or "-"])
+    return markdown_table(header, lines)
+
+
 def _stages(stages: dict[str, Any], method: str) -> str:
     """The time of an iteration per stage; on a GPU also the time in Python, if it differs."""
-    in_order = [name for recipe in reversed(RECIPES) for name in stages.get(recipe, ())]
+    in_order = [name for recipe in reversed(stages) for name in stages[recipe]]
     names = dict.fromkeys(name for name in in_order if name not in (OTHER, ITERATION))
     kinds = {"device_ms": "", "host_ms": ", Python"} if _apart(stages) else {"device_ms": ""}
     columns = [(recipe, kind) for recipe in stages for kind in kinds]
@@ -138,4 +166,4 @@ def _seconds(found: dict[str, Any]) -> str:
 
 def _name(recipe: str, method: str) -> str:
     """The name of a recipe in tables; ours has that of its method."""
-    return f"`{method if recipe == 'ours' else recipe}`"
+    return f"`{method if recipe == OURS else recipe}`"

@@ -35,6 +35,7 @@ from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
 from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import Guides, TrainingView, load_views
+from drivesplat.training.visits import NO_VISITS, Visits
 
 
 @dataclass(frozen=True)
@@ -210,6 +211,7 @@ def run_training(
     files: TrainingFiles,
     provenance: Provenance,
     label: str,
+    visits: Visits = NO_VISITS,
 ) -> None:
     """Trains and writes both files, or raises and writes neither. The resume state is kept after a failure, and where
     the parent process was killed meanwhile: Snakemake did not see this training end and will run it again."""
@@ -226,7 +228,7 @@ def run_training(
         model, seed = begun.model, job.random_seed
         summary = train(
             model, begun.views, begun.settings, seed, device, folders, begun.priors,
-            curves=begun.curves, scans=begun.scans,
+            curves=begun.curves, scans=begun.scans, visits=visits,
         )  # fmt: skip
         write_checkpoint(files.checkpoint, TrainedCheckpoint.of(model, job, provenance))
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})

@@ -27,6 +27,7 @@ from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
 from drivesplat.training.scans import TrainingScan
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
+from drivesplat.training.visits import NO_VISITS, Visits
 
 log = logging.getLogger(__name__)
 
@@ -82,16 +83,17 @@ def train(
     clock: Clock = UNTIMED,
     curves: CurveViews = MappingProxyType({}),
     scans: Sequence[TrainingScan] = (),
+    visits: Visits = NO_VISITS,
 ) -> TrainingSummary:
     """Fits `model` in place to `views` and LiDAR `scans`, resuming an interrupted run of the same training; `clock`
-    times its stages. `curves` are the images of PSNR curves in TensorBoard.
+    times its stages. `curves` are the images of PSNR curves in TensorBoard; `visits` see the model during the training.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock, scans)
-        run = TrainingRun.begin(trainer, folders, curves)
+        run = TrainingRun.begin(trainer, folders, curves, visits)
         with Monitor(folders.tensorboard, trainer.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
         return run.summary()
@@ -109,9 +111,10 @@ class TrainingRun:
     saved: float
     """When the state was last saved, or else when this run began (`time.monotonic`, as `began`)."""
     curves: CurveViews
+    visits: Visits
 
     @classmethod
-    def begin(cls, trainer: Trainer, folders: TrainingFolders, curves: CurveViews) -> "TrainingRun":
+    def begin(cls, trainer: Trainer, folders: TrainingFolders, curves: CurveViews, visits: Visits) -> "TrainingRun":
         """Resumes from the state in `folders` if this training wrote it; otherwise starts at 0."""
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()
@@ -119,12 +122,12 @@ class TrainingRun:
         saved = resume_state.resumable(folders.state, folders.fingerprint)
         if saved is None:
             shutil.rmtree(folders.tensorboard, ignore_errors=True)
-            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves)
+            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves, visits)
         resume_state.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
         log.info("resuming at iteration %d of %d", trainer.step, trainer.iterations)
         now = time.monotonic()
-        return cls(trainer, folders, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now, curves)
+        return cls(trainer, folders, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now, curves, visits)
 
     @property
     def seconds(self) -> float:
@@ -161,6 +164,19 @@ class TrainingRun:
         if not every or not _due(t.step, every, t.iterations):
             return {}
         return t.graphs.retry_without_graphs(lambda: curve_psnrs(t.model, self.curves, t.sh_degree()))
+
+    def visit(self) -> None:
+        """Stops for a visit where one is due. The stop does not count as training."""
+        t = self.trainer
+        if not self.visits.due(t.step, t.iterations):
+            return
+        if t.device.type == "cuda":
+            torch.cuda.synchronize(t.device)
+        began, seconds = time.monotonic(), self.seconds
+        with torch.no_grad():
+            t.graphs.retry_without_graphs(lambda: self.visits.see(t.step, seconds, t.model))
+        stopped = time.monotonic() - began
+        self.began, self.saved = self.began + stopped, self.saved + stopped
 
     @property
     def save_due(self) -> bool:
@@ -206,6 +222,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
             if with_picture and picture is not None and view is not None:
                 monitor.image(trainer.step, view, picture)
             monitor.psnrs(trainer.step, run.psnrs())
+            run.visit()
             if run.save_due:
                 run.save()
     run.check()

@@ -23,10 +23,11 @@ from benchmarks.speed.own_process import run_in_process
 from benchmarks.speed.plan import Task, plan_run, read_speed_file, targets_of, tasks_of
 from benchmarks.speed.settings import SpeedFile
 from benchmarks.speed.table import markdown
-from drivesplat.errors import ConfigError, TrainingError
+from drivesplat.errors import ConfigError, DeviceError, TrainingError
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.settings.config import load, merged
 from drivesplat.training.run import TrainingFiles, read_inputs, run_training
+from drivesplat.training.visits import NO_VISITS
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -83,6 +84,9 @@ def test_the_files_config_takes_precedence_over_dataset_settings(tmp_path):
         ({"iterations": [7, 7]}, ["mine.yaml", "iterations", "twice"]),
         ({"iterations": []}, ["mine.yaml", "iterations", "at least 1"]),
         ({"seeds": [1, 1]}, ["mine.yaml", "seeds", "twice"]),
+        ({"baselines": ["plain_sky"]}, ["mine.yaml", "baselines", "begins with 'plain'"]),
+        ({"baselines": ["plain", "plain_sky", "plain_sky"]}, ["mine.yaml", "baselines", "twice"]),
+        ({"baselines": ["plain", "mine"]}, ["mine.yaml", "baselines", "plain_packed"]),
         ({"iteration": [7]}, ["mine.yaml", "unknown key 'iteration'", "docs/speed.md"]),
         ({"config": {"results_dir": "x"}}, ["mine.yaml", "config.results_dir"]),
         ({"config": {"train": {"iteration": 3}}}, ["base and config: ", "train.iteration"]),
@@ -134,8 +138,8 @@ def ended(recipe: str, seed: int, loop: float, static: float, **more: Any) -> di
     costs = {"gaussians": 1000 + seed, "peak_gpu_memory_gb": 2.5, "loop": loop, "whole": 2.0 * loop}
     return {
         "recipe": recipe, "iterations": 300, "seed": seed, "device": "NVIDIA H200", "processors": 16, "cap_max": 5000,
-        "busy_elsewhere": 0.5, "dataset": "nuscenes", "protocol": PROTOCOL, "result": result, **costs,
-        **({"ssim": "fused_ssim"} if recipe == "plain" else {}), **more,
+        "busy_elsewhere": 0.5, "dataset": "nuscenes", "protocol": PROTOCOL, "result": result, "curve": [], **costs,
+        **({"ssim": "fused_ssim"} if recipe != "ours" else {}), **more,
     }  # fmt: skip
 
 
@@ -155,7 +159,9 @@ def test_the_table_gives_times_with_the_quality_reached():
     record = speed(TWO, RUNS, [])
     (table,) = record["tables"]
     assert (table["iterations"], table["seeds"]) == (300, [0, 1]), "no table of what has not been run"
-    assert table["times_as_fast"]["loop"]["by_seed"] == [2.0, 2.5] == table["times_as_fast"]["whole"]["by_seed"]
+    fast = table["rows"][1]["times_as_fast"]
+    assert fast["loop"]["by_seed"] == [2.0, 2.5] == fast["whole"]["by_seed"]
+    assert table["rows"][0]["times_as_fast"] is None
     assert table["rows"][1]["iterations_per_second"]["by_seed"] == [10.0, 15.0]
     assert table["rows"][1]["interpolation"]["difference"]["static"]["by_seed"] == [2.0, 3.0]
     between, beyond = rows(markdown(record))
@@ -173,6 +179,53 @@ def test_the_table_gives_times_with_the_quality_reached():
     ]  # fmt: skip
     assert beyond[3] == ["`vanilla`", "18.5 (17.0 to 20.0)", "+2.50 ± 0.50", "-", "-"]
     assert json.loads(json.dumps(record, allow_nan=False)) == record and record["runs"] == RUNS
+
+
+def test_variants_of_the_plain_recipe_are_compared_with_it():
+    file = TWO.model_copy(update={"baselines": ("plain", "plain_sky"), "seeds": (0,)})
+    assert speed(file, RUNS, [])["tables"] == [], "not every recipe has run"
+    (table,) = speed(file, [*RUNS, ended("plain_sky", 0, 90.0, 24.0)], [])["tables"]
+    assert [row["recipe"] for row in table["rows"]] == ["plain", "plain_sky", "ours"]
+    sky = table["rows"][1]
+    assert sky["times_as_fast"]["loop"]["mean"] == pytest.approx(60.0 / 90.0)
+    assert sky["interpolation"]["difference"]["static"]["by_seed"] == [4.0]
+
+
+def points(*of: tuple[float, float]) -> list[dict[str, float]]:
+    return [{"iteration": 10 * i, "seconds": seconds, "static": psnr} for i, (seconds, psnr) in enumerate(of, 1)]
+
+
+def test_the_table_gives_the_time_to_quality():
+    """The plain recipe is within 0.3 dB of its best, 21.0, half-way between its stops; the method reaches that value
+    after 2 s with one seed, and never with the other."""
+    curves = {
+        ("plain", 0): points((10.0, 20.4), (20.0, 21.0), (30.0, 20.9)),
+        ("ours", 0): points((2.0, 21.0), (4.0, 24.0), (6.0, 25.0)),
+        ("plain", 1): points((10.0, 22.0)),
+        ("ours", 1): points((2.0, 20.0), (4.0, 21.0)),
+    }
+    runs_of = [{**run, "curve": curves[run["recipe"], run["seed"]]} for run in RUNS]
+    (one,) = speed(TWO.model_copy(update={"seeds": (0,)}), runs_of, [])["tables"]
+    plain, ours = (row["time_to_quality"] for row in one["rows"])
+    assert (plain["best"]["mean"], plain["near_best"]["mean"], plain["best_of_plain"]["mean"]) == (21.0, 15.0, 20.0)
+    assert (ours["best"]["mean"], ours["best_of_plain"]["mean"]) == (25.0, 2.0)
+    assert ours["near_best"]["mean"] == pytest.approx(4.0 + 2.0 * 0.7)
+    record = speed(TWO.model_copy(update={"visits": 3}), runs_of, [])
+    (table,) = record["tables"]
+    assert table["rows"][1]["time_to_quality"]["best_of_plain"] is None, "one seed does not reach it"
+    page = markdown(record)
+    assert "at 3 stops of each training" in page
+    assert ["`vanilla`", "23.0 (21.0 to 25.0)", "4.4 (3.4 to 5.4) s", "-"] in rows(page)[2]
+    assert "Time to quality" not in markdown(speed(TWO, RUNS, []))
+
+
+def test_the_page_says_that_the_plain_recipe_is_handicapped_without_fused_ssim():
+    assert "handicapped" not in markdown(speed(TWO, RUNS, []))
+    slow = [{**run, "ssim": "torch"} if run["recipe"] == "plain" else run for run in RUNS]
+    page = markdown(speed(TWO, slow, []))
+    assert page.index("handicapped") < page.index("Scene 0061 of nuscenes"), "in its first line"
+    on_cpu = [{**run, "peak_gpu_memory_gb": None} for run in slow]
+    assert "handicapped" not in markdown(speed(TWO, on_cpu, [])), "the example needs a GPU for it"
 
 
 def test_only_seeds_run_by_both_recipes_count():
@@ -266,6 +319,8 @@ TINY = {
     "iterations": [12],
     "seeds": [4],
     "profiled": 6,
+    "baselines": ["plain", "plain_sky"],
+    "visits": 3,
     "workers": 0,
     "config": {"train": {**TINY_TRAINING, "gaussians": {"sh_degree": 3}}},
 }
@@ -290,19 +345,24 @@ def measured(tmp_path_factory):
 def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record(measured):
     record = measured.read("results/speed/tiny/speed.json")
     (table,) = record["tables"]
-    plain, ours = table["rows"]
-    for row in (plain, ours):
+    plain, with_sky, ours = table["rows"]
+    for row in (plain, with_sky, ours):
         assert row["extrapolation"]["static"]["mean"] > 5.0, "it was measured"
         assert 0.0 < row["loop"]["mean"] <= row["whole"]["mean"]
         assert row["gaussians"]["mean"] > 0 and row["peak_gpu_memory_gb"] is None
     assert plain["gaussians"] == ours["gaussians"], "the same seed points, the same cap, no growth in 12 iterations"
     assert plain["extrapolation"]["static"]["mean"] != ours["extrapolation"]["static"]["mean"]
     fast = plain["loop"]["mean"] / ours["loop"]["mean"]
-    assert table["times_as_fast"]["loop"]["mean"] == pytest.approx(fast)
-    assert list(table["stages"]) == ["plain", "ours"]
+    assert ours["times_as_fast"]["loop"]["mean"] == pytest.approx(fast)
+    assert list(table["stages"]) == ["plain", "plain_sky", "ours"]
     for stages in table["stages"].values():
         assert {"data", "render", "loss", "backward", "optimizer", "densification", "other"} < set(stages)
         assert stages["backward"]["device_ms"] > stages["data"]["device_ms"] > 0
+    for run in record["runs"]:
+        assert [point["iteration"] for point in run["curve"]] == [4, 8, 12]
+        assert 0.0 < run["curve"][0]["seconds"] < run["curve"][1]["seconds"] <= run["loop"]
+        group = next(group for group in run["result"].values() if group["static"])
+        assert run["curve"][-1]["static"] == pytest.approx(group["static"]["psnr"], abs=1e-4), "as in metrics.json"
     page = (measured.folder / "results/speed/tiny/speed.md").read_text(encoding="utf-8")
     assert page == markdown(record) and "| `plain` |" in page and "| `vanilla` |" in page
 
@@ -318,13 +378,19 @@ def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkey
     monkeypatch.chdir(measured.folder)
     file = read_speed_file("tiny.yaml", {})
     out = Path("results/speed/tiny")
-    _, task = tasks_of(file, plan_run(file, out, Path()), out)
+    *_, task = tasks_of(file, plan_run(file, out, Path()), out)
     timed = read_checkpoint(task.folder / "checkpoint.npz")
     inputs, _ = read_inputs(task.files.parser, [task.files.masks], (), (), ())
     files = TrainingFiles(tmp_path / "again/checkpoint.npz", tmp_path / "again/train.json")
     run_training(inputs, task.train, task.device, files, timed.provenance, "again")
     again = read_checkpoint(files.checkpoint)
     assert again.job == timed.job and all(torch.equal(value, again.model[name]) for name, value in timed.model.items())
+
+
+def test_the_packed_recipe_is_refused_on_a_cpu(tmp_path):
+    _, tasks = planned(tmp_path, scene="demo", seeds=[0], iterations=[3], baselines=["plain", "plain_packed"])
+    with pytest.raises(DeviceError, match=r"plain_packed: .* needs a GPU; drop it from baselines"):
+        runs.plain(tasks[1], torch.device("cpu"), [], NO_VISITS)
 
 
 def test_nothing_is_trained_if_snakemake_fails_or_only_plans(tmp_path, monkeypatch):

@@ -3,6 +3,8 @@
 import dataclasses
 import math
 import sys
+import time
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,12 +16,23 @@ from helpers.reference_rasterizer import rasterize_reference
 from PIL import Image
 from skimage.metrics import structural_similarity
 
-from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, init_splats, make_optimizers, scene_scale
+from benchmarks.speed.plain import (
+    VARIANTS,
+    PlainRecipe,
+    Schedule,
+    as_model,
+    init_splats,
+    make_optimizers,
+    make_sky,
+    scene_scale,
+)
 from benchmarks.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
 from benchmarks.speed.plain_training import PlainTraining, fit
 from drivesplat.io.checkpoint_file import load
 from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.visits import Visits
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CPU = torch.device("cpu")
@@ -218,7 +231,7 @@ def test_the_learning_rate_of_means_decays_and_the_noise_with_it(record, monkeyp
 def test_the_training_converges_reaches_its_cap_and_writes_a_measurable_model(record, tmp_path):
     splats = init_splats(record.points, record.points_rgb, seed=0)
     schedule = Schedule(220, sh_every=1, refine_start=0, refine_stop=220)
-    before = as_model({name: value.detach().clone() for name, value in splats.items()}, record)
+    before = as_model({name: value.detach().clone() for name, value in splats.items()}, scene_scale(record))
     recipe = PlainRecipe(schedule, 64, 0, workers=0)
     summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path / "out")
     assert (summary.gaussians, summary.peak_gpu_memory_gb, summary.ssim) == (64, None, "torch")
@@ -226,16 +239,50 @@ def test_the_training_converges_reaches_its_cap_and_writes_a_measurable_model(re
     assert summary.seconds > 0
     kept = load(tmp_path / "out/ckpt.npz", rule="train")
     assert kept["step"] == 220 and torch.equal(kept["splats"]["means"], splats["means"])
-    after = as_model(kept["splats"], record)
+    after = as_model(kept["splats"], scene_scale(record))
     assert after.sky is None and off(after, record) < 0.7 * off(before, record)
 
 
+def test_a_sky_is_learned_behind_the_gaussians_where_it_is_wanted(record, tmp_path):
+    splats = init_splats(record.points, record.points_rgb, seed=0)
+    assert make_sky(VARIANTS["plain"], TrainSettings()) is None
+    sky = make_sky(VARIANTS["plain_sky"], TrainSettings(sky_resolution=16))
+    before = {name: value.clone() for name, value in sky.state_dict().items()}
+    recipe = PlainRecipe(Schedule(60, sh_every=1, refine_start=0, refine_stop=60), 64, 0, 0, VARIANTS["plain_sky"])
+    grey = off(as_model({name: value.detach().clone() for name, value in splats.items()}, 1.0, sky), record)
+    fit(splats, images_of(record), scene_scale(record), recipe, tmp_path, sky=sky)
+    kept = load(tmp_path / "ckpt.npz", rule="train")
+    again = make_sky(VARIANTS["plain_sky"], TrainSettings(sky_resolution=16))
+    again.load_state_dict(kept["sky"])
+    assert any(not torch.equal(value, before[name]) for name, value in again.state_dict().items())
+    assert off(as_model(kept["splats"], 1.0, again), record) < grey
+
+
+def test_visits_see_the_training_and_take_no_time(record, tmp_path):
+    splats, seen = init_splats(record.points, record.points_rgb, seed=0), []
+
+    def see(step, seconds, model):
+        seen.append((step, seconds, off(model, record)))
+        time.sleep(0.5)
+
+    recipe = PlainRecipe(Schedule(40, sh_every=1, refine_start=0, refine_stop=40), 64, 0, workers=0)
+    began = time.monotonic()
+    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path, visits=Visits(4, see))
+    assert [step for step, *_ in seen] == [10, 20, 30, 40]
+    assert all(earlier[1] < later[1] for earlier, later in pairwise(seen)) and seen[-1][1] <= summary.seconds
+    assert seen[-1][2] < seen[0][2], "it learns between visits"
+    assert summary.seconds < time.monotonic() - began - 4 * 0.5
+
+
 @pytest.mark.gpu
-def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(record, tmp_path):
+@pytest.mark.parametrize("name", [*VARIANTS])
+def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(record, name, tmp_path):
     splats = init_splats(record.points, record.points_rgb, seed=0).to("cuda")
-    recipe = PlainRecipe(Schedule(120, sh_every=1, refine_start=0, refine_stop=120), 64, 0, workers=2)
+    schedule = Schedule(120, sh_every=1, refine_start=0, refine_stop=120)
+    recipe, sky = PlainRecipe(schedule, 64, 0, 2, VARIANTS[name]), make_sky(VARIANTS[name], TrainSettings())
     before = torch.cuda.memory_reserved() / 1e9  # by other tests' recordings, whose memory torch does not give back
-    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path)
+    sky = None if sky is None else sky.to("cuda")
+    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path, sky=sky)
     assert summary.gaussians == 63 and 0 < summary.peak_gpu_memory_gb < before + 1
     assert all(torch.isfinite(value).all() for value in load(tmp_path / "ckpt.npz", rule="train")["splats"].values())
 

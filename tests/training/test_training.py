@@ -11,6 +11,8 @@ import pickle
 import resource
 import signal
 import sys
+import time
+from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
@@ -73,6 +75,7 @@ from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
 from drivesplat.training.train import TrainingSummary, train
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import Guides, TrainingView, load_views, view_index
+from drivesplat.training.visits import Visits
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -137,6 +140,24 @@ def test_a_training_comes_nearer_to_its_images(uninterrupted, strategy):
 def test_one_seed_gives_one_result_on_the_cpu(uninterrupted, strategy, tmp_path):
     again, _ = trained(tmp_path, settings_of(strategy))
     assert same_parameters(again, uninterrupted[strategy][0])
+
+
+def test_visits_see_the_model_and_neither_change_it_nor_count_as_training(tmp_path):
+    settings, views, seen = settings_of(iterations=10), recorded_views(), []
+
+    def see(step: int, seconds: float, model: SplatModel) -> None:
+        assert not torch.is_grad_enabled()
+        seen.append((step, seconds, mean_psnr(model, views)))
+        time.sleep(0.3)
+
+    visited, plain = untrained(settings), untrained(settings)
+    began = time.monotonic()
+    summary = train(visited, views, settings, 0, CPU, folders_of(tmp_path / "a", ""), visits=Visits(4, see))
+    assert summary.seconds < time.monotonic() - began - 4 * 0.3
+    assert [step for step, *_ in seen] == [3, 5, 8, 10]
+    assert all(0.0 < earlier[1] < later[1] < summary.seconds + 0.1 for earlier, later in pairwise(seen))
+    train(plain, views, settings, 0, CPU, folders_of(tmp_path / "b", ""))
+    assert same_parameters(visited, plain) and seen[-1][2] == pytest.approx(mean_psnr(plain, views))
 
 
 def test_another_seed_gives_another_result(uninterrupted, tmp_path):

@@ -1,0 +1,28 @@
+"""Stops of a training, for measurements of the model as it is then."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivesplat.model.splat_model import SplatModel
+
+
+@dataclass(frozen=True)
+class Visits:
+    """`count` stops of a training, after equal numbers of iterations, the last one at its end. `see` then gets the
+    number of iterations so far, the seconds of training until then, which do not include earlier stops, and the model.
+    It must leave the model as it is."""
+
+    count: int
+    see: Callable[[int, float, SplatModel], None]
+
+    def due(self, step: int, iterations: int) -> bool:
+        """Whether a training of so many iterations stops after its first `step`.
+
+        >>> visits = Visits(4, lambda *_: None)
+        >>> [step for step in range(1, 11) if visits.due(step, 10)]
+        [3, 5, 8, 10]
+        """
+        return step * self.count // iterations > (step - 1) * self.count // iterations
+
+
+NO_VISITS = Visits(0, lambda *_: None)
