@@ -7,9 +7,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
-from skimage.metrics import structural_similarity
 
 from drivesplat.errors import ResultError
 from drivesplat.lidar.depth_record import PixelDepths
@@ -20,8 +20,13 @@ MIN_REGION_PIXELS = 1000
 MIN_FRAME_PIXELS = 100
 """A frame with fewer pixels of a region is left out of the region's frame mean."""
 
+SSIM_TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2).astype(np.float32)
+SSIM_TAPS /= SSIM_TAPS.sum(dtype=np.float64)
+SSIM_C1, SSIM_C2 = np.float32(0.01**2), np.float32(0.03**2)
+"""The window along each axis, and the constants that keep quotients finite."""
+
 MAX_PARALLEL_FRAMES = 4
-"""Maximum number of frames measured in parallel; one of 1600x900 takes 0.3 GB."""
+"""Maximum number of frames measured in parallel; one of 1600x900 takes 0.2 GB."""
 
 LpipsMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -52,18 +57,23 @@ def psnr_record(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Structural similarity per pixel (h, w) of two images (h, w, 3) in [0, 1], mean over channels (Wang et al. 2004):
-    Gaussian window with sigma 1.5 and 11 taps, no border cropped."""
-    _, full = structural_similarity(
-        image,
-        truth,
-        data_range=1.0,
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )
-    return full.mean(axis=2)
+    Gaussian window with sigma 1.5 and 11 taps, no border cropped.
+
+    Within 1e-4 of skimage's map (`gaussian_weights=True`, `use_sample_covariance=False`), in single precision: moments
+    about 0.5, and so variances, keep more digits than those about 0.
+    """
+    x, y = (values.astype(np.float32) - np.float32(0.5) for values in (image, truth))
+    means = mean_x, mean_y = _windowed(x), _windowed(y)
+    var_x, var_y = (_windowed(values * values) - mean * mean for values, mean in zip((x, y), means, strict=True))
+    covariance = _windowed(x * y) - mean_x * mean_y
+    mean_x, mean_y = mean_x + 0.5, mean_y + 0.5
+    luminance = (2.0 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
+    return (luminance * (2.0 * covariance + SSIM_C2) / (var_x + var_y + SSIM_C2)).mean(axis=2)
+
+
+def _windowed(values: np.ndarray) -> np.ndarray:
+    """Local means (h, w, 3), reflected at the borders."""
+    return cv2.sepFilter2D(values, -1, SSIM_TAPS, SSIM_TAPS, borderType=cv2.BORDER_REFLECT)
 
 
 class FrameErrors(NamedTuple):
@@ -103,7 +113,9 @@ class RegionMetrics:
         maps = [((image - truth) ** 2).mean(axis=2), ssim_map(image, truth)]
         maps.append(self._lpips_map(image, truth) if self._lpips_map else np.zeros_like(maps[0]))
         return {
-            region: FrameErrors(int(masks[region].sum()), *(float(values[masks[region]].sum()) for values in maps))
+            region: FrameErrors(
+                int(masks[region].sum()), *(float(values[masks[region]].sum(dtype=np.float64)) for values in maps)
+            )
             for region in self._frames
         }
 

@@ -154,7 +154,7 @@ def test_pooled_figures_equal_those_of_the_concatenated_pixels():
         similarity = np.concatenate([s[m] for s, m in zip(maps, masks, strict=True)])
         perceptual = np.concatenate([fake_lpips(i, t)[m] for (i, t, _), m in zip(frames, masks, strict=True)])
         assert result[region]["psnr"] == pytest.approx(-10 * math.log10(errors.mean()), abs=1e-9)
-        assert result[region]["ssim"] == pytest.approx(similarity.mean(), abs=1e-9)
+        assert result[region]["ssim"] == pytest.approx(similarity.mean(), abs=1e-6)
         assert result[region]["lpips"] == pytest.approx(perceptual.mean(), abs=1e-9)
         assert result[region]["pixels"] == len(perceptual)
 
@@ -184,14 +184,28 @@ def test_a_pixel_counts_in_the_regions_of_its_label(label, regions):
     assert {region for region in REGIONS if result[region] is not None} == regions
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.3])
-def test_the_ssim_map_equals_that_of_skimage(noise):
-    image, truth = pair(6, noise)
+def skimage_ssim(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     _, expected = structural_similarity(
         image, truth, data_range=1.0, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         full=True,
     )  # fmt: skip
-    np.testing.assert_allclose(ssim_map(image, truth), expected.mean(axis=2), atol=1e-4)
+    return expected.mean(axis=2)
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.3])
+def test_the_ssim_map_equals_that_of_skimage(noise):
+    image, truth = pair(6, noise)
+    np.testing.assert_allclose(ssim_map(image, truth), skimage_ssim(image, truth), atol=1e-5)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.02, 0.5, 0.98, 1.0])
+def test_the_ssim_map_is_accurate_where_images_are_even(level):
+    """Variances near 0, at which single precision loses most; black and white, half a step of 8 bits apart."""
+    rng = np.random.default_rng(7)
+    truth = np.full((40, 60, 3), level)
+    image = (truth + rng.normal(scale=0.002, size=truth.shape)).clip(0.0, 1.0)
+    np.testing.assert_allclose(ssim_map(image, truth), skimage_ssim(image, truth), atol=1e-4)
+    np.testing.assert_array_equal(ssim_map(truth, truth), 1.0)
 
 
 def test_without_a_map_lpips_is_null():
