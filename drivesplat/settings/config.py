@@ -64,7 +64,7 @@ class Config(Settings):
     nuscenes_mini: NuscenesMiniSettings = NuscenesMiniSettings()
     methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
     """Methods to train and compare, each under a name of your choice, which also names its result folder. null drops a
-    method: `methods: {street: null}` in a file laid over this one."""
+    method: `methods: {street: null}` in a file laid over this one. Tables show vanilla and street before others."""
     ablation: AblationSettings = AblationSettings()
     """Ablation of a method. Only `snakemake results/{scene}/ablation.csv` trains it."""
     cameras: tuple[str, ...] = ("CAM_FRONT",)
@@ -128,7 +128,7 @@ class Config(Settings):
         wanted = {name: method for name, method in value.items() if method is not None}
         if not wanted:
             raise ValueError("no method is left; keep one")
-        return wanted
+        return {name: wanted[name] for name in (*_default_methods(), *wanted) if name in wanted}
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> "Config":

@@ -285,6 +285,18 @@ def test_overrides_of_a_dataset_reach_the_stages_of_its_scenes_only():
     assert stage_record(values, "extract", "a")["dataset"] == "small"
 
 
+def test_the_shipped_methods_are_first_whatever_order_snakemake_merges_files_in(defaults):
+    """Snakemake puts the methods of --configfile before those of config.yaml, and tables would begin with them."""
+    shipped = defaults["methods"]
+    mine = {"blind": {"tracks": "none"}, "another": {"parts": ["background", "actors"]}}
+    assert [*load(defaults | {"methods": {**mine, **shipped}}).methods] == ["vanilla", "street", "blind", "another"]
+    assert [*load(defaults | {"methods": {**mine, "street": shipped["street"]}}).methods] == [
+        "street",
+        "blind",
+        "another",
+    ]
+
+
 def test_overrides_of_a_method_reach_its_own_stages_only():
     values = {"methods": {"vanilla": {}, "no_sky": {"overrides": {"sky": "none", "train": {"iterations": 5}}}}}
     assert stage_record(values, "train", method="no_sky")["sky"] == "none"
