@@ -3,8 +3,8 @@
     python -m benchmarks.speed benchmarks/speed/demo.yaml
     python -m benchmarks.speed benchmarks/speed/demo_1600.yaml --iterations 7000 --seeds 0 -- --cores 16
 
-Both train in turns, alone on the device, and are measured on the same held-out frames; with --cards the seeds train
-side by side, each on its own GPU. Arguments after `--` are Snakemake's, which prepares the training data. Writes
+All recipes train in turns, alone on the device, and are measured on the same held-out frames; with --cards the seeds
+train side by side, each on its own GPU. Arguments after `--` are Snakemake's, which prepares the training data. Writes
 speed.md and speed.json. See docs/speed.md.
 """
 
@@ -19,6 +19,7 @@ from benchmarks.snakemake_run import is_dry_run
 from benchmarks.speed import runs
 from benchmarks.speed.compare import speed
 from benchmarks.speed.own_process import run_in_process
+from benchmarks.speed.plain import VARIANTS
 from benchmarks.speed.plan import Task, plan_run, read_speed_file, targets_of, tasks_of
 from benchmarks.speed.settings import SpeedFile
 from benchmarks.speed.table import markdown
@@ -38,6 +39,9 @@ def measure(file: SpeedFile, out: Path, arguments: Sequence[str], workflow: Path
     require_workflow(workflow)
     if cards > visible_gpus():
         raise ConfigError(f"--cards {cards}: there are {visible_gpus()} GPUs that this process may use")
+    packed = [name for name in file.baselines if VARIANTS[name].packed]
+    if packed and not visible_gpus():
+        raise ConfigError(f"baselines: {packed[0]} needs a GPU, and this process may use none; leave it out")
     run, dry_run = plan_run(file, out, workflow), is_dry_run(arguments)
     outcome = run.start(arguments or CORES, workflow, targets_of(run))
     if outcome.status or dry_run:

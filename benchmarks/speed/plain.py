@@ -1,8 +1,7 @@
 """The plain recipe: the settings of gsplat's example trainer in its configuration `mcmc` (gsplat 1.5, examples/
 simple_trainer.py), and its initial Gaussians.
 
-It is the baseline of this workflow's training, so improvements there are not adopted here. Variants of it change one
-thing each.
+It is the baseline of this workflow's training, so improvements there are not adopted here. It has two variants.
 """
 
 from collections.abc import Mapping

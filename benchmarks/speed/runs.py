@@ -41,6 +41,7 @@ from drivesplat.model.build import gaussian_cap, random_subset
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.provenance.record import provenance
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import read_masks_record
@@ -213,11 +214,13 @@ def held_device(settings: DeviceSettings) -> Iterator[torch.device]:
 
 
 def load_kernels(device: torch.device) -> None:
-    """Loads the rasterizer's kernels and, on a GPU, torch's CUDA context, so that no timing includes them."""
+    """Loads the kernels of the rasterizer and the sky and, on a GPU, torch's CUDA context: no timing includes them."""
     means = torch.tensor([[0.0, 0.0, 2.0]] * 8, device=device, requires_grad=True)
     quats, scales = torch.ones(8, 4, device=device), torch.full((8, 3), 0.1, device=device)
     opacities, coefficients = torch.full((8,), 0.5, device=device), torch.zeros(8, 16, 3, device=device)
     intrinsics = torch.tensor([[[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]]], device=device)
     cameras = torch.eye(4, device=device)[None], intrinsics, 32, 32
     rendering = rasterize(means, quats, scales, opacities, coefficients, *cameras, sh_degree=3)
-    rendering.image.sum().backward()
+    sky = CubemapSky(8, torch.full((3,), 0.5), 1e-3).to(device)
+    view = View(intrinsics[0], cameras[0][0], *cameras[2:], time=0.0)
+    sky.behind(rendering.image[0], rendering.alpha[0], view).sum().backward()

@@ -30,7 +30,7 @@ STAGES = (
 TIME_TO_QUALITY = (
     "Time to quality: static PSNR in dB on held-out frames {where} at {visits} stops of each training, and the seconds "
     "of training until it is within {near:.1f} dB of its own best, and until it reaches the best of `plain`. The stops "
-    "do not count; between two of them PSNR is taken as linear."
+    "do not count. Between two of them PSNR is taken as linear; what the first one has counts as reached then."
 )
 HANDICAPPED = (
     "**The plain recipe is handicapped:** gsplat's example needs the package `fused_ssim`, which is not installed. Its "

@@ -64,7 +64,7 @@ class Config(Settings):
     nuscenes_mini: NuscenesMiniSettings = NuscenesMiniSettings()
     methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
     """Methods to train and compare, each under a name of your choice, which also names its result folder. null drops a
-    method: `methods: {street: null}` in a file laid over this one. Tables show vanilla and street before others."""
+    method: `methods: {street: null}` in a file laid over this one. vanilla and street stand before all others."""
     ablation: AblationSettings = AblationSettings()
     """Ablation of a method. Only `snakemake results/{scene}/ablation.csv` trains it."""
     cameras: tuple[str, ...] = ("CAM_FRONT",)

@@ -132,8 +132,8 @@ FINE_TUNED = ("echoes", *OFFSETS.values())
 
 
 def choose_learned(optimizers: ModelOptimizers, fine_tunes: bool) -> None:
-    """Makes gradients reach what the next iteration learns: where it `fine_tunes`, of parts only what only the LiDAR
-    sees, and before that everything but OFFSETS. What is constant costs an iteration nothing."""
+    """Sets `requires_grad` of the parameters of parts for the next iteration: FINE_TUNED where it `fine_tunes`,
+    otherwise all but OFFSETS. Parameters without an optimizer are left alone. What is constant costs no time."""
     for group in (*optimizers.parts, *optimizers.shared):
         for name, optimizer in group.items():
             learned = name in FINE_TUNED if fine_tunes else name not in OFFSETS.values()

@@ -225,7 +225,8 @@ class Trainer:
         return {name: value.detach() for name, value in terms.items()}
 
     def _limit_gradients(self) -> None:
-        """Multiplies a scan's gradients of what images show, too, by `scans.geometry`; what is fine-tuned has none."""
+        """Multiplies a scan's gradients of geometry and of shared parameters by `scans.geometry`. While a training
+        fine-tunes these have no gradients (`choose_learned`)."""
         for part in self.model.parts:
             geometry = [*(part.params[name] for name in part.geometry), *part.shared.values()]
             _scale_gradients(geometry, self.settings.scans.geometry)
@@ -252,7 +253,9 @@ class Trainer:
         self.step += 1
 
     def end(self) -> None:
-        """Drops preallocated rows."""
+        """Drops preallocated rows, and lets gradients reach all that was learned: another training may follow."""
+        for _, optimizer in self.optimizers.all():
+            optimizer.parameter.requires_grad_(True)
         for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
             densifier.end(optimizers)
 

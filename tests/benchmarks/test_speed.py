@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import time
 from pathlib import Path
 from threading import Barrier
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from benchmarks.snakemake_run import Outcome, SnakemakeRun
 from benchmarks.speed import __main__ as command
-from benchmarks.speed import runs
+from benchmarks.speed import curves, runs
 from benchmarks.speed.compare import speed
 from benchmarks.speed.cpu_load import CpuSample, busy_elsewhere
 from benchmarks.speed.own_process import run_in_process
@@ -385,6 +386,23 @@ def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkey
     run_training(inputs, task.train, task.device, files, timed.provenance, "again")
     again = read_checkpoint(files.checkpoint)
     assert again.job == timed.job and all(torch.equal(value, again.model[name]) for name, value in timed.model.items())
+
+
+def test_the_packed_recipe_is_refused_without_a_gpu_before_anything_is_trained(tmp_path, monkeypatch):
+    file = SpeedFile(scene="demo", baselines=("plain", "plain_packed"))
+    monkeypatch.setattr(command, "visible_gpus", lambda: 0)
+    with pytest.raises(ConfigError, match="plain_packed needs a GPU"):
+        command.measure(file, tmp_path, (), REPOSITORY, cards=0)
+
+
+def test_stops_do_not_count(monkeypatch):
+    """Neither in the seconds of a point nor in the whole time of a training."""
+    monkeypatch.setattr(curves, "static_psnr", lambda *_: time.sleep(0.2) or 20.0)
+    curve = curves.QualityCurve([])
+    for step in (1, 2):
+        curve.see(step, 0.5 * step, None)
+    assert curve.points == [{"iteration": i, "seconds": 0.5 * i, "static": 20.0} for i in (1, 2)]
+    assert curve.spent == pytest.approx(0.4, abs=0.1)
 
 
 def test_the_packed_recipe_is_refused_on_a_cpu(tmp_path):

@@ -28,7 +28,7 @@ from benchmarks.speed.plain import (
 )
 from benchmarks.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
-from benchmarks.speed.plain_training import PlainTraining, fit
+from benchmarks.speed.plain_training import PlainTraining, _visible, fit
 from drivesplat.io.checkpoint_file import load
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
@@ -272,6 +272,25 @@ def test_visits_see_the_training_and_take_no_time(record, tmp_path):
     assert all(earlier[1] < later[1] for earlier, later in pairwise(seen)) and seen[-1][1] <= summary.seconds
     assert seen[-1][2] < seen[0][2], "it learns between visits"
     assert summary.seconds < time.monotonic() - began - 4 * 0.5
+
+
+def test_visible_gaussians_are_those_that_a_packed_rasterization_lists():
+    info = {"gaussian_ids": torch.tensor([1, 1, 3], dtype=torch.int32)}
+    assert _visible(info, 5).tolist() == [False, True, False, True, False]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["plain", "plain_packed"])
+def test_packed_only_visible_gaussians_learn(record, name, tmp_path):
+    """The first Gaussian is behind every camera: the mean opacity alone would change it."""
+    splats = init_splats(record.points, record.points_rgb, seed=0).to("cuda")
+    with torch.no_grad():
+        splats["means"][0] = torch.tensor([0.0, 0.0, -50.0])
+    before = splats["opacities"].detach().clone()
+    recipe = PlainRecipe(Schedule(50, sh_every=1, refine_start=0, refine_stop=50), 64, 0, 0, VARIANTS[name])
+    fit(splats, images_of(record), scene_scale(record), recipe, tmp_path)
+    changed = splats["opacities"].detach() != before
+    assert bool(changed[0]) == (name == "plain") and changed[1:].float().mean() > 0.5
 
 
 @pytest.mark.gpu

@@ -25,12 +25,14 @@ from pydantic import ValidationError
 from drivesplat.model.background import Background
 from drivesplat.model.build import definitions, gaussian_cap, rebuild_model
 from drivesplat.model.parameters import OFFSETS
+from drivesplat.model.part import Part
 from drivesplat.model.scans import ScanPicture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
+from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.run import TrainingInputs, prepare
 from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import (
@@ -206,6 +208,11 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
     assert picture.returned[scans[1].returned].median() > 0.7 > 0.5 > picture.returned[~scans[1].returned].median()
 
 
+def learnable(part: Part) -> dict[str, torch.Tensor]:
+    """The parameters of its Gaussians, and those that they share."""
+    return {**part.params, **part.shared}
+
+
 def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[Trainer, dict[str, set[str]]]:
     """A trainer after one of 8 iterations, or with `fine_tune` one of those that follow, which fitted a scan; and the
     names of the parameters that it changed, by part."""
@@ -214,14 +221,14 @@ def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[
     model = untrained_street(settings, echo=(0.0, 2.0)) if street else still
     recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
     trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=recorded)
-    before = {part.name: {k: v.detach().clone() for k, v in part.params.items()} for part in model.parts}
+    before = {part.name: {k: v.detach().clone() for k, v in learnable(part).items()} for part in model.parts}
     trainer.step = step
     assert trainer.fits_scan
     terms, picture, view = trainer.fit_one(with_picture=trainer.fine_tunes)
     assert picture is None and view is None and "scan_range" in terms
     trainer.densify(picture)
     changed = {
-        part.name: {k for k, v in part.params.items() if not torch.equal(v, before[part.name][k])}
+        part.name: {k for k, v in learnable(part).items() if not torch.equal(v, before[part.name][k])}
         for part in model.parts
     }
     return trainer, changed
@@ -238,7 +245,8 @@ def test_fine_tuning_changes_what_the_lidar_alone_sees():
     trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.5)
     assert changed == {"background": {"echoes", *OFFSETS.values()}, "actors": {"echoes"}}
     assert trainer.step == 9 and trainer.fine_tunes
-    _, before = changed_by_a_scan(7, fine_tune=0.5)
+    _, before = changed_by_a_scan(7, street=True, fine_tune=0.5)
+    assert {"translation", "yaw"} & before["actors"], "tracks are corrected by scans until then"
     assert not before["background"] & {*OFFSETS.values()} and "scales" in before["background"]
 
 
@@ -339,6 +347,15 @@ def test_each_kind_of_iteration_learns_its_own_parameters(step, learned):
     assert trainer.fits_scan == (step > 0) and trainer.fine_tunes == (step == 600)
     trainer.fit_one(with_picture=False)
     assert {name for name, parameter in params.items() if not torch.equal(parameter, before[name])} == learned
+
+
+def test_another_training_of_the_same_model_learns_everything_again(tmp_path):
+    """Whatever the last iteration of the first one had left constant."""
+    settings = settings_of(iterations=4, scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.5))
+    model, scans = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
+    learned = make_optimizers(model).parts[0].keys()
+    train(model, recorded_views(2), settings, 0, CPU, folders_of(tmp_path, "a"), scans=scans)
+    assert make_optimizers(model).parts[0].keys() == learned >= {"means", "echoes", *OFFSETS.values()}
 
 
 def test_cameras_do_not_see_what_lidar_sees_elsewhere():
