@@ -21,23 +21,35 @@ from drivesplat.training.views import TrainingView
 log = logging.getLogger(__name__)
 
 NEVER = 2**62
+WATCHED = 65_536
+"""Maximum number of values in all combinations that iterations of a training watch."""
 LOGGED_EVERY_S = 10.0
 PICTURE_HEIGHT = 360
 """Approximate maximum height in pixels of images in TensorBoard."""
 
 
 class FiniteGuard:
-    """Records on the device the first iteration at which each watched value was not finite."""
+    """Records on the device the first iteration at which each watched value was not finite.
+
+    The records are slices of memory that exists from the beginning: a CUDA graph that captured their creation would
+    reset them at every replay.
+    """
 
     def __init__(self, device: torch.device):
-        self._device = device
+        self._records = torch.full((WATCHED,), NEVER, device=device)
         self._first: dict[tuple[str, ...], Tensor] = {}
 
     def watch(self, step: int | Tensor, values: dict[str, Tensor]) -> None:
-        """Checks the scalars `values`, by name, of an iteration `step`, an int or an int64 scalar on the device."""
+        """Checks the scalars `values`, by name, of an iteration `step`, an int or an int64 scalar on the device.
+
+        Raises ValueError where different iterations watch more than WATCHED values together.
+        """
         names = tuple(values)
         if names not in self._first:
-            self._first[names] = torch.full((len(names),), NEVER, device=self._device)
+            begin = sum(map(len, self._first))
+            if begin + len(names) > WATCHED:
+                raise ValueError(f"iterations watch more than {WATCHED} values")
+            self._first[names] = self._records[begin : begin + len(names)]
         finite = torch.isfinite(torch.stack([value.detach() for value in values.values()]))
         first = self._first[names]
         torch.minimum(first, torch.where(finite, NEVER, step), out=first)

@@ -68,7 +68,7 @@ from drivesplat.settings.train import (
 from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.training import resume_state
 from drivesplat.training.geometry_priors import GeometryPriors
-from drivesplat.training.monitor import FiniteGuard
+from drivesplat.training.monitor import NEVER, FiniteGuard
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.road import driven_road
 from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
@@ -686,6 +686,20 @@ def test_the_guard_names_the_first_iteration_and_its_terms_alone(value):
     message = str(error.value)
     assert "iteration 7: loss ssim, gradient of means is not finite" in message
     assert "loss l1" not in message and "state.npz" in message
+
+
+def test_the_guard_keeps_its_records_in_memory_that_exists_from_the_beginning(monkeypatch):
+    """A CUDA graph that captured their creation would reset them at every replay."""
+    monkeypatch.setattr("drivesplat.training.monitor.WATCHED", 3)
+    guard, fine, broken = FiniteGuard(CPU), torch.tensor(1.0), torch.tensor(math.nan)
+    known = guard._records.data_ptr()
+    guard.watch(4, {"a": fine})
+    guard.watch(5, {"a": broken, "b": fine})
+    guard.watch(6, {"a": broken})
+    assert [first.data_ptr() for first in guard._first.values()] == [known, known + 8]
+    assert [first.tolist() for first in guard._first.values()] == [[6], [5, NEVER]]
+    with pytest.raises(ValueError, match="more than 3 values"):
+        guard.watch(7, {"c": fine})
 
 
 def test_the_guard_keeps_apart_iterations_that_watch_different_terms():
