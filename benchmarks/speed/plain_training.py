@@ -128,10 +128,8 @@ class PlainTraining:
                 self.learn(info)
             if visits.due(self.step, self.recipe.schedule.iterations):
                 self._finish()
-                seconds = time.monotonic() - began
-                with torch.no_grad():
-                    visits.see(self.step, seconds, as_model(self.state()["splats"], extent, self.sky))
-                began = time.monotonic() - seconds
+                seconds, model = time.monotonic() - began, as_model(self.state()["splats"], extent, self.sky)
+                began += visits.stop(self.step, seconds, model)
         self._finish()
         return time.monotonic() - began
 

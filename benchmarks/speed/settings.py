@@ -1,6 +1,6 @@
 """Speed files (docs/speed.md): which trainings are timed."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
@@ -11,27 +11,30 @@ OURS = "ours"
 """The recipe that is the method of the config."""
 
 
-def _no_duplicates(lengths: tuple[int, ...]) -> tuple[int, ...]:
-    if len(set(lengths)) != len(lengths):
-        raise ValueError("it names a length twice")
-    return lengths
+def _distinct(kind: str) -> AfterValidator:
+    """Refuses a tuple of the `kind` that holds a value twice."""
+
+    def check(values: tuple[Any, ...]) -> tuple[Any, ...]:
+        if len(set(values)) != len(values):
+            raise ValueError(f"it names a {kind} twice")
+        return values
+
+    return AfterValidator(check)
 
 
 def _plain_first(names: tuple[PlainName, ...]) -> tuple[PlainName, ...]:
     if names[:1] != ("plain",):
         raise ValueError("it begins with 'plain', which all others are compared with")
-    if len(set(names)) != len(names):
-        raise ValueError("it names a recipe twice")
     return names
 
 
 class SpeedFile(BenchmarkFile):
     method: str = "vanilla"
     """The method of the config that is compared with the plain recipe."""
-    baselines: Annotated[tuple[PlainName, ...], AfterValidator(_plain_first)] = ("plain",)
+    baselines: Annotated[tuple[PlainName, ...], AfterValidator(_plain_first), _distinct("recipe")] = ("plain",)
     """The plain recipe, and variants of it: 'plain_packed' (needs a GPU), 'plain_sky'."""
     iterations: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=1_000_000)], ...], Field(min_length=1), AfterValidator(_no_duplicates)
+        tuple[Annotated[int, Field(ge=1, le=1_000_000)], ...], Field(min_length=1), _distinct("length")
     ] = (30_000,)
     """Training lengths; one table each."""
     profiled: int = Field(200, ge=0, le=100_000)

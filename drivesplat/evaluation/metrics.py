@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from drivesplat.errors import ResultError
+from drivesplat.kernels.color_difference import C1, C2, window_taps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.scene.regions import REGIONS
 
@@ -19,11 +20,6 @@ MIN_REGION_PIXELS = 1000
 """A region with fewer pixels in a group is null."""
 MIN_FRAME_PIXELS = 100
 """A frame with fewer pixels of a region is left out of the region's frame mean."""
-
-SSIM_TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2).astype(np.float32)
-SSIM_TAPS /= SSIM_TAPS.sum(dtype=np.float64)
-SSIM_C1, SSIM_C2 = np.float32(0.01**2), np.float32(0.03**2)
-"""The window along each axis, and the constants that keep quotients finite."""
 
 MAX_PARALLEL_FRAMES = 4
 """Maximum number of frames measured in parallel; one of 1600x900 takes 0.2 GB."""
@@ -67,13 +63,14 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     var_x, var_y = (_windowed(values * values) - mean * mean for values, mean in zip((x, y), means, strict=True))
     covariance = _windowed(x * y) - mean_x * mean_y
     mean_x, mean_y = mean_x + 0.5, mean_y + 0.5
-    luminance = (2.0 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
-    return (luminance * (2.0 * covariance + SSIM_C2) / (var_x + var_y + SSIM_C2)).mean(axis=2)
+    luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
+    return (luminance * (2.0 * covariance + C2) / (var_x + var_y + C2)).mean(axis=2)
 
 
 def _windowed(values: np.ndarray) -> np.ndarray:
     """Local means (h, w, 3), reflected at the borders."""
-    return cv2.sepFilter2D(values, -1, SSIM_TAPS, SSIM_TAPS, borderType=cv2.BORDER_REFLECT)
+    taps = window_taps()
+    return cv2.sepFilter2D(values, -1, taps, taps, borderType=cv2.BORDER_REFLECT)
 
 
 class FrameErrors(NamedTuple):

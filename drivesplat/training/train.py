@@ -172,10 +172,8 @@ class TrainingRun:
             return
         if t.device.type == "cuda":
             torch.cuda.synchronize(t.device)
-        began, seconds = time.monotonic(), self.seconds
-        with torch.no_grad():
-            t.graphs.retry_without_graphs(lambda: self.visits.see(t.step, seconds, t.model))
-        stopped = time.monotonic() - began
+        seconds = self.seconds
+        stopped = t.graphs.retry_without_graphs(lambda: self.visits.stop(t.step, seconds, t.model))
         self.began, self.saved = self.began + stopped, self.saved + stopped
 
     @property

@@ -1,7 +1,10 @@
 """Stops of a training, for measurements of the model as it is then."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+
+import torch
 
 from drivesplat.model.splat_model import SplatModel
 
@@ -23,6 +26,13 @@ class Visits:
         [3, 5, 8, 10]
         """
         return step * self.count // iterations > (step - 1) * self.count // iterations
+
+    def stop(self, step: int, seconds: float, model: SplatModel) -> float:
+        """Shows the model, without gradients. Returns the seconds that this took."""
+        began = time.monotonic()
+        with torch.no_grad():
+            self.see(step, seconds, model)
+        return time.monotonic() - began
 
 
 NO_VISITS = Visits(0, lambda *_: None)
