@@ -37,8 +37,8 @@ class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
     (3,) of every camera in `exposed`, whose exposure is learned, and for every camera in `posed`, whose poses are
-    corrected, the times of its training images in seconds, and the initial logits of LiDAR's intensity and return
-    (`echo`; None: LiDAR is not rendered)."""
+    corrected, the times of its training images in seconds, the initial logits of LiDAR's intensity and return
+    (`echo`; None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
@@ -47,6 +47,12 @@ class ModelInit:
     exposed: dict[str, np.ndarray] = field(default_factory=dict)
     posed: Mapping[str, Sequence[float]] = field(default_factory=dict)
     echo: tuple[float, float] | None = None
+    scans: int = 0
+
+    @property
+    def views(self) -> int:
+        """The number of training images, or of scans without images."""
+        return len(self.record.train_images) or self.scans
 
 
 def gaussian_cap(record: TrainingRecord, settings: TrainSettings, rays: int = 0) -> int:
@@ -161,9 +167,9 @@ def _init_objects(
     kept = [random_subset(count, share) for count, share in zip(counts, shares, strict=True)]
     chosen = list(zip(actors, kept, strict=True))
     points, colors = [actor.points[rows] for actor, rows in chosen], [actor.points_rgb[rows] for actor, rows in chosen]
-    capped = own.model_copy(update={"cap_max": min(own.cap_max, sum(limits))})
+    resolved = own.for_scene(sum(limits), len(actors), init.views)
     colors = [values / 255.0 for values in colors]
-    return kind.from_points(tracks, points, colors, capped, settings.gaussians, init.classes, init.echo)
+    return kind.from_points(tracks, points, colors, resolved, settings.gaussians, init.classes, init.echo)
 
 
 def actor_cap(actor: ActorRecord, settings: ActorSettings, pixels_per_gaussian: float) -> int:

@@ -3,7 +3,6 @@ trilinear interpolation between them (Sederberg and Parry, SIGGRAPH 1986, with l
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +39,8 @@ class LatticeField(Field):
     ) -> Deformation:
         around, nodes = corners(gaussians, self.settings.nodes), parameters["lattice"]
         at_nodes = torch.einsum("ak,akm->am", basis, nodes.flatten(2)).reshape(-1, 6)
-        return Deformation.of((around.weights[..., None] * at_nodes[around.nodes]).sum(dim=1))
+        chosen = at_nodes.index_select(0, around.nodes.flatten())  # its gradient is faster than that of indexing
+        return Deformation.of((around.weights[..., None] * chosen.reshape(-1, 8, 6)).sum(dim=1))
 
     def penalties(self, parameters: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
         nodes, own = parameters["lattice"], self.settings
@@ -59,19 +59,15 @@ class LatticeField(Field):
 def corners(gaussians: Undeformed, nodes: tuple[int, int, int]) -> Corners:
     """The nodes around the centres of Gaussians. Lattices of `nodes` along x, y and z fill the boxes of the objects;
     centres outside count as on the surface. The weights have a gradient for the centres."""
-    places = gaussians.means / of_owners(gaussians.reach, gaussians.owns)
-    firsts, sides = [], []
-    for axis, count in enumerate(nodes):
-        place = (0.5 * places[:, axis].clamp(-1.0, 1.0) + 0.5) * (count - 1)
-        first = place.detach().floor().clamp(max=count - 2)
-        firsts.append(first.long())
-        sides.append((1.0 - (place - first), place - first))
-    found, weights = [], []
-    for x, y, z in product((0, 1), repeat=3):
-        index = ((firsts[0] + x) * nodes[1] + firsts[1] + y) * nodes[2] + firsts[2] + z
-        found.append(gaussians.owner * (nodes[0] * nodes[1] * nodes[2]) + index)
-        weights.append(sides[0][x] * sides[1][y] * sides[2][z])
-    return Corners(torch.stack(found, dim=1), torch.stack(weights, dim=1))
+    places = 0.5 * (gaussians.means / of_owners(gaussians.reach, gaussians.owns)).clamp(-1.0, 1.0) + 0.5
+    along = [places[:, axis] * (count - 1) for axis, count in enumerate(nodes)]
+    first = [place.detach().floor().clamp(max=count - 2) for place, count in zip(along, nodes, strict=True)]
+    x, y, z = (torch.stack([1.0 - (place - low), place - low], dim=1) for place, low in zip(along, first, strict=True))
+    weights = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).flatten(1)
+    row, layer = nodes[2], nodes[1] * nodes[2]
+    lowest = gaussians.owner * (nodes[0] * layer) + (first[0] * layer + first[1] * row + first[2]).long()
+    corner = torch.arange(8, device=lowest.device)
+    return Corners(lowest[:, None] + corner // 4 * layer + corner // 2 % 2 * row + corner % 2, weights)
 
 
 def roughness(nodes: Float[Tensor, "a k x y z 6"]) -> Float[Tensor, " k"]:

@@ -40,10 +40,17 @@ class LatticeSettings(Settings):
     """Nodes along the length, width and height of the box."""
     learning_rate: float = Field(2e-3, gt=0)
     """Learning rate of displacements (metres) and rotations (radians)."""
-    size_weight: float = Field(0.01, ge=0)
-    """Loss weight of their mean square, times the square of the multiple of the phase."""
-    smoothness_weight: float = Field(0.1, ge=0)
-    """Loss weight of the mean squared difference between neighbouring nodes."""
+    size_weight: float = Field(0.1, ge=0)
+    """Loss weight of an object's mean square of both, times the square of the multiple of the phase, divided by the
+    number of training images: the fewer images, the less an object deforms."""
+    smoothness_weight: float = Field(1.0, ge=0)
+    """Loss weight of an object's mean squared difference between neighbouring nodes, divided by the number of training
+    images."""
+
+    def for_scene(self, objects: int, views: int) -> "LatticeSettings":
+        """The settings with the weights of means over so many `objects`, in a scene of so many training `views`."""
+        weights = {name: getattr(self, name) * objects / max(1, views) for name in ("size_weight", "smoothness_weight")}
+        return self.model_copy(update=weights)
 
 
 class NetworkSettings(Settings):

@@ -102,6 +102,10 @@ class ActorSettings(Settings):
     """Gaussians with centres farther than this (metres) outside their box are faded out."""
     tracks: TrackSettings = TrackSettings()
 
+    def for_scene(self, cap: int, objects: int, views: int) -> "ActorSettings":
+        """The settings for so many `objects`, of at most `cap` Gaussians, in a scene of so many training `views`."""
+        return self.model_copy(update={"cap_max": min(self.cap_max, cap)})
+
 
 class DeformableSettings(ActorSettings):
     """The part `deformable`: people, animals and cyclists, each a set of Gaussians in the frame of its box that deform
@@ -118,6 +122,10 @@ class DeformableSettings(ActorSettings):
     gait: GaitSettings = GaitSettings()
     lattice: LatticeSettings = LatticeSettings()
     network: NetworkSettings = NetworkSettings()
+
+    def for_scene(self, cap: int, objects: int, views: int) -> "ActorSettings":
+        lattice = self.lattice.for_scene(objects, views)
+        return super().for_scene(cap, objects, views).model_copy(update={"lattice": lattice})
 
 
 class CoarseToFineSettings(Settings):

@@ -289,6 +289,28 @@ def test_a_part_is_built_of_its_own_objects_and_survives_a_checkpoint():
         assert torch.equal(found, expected)
 
 
+def penalty_of_lattices(objects: int, images: int, scans: int = 0) -> dict[str, float]:
+    """The penalties of a model whose objects all deform alike."""
+    paths = [motion_through(TIMES, [[t, i, 0.9] for t in TIMES], 0.0 * TIMES) for i in range(objects)]
+    records = [actor_record(track_of(path, f"walker {i}", SIZE)) for i, path in enumerate(paths)]
+    records = [dataclasses.replace(record, parts=("deformable",)) for record in records]
+    init = ModelInit(training_record_of(images), records, np.full(3, 0.5), scans=scans)
+    part = build_model(init, ("background", "deformable"), "none", TrainSettings()).parts[1]
+    with torch.no_grad():
+        part.shared["lattice"][:, 0, 0] = 0.1
+    return {name: float(part.penalties()[name].detach()) for name in ("lattice_size", "lattice_roughness")}
+
+
+def test_lattices_are_penalised_by_object_and_less_the_more_images_there_are():
+    """As the colour loss, whose mean over images has a share of each object that does not depend on other objects."""
+    for name, expected in penalty_of_lattices(1, 4).items():
+        assert expected > 0.0
+        assert penalty_of_lattices(3, 4)[name] == pytest.approx(3.0 * expected)
+        assert penalty_of_lattices(1, 40)[name] == pytest.approx(0.1 * expected)
+        assert penalty_of_lattices(1, 0, scans=40)[name] == pytest.approx(0.1 * expected), "a LiDAR alone"
+        assert penalty_of_lattices(1, 4, scans=40)[name] == pytest.approx(expected)
+
+
 @pytest.mark.parametrize(
     ("owner", "name", "row"),
     [("params", "means", 45), ("shared", "lattice", 1), ("shared", "stride", 1), ("shared", "phase", 12)],
