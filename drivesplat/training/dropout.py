@@ -6,6 +6,16 @@ import torch
 
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.train import TrainSettings
+
+
+def dropout_share(record: TrainingRecord, settings: TrainSettings) -> float:
+    """The share of the static Gaussians that iterations leave out: `dropout`, or less where the cameras have more than
+    `dropout_images` training images each, in the mean."""
+    images = record.train_images
+    cameras = len({record.camera_name(i) for i in images})
+    return settings.dropout * min(1.0, settings.dropout_images * cameras / max(1, len(images)))
 
 
 def with_dropout(gaussians: Gaussians, model: SplatModel, share: float) -> Gaussians:

@@ -29,6 +29,7 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
+from drivesplat.training.dropout import dropout_share
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
@@ -157,7 +158,8 @@ class Prepared:
 
 
 def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
-    """Loads the training images onto the device, builds an untrained model, and resolves the cap in the settings."""
+    """Loads the training images onto the device, builds an untrained model, and resolves in the settings what
+    depends on the scene."""
     with explain_out_of_memory(lambda: 0):
         views = load_views(inputs.record, inputs.guides(job), device)
     rays = sum(int(scan.measured.sum()) for scan in inputs.scans)
@@ -165,7 +167,8 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     if job.train.scans.per_image:
         record = with_scan_points(record, inputs.scans, job.train.scans, job.random_seed)
     more = len(record.points) - len(inputs.record.points)
-    settings = job.train.model_copy(update={"cap_max": cap + more})
+    resolved = {"cap_max": cap + more, "dropout": dropout_share(record, job.train)}
+    settings = job.train.model_copy(update=resolved)
     exposed = inputs.exposed(job)
     init = ModelInit(
         record,

@@ -1,10 +1,13 @@
 """Dropout: which Gaussians an iteration leaves out."""
 
+import numpy as np
 import pytest
 import torch
-from helpers.trainings import settings_of, untrained_street
+from helpers.records import training_record_of
+from helpers.trainings import inputs_in, job_of, settings_of, untrained_street
 
-from drivesplat.training.dropout import with_dropout
+from drivesplat.training.dropout import dropout_share, with_dropout
+from drivesplat.training.run import prepare
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
@@ -29,3 +32,24 @@ def test_gaussians_left_out_get_no_gradient():
     static = model.parts[0].params["opacities"]
     left_out = shown.opacities[model.rows[0]] == 0.0
     assert left_out.any() and not static.grad[left_out].any() and static.grad[~left_out].all()
+
+
+@pytest.mark.parametrize(
+    ("images", "cameras", "expected"),
+    [(0, 1, 0.0), (7, 1, 0.2), (20, 1, 0.2), (40, 1, 0.1), (40, 2, 0.2), (120, 2, 0.2 / 3)],
+)
+def test_dropout_shrinks_with_the_training_images_of_a_camera(images, cameras, expected):
+    """Held-out images, eight more, do not count."""
+    names = [f"CAM_{i}" for i in range(cameras)]
+    indices = np.arange(images + 8) % cameras
+    splits = {"train": np.arange(images), "interpolation": np.arange(images, images + 8)}
+    record = training_record_of(images + 8, camera_names=names, camera_indices=indices, splits=splits)
+    assert dropout_share(record, settings_of(dropout=0.2)) == pytest.approx(expected)
+    assert dropout_share(record, settings_of(dropout=0.0)) == 0.0
+
+
+def test_a_training_takes_the_share_of_its_scene(tmp_path):
+    inputs = inputs_in(tmp_path)
+    share = prepare(inputs, job_of(dropout=0.3, dropout_images=1), torch.device("cpu")).settings.dropout
+    assert len(inputs.record.train_images) > 1
+    assert share == pytest.approx(0.3 / len(inputs.record.train_images))
