@@ -25,6 +25,14 @@ def rotated_back(quats: Float[Tensor, "*n 4"], vectors: Float[Tensor, "*n 3"]) -
     return vectors - quats[..., :1] * twice + torch.linalg.cross(axis, twice)
 
 
+def turned(quats: Float[Tensor, "n 4"], turns: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Rotations followed by those of the quaternions (1, turn), of which `turns` are halved rotation vectors where they
+    are small. The result has another length. Elementwise, as `rotated_back`."""
+    scalar, axis = quats[:, :1], quats[:, 1:]
+    rotated = axis + scalar * turns + torch.linalg.cross(turns, axis)
+    return torch.cat([scalar - (turns * axis).sum(dim=1, keepdim=True), rotated], dim=1)
+
+
 def about_vertical(angles: Float[Tensor, "*n"]) -> Float[Tensor, "*n 4"]:
     """Rotations by `angles` (radians) about z."""
     half, nothing = 0.5 * angles, torch.zeros_like(angles)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from drivesplat.kernels.placement import LocalGaussians, of_owners
-from drivesplat.kernels.quaternions import left_factor
+from drivesplat.kernels.quaternions import turned
 from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.actors import Actors
 from drivesplat.model.deformation import Field, Undeformed
@@ -81,16 +81,17 @@ class Deformable(Actors):
     def basis(self, state: TimeState) -> Float[Tensor, "a k"]:
         """The k functions that deform each actor at a time state: cosine and sine of the phase and of its multiples,
         then the series of the colours without its constant."""
-        angles = 2.0 * math.pi * self.cycles(state)
-        turning = [f(h * angles) for h in range(1, self._gait.harmonics + 1) for f in (torch.cos, torch.sin)]
-        return torch.cat([torch.stack(turning, dim=1), state.series[:, 1:]], dim=1)
+        cycles = self.cycles(state)
+        multiples = torch.arange(1, self._gait.harmonics + 1, device=cycles.device)
+        angles = 2.0 * math.pi * multiples * cycles[:, None]
+        turning = torch.stack([torch.cos(angles), torch.sin(angles)], dim=2).flatten(1)
+        return torch.cat([turning, state.series[:, 1:]], dim=1)
 
     def local(self, state: TimeState) -> LocalGaussians:
         p = self.params
         gaussians = Undeformed(p["means"], p["owner"], self._owns, self._reach)
         moved = self._field.deformation(dict(self.shared.items()), gaussians, self.basis(state))
-        turns = normalize(torch.cat([torch.ones_like(moved.turns[:, :1]), moved.turns], dim=1), dim=1)
-        quats = (left_factor(turns) @ p["quats"][..., None])[..., 0]
+        quats = turned(p["quats"], moved.turns)
         return LocalGaussians(p["means"] + moved.shifts, quats, p["scales"], p["opacities"])
 
     @torch.no_grad()

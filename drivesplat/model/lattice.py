@@ -3,6 +3,7 @@ trilinear interpolation between them (Sederberg and Parry, SIGGRAPH 1986, with l
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -44,10 +45,9 @@ class LatticeField(Field):
 
     def penalties(self, parameters: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
         nodes, own = parameters["lattice"], self.settings
-        sizes = nodes.square().mean(dim=(0, 2, 3, 4, 5)).unbind()
-        weighted = [float(order) ** 2 * size for order, size in zip(self.orders, sizes, strict=True)]
+        sizes = nodes.square().mean(dim=(0, 2, 3, 4, 5))
         return {
-            "lattice_size": own.size_weight * torch.stack(weighted).sum(),
+            "lattice_size": own.size_weight * (sizes @ _squares(tuple(self.orders.tolist()), sizes.device)),
             "lattice_roughness": own.smoothness_weight * roughness(nodes).sum(),
         }
 
@@ -68,6 +68,11 @@ def corners(gaussians: Undeformed, nodes: tuple[int, int, int]) -> Corners:
     lowest = gaussians.owner * (nodes[0] * layer) + (first[0] * layer + first[1] * row + first[2]).long()
     corner = torch.arange(8, device=lowest.device)
     return Corners(lowest[:, None] + corner // 4 * layer + corner // 2 % 2 * row + corner % 2, weights)
+
+
+@cache
+def _squares(orders: tuple[float, ...], device: torch.device) -> Float[Tensor, " k"]:
+    return torch.tensor(orders, device=device).square()
 
 
 def roughness(nodes: Float[Tensor, "a k x y z 6"]) -> Float[Tensor, " k"]:

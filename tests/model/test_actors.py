@@ -9,7 +9,7 @@ from helpers.hand_made import about_z, actors_of, looking_at, motion_through, tr
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.placement import ObjectPoses
-from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix
+from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix, turned
 from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -76,6 +76,18 @@ def test_vectors_rotated_back_equal_scipys_inverse():
     vectors = rng.normal(size=(20, 3))
     found = rotated_back(torch.from_numpy(rotations.as_quat(scalar_first=True)), torch.from_numpy(vectors))
     np.testing.assert_allclose(found, rotations.inv().apply(vectors), atol=1e-12)
+
+
+def test_turned_quaternions_rotate_by_themselves_and_then_by_the_turn():
+    """A turn is the axis times the tangent of half the angle: half the rotation vector where it is small."""
+    rotations, rng = Rotation.random(20, random_state=5), np.random.default_rng(6)
+    vectors = rng.normal(size=(20, 3))
+    angles = np.linalg.norm(vectors, axis=1, keepdims=True)
+    turns = torch.from_numpy(np.tan(angles / 2.0) * vectors / angles)
+    quats = 1.7 * torch.from_numpy(rotations.as_quat(scalar_first=True))
+    expected = (Rotation.from_rotvec(vectors) * rotations).as_matrix()
+    np.testing.assert_allclose(matrices(turned(quats, turns)), expected, atol=1e-12)
+    assert torch.equal(turned(quats, torch.zeros_like(turns)), quats)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -2.0, np.pi])
