@@ -26,8 +26,8 @@ def rotated_back(quats: Float[Tensor, "*n 4"], vectors: Float[Tensor, "*n 3"]) -
 
 
 def turned(quats: Float[Tensor, "n 4"], turns: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Rotations followed by those of the quaternions (1, turn), of which `turns` are halved rotation vectors where they
-    are small. The result has another length. Elementwise, as `rotated_back`."""
+    """The products (1, turn) * quaternion: rotations followed by those of `turns`, which are halved rotation vectors
+    where they are small. The results are longer than `quats`. Elementwise, as `rotated_back`."""
     scalar, axis = quats[:, :1], quats[:, 1:]
     rotated = axis + scalar * turns + torch.linalg.cross(turns, axis)
     return torch.cat([scalar - (turns * axis).sum(dim=1, keepdim=True), rotated], dim=1)

@@ -41,11 +41,11 @@ class LatticeSettings(Settings):
     learning_rate: float = Field(2e-3, gt=0)
     """Learning rate of displacements (metres) and rotations (radians)."""
     size_weight: float = Field(0.1, ge=0)
-    """Loss weight of an object's mean square of both, times the square of the multiple of the phase, divided by the
-    number of training images: the fewer images, the less an object deforms."""
+    """Loss weight of the mean square of an object's displacements and rotations, times the square of the multiple of
+    the phase. It is divided by the number of training images: with fewer images objects deform less."""
     smoothness_weight: float = Field(1.0, ge=0)
-    """Loss weight of an object's mean squared difference between neighbouring nodes, divided by the number of training
-    images."""
+    """Loss weight of the mean squared difference between neighbouring nodes of an object. It is divided by the number
+    of training images, too."""
 
     def for_scene(self, objects: int, views: int) -> "LatticeSettings":
         """The settings with the weights of means over so many `objects`, in a scene of so many training `views`."""

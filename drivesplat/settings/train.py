@@ -213,8 +213,8 @@ class TrainSettings(Settings):
     """Fraction of the Gaussians of static parts that each iteration with an image leaves out at random: no surface may
     depend on a single Gaussian (docs/off_the_lane.md)."""
     dropout_images: int = Field(20, ge=1)
-    """Where cameras have more training images each, `dropout` is multiplied by this number and divided by theirs: more
-    images overfit less."""
+    """Number of training images per camera up to which `dropout` applies in full. With more images there is less
+    overfitting: `dropout` is then multiplied by this number and divided by theirs."""
     flatness_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean thickness of background Gaussians (their smallest scale, metres)."""
     road_weight: float = Field(0.0, ge=0)
