@@ -7,6 +7,7 @@ Takes a GPU where there is one. Prints, for each grid, how many scans a second a
 the milliseconds of a forward and backward pass: medians over rounds, after a warm-up.
 """
 
+import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -21,8 +22,8 @@ from drivesplat.machine.device import choose_device, device_name
 from drivesplat.rasterization import RayGrid, ScanMotion, rasterize_scan
 from drivesplat.settings.device import DeviceSettings
 
-GRIDS = ("32x1084", "64x2650")
-"""Beams by firings: the LiDARs of nuScenes and of Waymo."""
+GRIDS = ((32, 1084), (64, 2650))
+"""Beams and firings: the LiDARs of nuScenes and of Waymo."""
 HEIGHT, REVOLUTION_S = 1.8, 0.1
 BEAM_SPREAD = (1.5e-3, 1.5e-3)
 ROUNDS = 5
@@ -100,19 +101,26 @@ def seconds_of(work: Callable[[], object], repetitions: int, device: torch.devic
     return float(np.median(rounds[1:]))
 
 
+def grid(text: str) -> tuple[int, int]:
+    """The numbers of beams and firings of a grid of rays, such as 32x1084."""
+    beams, times, firings = text.partition("x")
+    if not (times and beams.isdecimal() and firings.isdecimal() and int(beams) and int(firings)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of beams and of firings, such as 32x1084")
+    return int(beams), int(firings)
+
+
 def main(arguments: Sequence[str]) -> int:
     """Runs the command with these arguments; returns its exit status."""
     parser = argument_parser("scans", __doc__)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
-    parser.add_argument("--rays", nargs="+", default=list(GRIDS), metavar="BEAMSxFIRINGS")
+    parser.add_argument("--rays", nargs="+", type=grid, default=GRIDS, metavar="BEAMSxFIRINGS")
     parser.add_argument("--scans", type=int, default=60, help="scans in a round")
     options = parser.parse_args(arguments)
     device = choose_device(DeviceSettings(kind="any"))
     street = Street.random(options.gaussians, device)
     found = {"device": device_name(device), "gaussians": options.gaussians}
-    for grid in options.rays:
-        beams, firings = (int(number) for number in grid.split("x"))
-        found[grid] = measure(street, beams, firings, options.scans)
+    for beams, firings in options.rays:
+        found[f"{beams}x{firings}"] = measure(street, beams, firings, options.scans)
     print(json.dumps(found, indent=2))
     return 0
 

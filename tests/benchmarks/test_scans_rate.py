@@ -49,6 +49,13 @@ def test_scans_with_motion_are_those_of_a_sensor_and_of_gaussians_that_move(monk
     assert all(value > 0 for value in found.values())
 
 
+@pytest.mark.parametrize("rays", ["32", "32x", "x16", "0x16", "2x-8", "axb"])
+def test_a_grid_that_is_none_is_refused_in_a_sentence(rays, capsys):
+    with pytest.raises(SystemExit):
+        command.main(["--rays", rays])
+    assert f"'{rays}' is not a number of beams and of firings" in capsys.readouterr().err
+
+
 def test_the_command_prints_a_record_for_each_grid(capsys):
     assert command.main(["--gaussians", "300", "--rays", "2x8", "3x16", "--scans", "1"]) == 0
     found = json.loads(capsys.readouterr().out)
