@@ -5,10 +5,7 @@ callees.
 """
 
 import os
-import shutil
-import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,10 +14,8 @@ import numba
 
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_write
-from drivesplat.provenance.code_digest import code_digest
+from drivesplat.kernels.cache_folder import cache_folder
 
-MAX_UNUSED_S = 14 * 24 * 3600
-"""Seconds after which unused compiled code is removed; another run may use an older version until then."""
 OPTIONS = {"nogil": True, "error_model": "numpy"}
 callee = numba.njit(**OPTIONS)
 """Compiles a function that only kernels call; it is cached as part of them."""
@@ -51,29 +46,9 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
 def _cached_source(file: Path, configured: str) -> Path:
     """A copy of `file` in its cache folder. numba names cache entries by the path of the source: with this path every
     checkout of the same code shares them. Raises ResultError where the copy cannot be written."""
-    source = _cache_folder(file, configured) / file.name
+    source = cache_folder(file, configured) / file.name
     if not source.exists():
         with atomic_write(source) as copy:
             copy.write(file.read_bytes())
     os.utime(source.parent)
     return source
-
-
-def _cache_folder(file: Path, configured: str) -> Path:
-    """The folder for code compiled from `file` and from what it imports, in the `configured` folder, or else in the
-    first writable one of the package's __pycache__ and the user's cache. Removes folders that have long been unused."""
-    package, user = Path(__file__).parents[1] / "__pycache__", Path.home() / ".cache" / "drivesplat"
-    writable = (folder for folder in (package, user) if _writable(folder))
-    parent = Path(configured) if configured else next(writable, package)
-    folder = parent / f"kernels-{file.stem}-{code_digest(file)[:16]}"
-    for other in parent.glob(f"kernels-{file.stem}-*"):
-        with suppress(OSError):
-            if other != folder and time.time() - other.stat().st_mtime > MAX_UNUSED_S:
-                shutil.rmtree(other)
-    return folder
-
-
-def _writable(folder: Path) -> bool:
-    """Whether files can be created in a folder, which need not exist yet."""
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    return os.access(existing, os.W_OK | os.X_OK)

@@ -19,7 +19,8 @@ def composite(
 
     With `absgrad` the backward pass leaves the sums over pixels of the absolute gradients of `means2d` in
     `means2d.absgrad`. Runs gsplat on a GPU, numba elsewhere. Where Triton compiles, long lists of Gaussians are cut
-    into chunks, so that no tile waits for the longest one.
+    into chunks, so that no tile waits for the longest one; where torch compiles CUDA C++, too, kernels of this package
+    composite the chunks.
     """
     means2d, depths, conics, radii, opacities = gaussians
     if not means2d.is_cuda:
@@ -29,11 +30,14 @@ def composite(
     from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
     if not absgrad and triton_support.usable_for(means2d):
+        from drivesplat.kernels.cuda import compiled, compositing
         from drivesplat.kernels.triton import chunks, tiles
 
         if values.shape[-1] <= chunks.MAX_VALUES:
             footprints = tiles.Footprints(means2d, conics, values, opacities)
             lists = tiles.tile_lists(footprints, radii, depths, width, height)
+            if compiled.usable_for(values):
+                return compositing.composite(footprints, lists, width, height)
             return chunks.composite(footprints, lists, width, height, rasterize_to_pixels)
     cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)
     _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, across, down, n_images=cameras)

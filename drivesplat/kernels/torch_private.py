@@ -1,10 +1,12 @@
 """torch's private functions, each behind one function of ours. tests/kernels/test_private.py checks their signatures.
 
-There is no public way to update many tensors in one call, to run one fused Adam step, or to end a broken capture.
+There is no public way to update many tensors in one call, to run one fused Adam step, to end a broken capture, or to
+compile CUDA C++ without a compiler of CUDA.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from unittest.mock import patch
 
 import torch
 from jaxtyping import Float
@@ -41,6 +43,25 @@ def fused_adam_step(
 def write_count(tensor: Tensor) -> int:
     """A number that grows with every write to the tensor."""
     return tensor._version
+
+
+def compiled_cuda(source: str, kernel: str, defined: Mapping[str, int], capability: str) -> bytes:
+    """CUDA C++ source compiled by NVRTC for GPUs of a compute capability, such as "90". `kernel` is one of its kernels,
+    `defined` are its macros. Raises RuntimeError, or OSError without NVRTC."""
+    from torch.cuda import _utils
+
+    options = [f"-D{name}={value}" for name, value in defined.items()]
+    with patch("torch.utils.cpp_extension.include_paths", return_value=[]):  # headers of CUDA may not be there
+        binary, _ = _utils._nvrtc_compile(source, kernel, capability, nvcc_options=options)
+    return binary
+
+
+def loaded_cuda(binary: bytes, kernels: Sequence[str]) -> dict[str, Callable[..., None]]:
+    """Compiled kernels by name, loaded for the current device. They take `grid`, `block` and `args`."""
+    from torch.cuda import _utils
+
+    loaded = _utils._cuda_load_module(binary, list(kernels))
+    return {name: loaded[name] for name in kernels}
 
 
 def release_graph_pool(device_index: int, pool: tuple[int, int]) -> None:

@@ -232,6 +232,9 @@ class TrainSettings(Settings):
     entropy_weight: float = Field(0.1, ge=0)
     """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
     consist of objects."""
+    entropy_every: int = Field(1, ge=1)
+    """Iterations with an image from one that has this term to the next, which is weighted by their number: objects are
+    rendered alone for it, which takes time."""
     dynamic_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute colour difference over the pixels of moving objects. Only with parts that
     consist of objects."""
@@ -279,7 +282,7 @@ class TrainSettings(Settings):
         parts and, without any part that consists of objects, the loss weights of objects."""
         fields = [part for part in MOVING_PARTS if part not in parts]
         if not set(STAGE_OF_PART) & set(parts):
-            fields += ["entropy_weight", "dynamic_weight"]
+            fields += ["entropy_weight", "entropy_every", "dynamic_weight"]
         return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
 
 

@@ -127,7 +127,7 @@ class Trainer:
 
         if with_picture or not self.graphs.enabled:
             return *self.graphs.retry_without_graphs(iteration), view
-        image = Recording("image", (self.images.factor(self.step), number))
+        image = Recording("image", (self.images.factor(self.step), number, self._has_entropy))
         layout = self.images.factor(self.step), self.sh_degree(), *self._addresses()
         return self._captured(image, lambda: iteration()[0], layout), None, view
 
@@ -176,7 +176,7 @@ class Trainer:
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
             )
         with stage("loss"):
-            terms = loss_terms(picture, view, self.model, self.settings)
+            terms = loss_terms(picture, view, self.model, self._image_settings())
             terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
         if by_gradient:
@@ -235,6 +235,17 @@ class Trainer:
     def _image_step(self) -> int:
         """The number of iterations so far that fitted an image."""
         return self.scan_schedule.images_before(self.step)
+
+    @property
+    def _has_entropy(self) -> bool:
+        """Whether an iteration with an image, now, has the term of the entropy of objects. True without objects."""
+        objects = any(part.has_objects for part in self.model.parts)
+        return not objects or self._image_step % self.settings.entropy_every == 0
+
+    def _image_settings(self) -> TrainSettings:
+        """The settings with the weight that the entropy of objects has in an iteration with an image, now."""
+        factor = self.settings.entropy_every if self._has_entropy else 0
+        return self.settings.model_copy(update={"entropy_weight": factor * self.settings.entropy_weight})
 
     def _addresses(self) -> tuple[tuple[int, int], ...]:
         """The addresses and sizes of all parameters. Captured iterations become invalid when they change."""

@@ -21,7 +21,14 @@ SHOW = "from drivesplat.caller import total\nprint(total(10.0))\nprint(sum(total
 def small_package(root: Path) -> Path:
     """A package of the library's name with kernels only: code digests follow the imports of a kernel."""
     package = root / "drivesplat"
-    used = ("kernels/cache", "provenance/code_digest", "provenance/syntax_digest", "io/storage", "errors")
+    used = (
+        "kernels/cache",
+        "kernels/cache_folder",
+        "provenance/code_digest",
+        "provenance/syntax_digest",
+        "io/storage",
+        "errors",
+    )
     for name in used:
         file = package / f"{name}.py"
         file.parent.mkdir(parents=True, exist_ok=True)

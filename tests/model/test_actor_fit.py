@@ -114,7 +114,7 @@ def test_an_object_is_learned_in_its_own_frame_from_images_of_it_passing_by():
     thing, motion = a_thing(), passing_by()
     actors = guessed(thing, motion, ActorSettings(sh_degree=0, fourier=1))
     assert np.linalg.norm(actors.params["means"].detach().numpy() - thing.places, axis=1).mean() > 0.08
-    fit(actors, recorded(thing, motion, from_the_kerb()), 300)
+    fit(actors, recorded(thing, motion, from_the_kerb()), 360)
     leaning = actors.params["means"].detach().numpy() - thing.places
     off = np.linalg.norm(leaning - leaning.mean(axis=0), axis=1)
     colors = 0.5 + C0 * actors.params["sh0"].detach().numpy()[:, 0, 0]

@@ -6,12 +6,13 @@ chunk becomes an image of a tile's size, and these are composited front to back.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -23,8 +24,43 @@ MAX_VALUES = 8
 """Maximum number of values of a Gaussian: every entry of a list gets its own copy of them."""
 BLOCK = 4096
 """Tiles counted at a time."""
+TILES = 128
+"""Tiles whose chunks one program names."""
 
 Rasterizer = Callable[..., tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """The chunks of all lists, at most `count` of at most `length` entries each, tile after tile: the first of each of
+    t tiles, then the number of all (`firsts`), and the tile of each (`tile_of`, undefined beyond the last)."""
+
+    firsts: Int[Tensor, " t1"]
+    tile_of: Int[Tensor, " m"]
+    count: int
+    length: int
+
+    @classmethod
+    def of(cls, lists: TileLists, length: int) -> "Chunks":
+        """Chunks of at most `length` entries."""
+        tiles = len(lists.offsets) - 1
+        count = tiles + len(lists.ids) // length
+        firsts, tile_of = lists.ids.new_empty(tiles + 1), lists.ids.new_empty(count)
+        count_chunks[(1,)](lists.offsets, firsts, tiles, length, BLOCK)
+        _name_tiles[(triton.cdiv(tiles, TILES),)](firsts, tile_of, tiles, TILES)
+        return cls(firsts, tile_of, count, length)
+
+
+def join(
+    values: Float[Tensor, "m 256 v"],
+    alpha: Float[Tensor, "m 256"],
+    chunks: Chunks,
+    lists: TileLists,
+    width: int,
+    height: int,
+) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
+    """Images and alpha of all tiles, composited from those of their chunks."""
+    return _Join.apply(values, alpha, chunks.firsts, lists.tiles, width, height)
 
 
 def composite(
@@ -121,6 +157,18 @@ def count_chunks(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.constex
         tl.store(firsts + tile, found + tl.cumsum(chunks, 0) - chunks, mask=inside)
         found += tl.sum(chunks)
     tl.store(firsts + tiles, found)
+
+
+@triton.jit(do_not_specialize=["tiles"])
+@no_type_check
+def _name_tiles(firsts, tile_of, tiles, TILES: tl.constexpr):
+    """Writes the tile of every chunk."""
+    tile = tl.program_id(0) * TILES + tl.arange(0, TILES)
+    inside = tile < tiles
+    first = tl.load(firsts + tile, mask=inside, other=0)
+    chunks = tl.load(firsts + tile + 1, mask=inside, other=0) - first
+    for step in range(tl.max(chunks, 0)):
+        tl.store(tile_of + first + step, tile, mask=step < chunks)
 
 
 @triton.jit

@@ -1,0 +1,1 @@
+"""CUDA C++ kernels, which torch compiles with NVRTC when they are first used."""

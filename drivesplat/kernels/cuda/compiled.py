@@ -1,0 +1,67 @@
+"""The compiled CUDA kernels, cached on disk, and whether this process can have them."""
+
+import logging
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from drivesplat.io.storage import atomic_write
+from drivesplat.kernels import torch_private
+from drivesplat.kernels.cache_folder import cache_folder
+from drivesplat.kernels.cuda import source
+
+log = logging.getLogger(__name__)
+
+LENGTH = 256
+"""Maximum number of Gaussians in a chunk."""
+PIXELS = 2
+"""Pixels of a thread."""
+
+
+def usable_for(tensor: Tensor) -> bool:
+    """Whether the kernels can process a tensor: it is on an NVIDIA GPU, and NVRTC compiles for it."""
+    return tensor.is_cuda and torch.version.hip is None and _compiles(tensor.device.index)
+
+
+@cache
+def kernels(channels: int, length: int, device: int) -> Mapping[str, Callable[..., None]]:
+    """The kernels for Gaussians with so many values and chunks of at most `length` of them, loaded for a device, by
+    name. Raises RuntimeError or OSError where they cannot be compiled."""
+    with torch.cuda.device(device):
+        capability = "{}{}".format(*torch.cuda.get_device_capability())
+        return torch_private.loaded_cuda(_binary(channels, length, capability), source.KERNELS)
+
+
+@cache
+def _compiles(device: int) -> bool:
+    try:
+        kernels(3, LENGTH, device)
+    except (RuntimeError, OSError, AttributeError, ImportError) as error:  # no NVRTC, or another version of torch
+        log.warning("CUDA kernels cannot be compiled (%s): gsplat's replace them; trainings take longer", error)
+        return False
+    return True
+
+
+def _binary(channels: int, length: int, capability: str) -> bytes:
+    """The compiled kernels, from their file in the cache where there is one."""
+    file = cache_folder(Path(__file__)) / f"{channels}-{length}-sm{capability}-{torch.version.cuda}.cubin"
+    try:
+        return file.read_bytes()
+    except OSError:
+        binary = compiled(channels, length, capability)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(file) as copy:
+            copy.write(binary)
+    except OSError as error:
+        log.debug("%s: %s: every process compiles", file, error)
+    return binary
+
+
+def compiled(channels: int, length: int, capability: str) -> bytes:
+    """The kernels compiled for GPUs of a compute capability, such as "90"."""
+    defined = {"CHANNELS": channels, "LENGTH": length, "PIXELS": PIXELS}
+    return torch_private.compiled_cuda(source.SOURCE, source.KERNELS[0], defined, capability)

@@ -1,0 +1,277 @@
+"""The CUDA C++ source of the kernels that composite chunks of tiles' lists (`drivesplat.kernels.cuda.compositing`).
+
+CHANNELS, the number of values of a Gaussian, LENGTH, the most entries of a chunk, and PIXELS, the number of pixels of a
+thread, are defined when it is compiled. Rays end and contributions are skipped as in gsplat's kernels.
+"""
+
+KERNELS = ("composite_chunks", "composite_chunks_backward")
+
+SOURCE = r"""
+#define TILE 16
+#define WARP 32
+#define EVERY_LANE 0xffffffffu
+#define THREADS (TILE * TILE / PIXELS)
+#define MAX_ALPHA 0.999f
+#define MIN_ALPHA (1.0f / 255.0f)
+#define MIN_TRANSMITTANCE 1e-4f
+#define SLACK 0.01f                         // of the exponent, against rounding
+#define SUMS (CHANNELS + 6)                 // gradients of a Gaussian: values, mean, conic, opacity
+#define WIDTH (SUMS <= 8 ? 8 : 16)          // the power of two that holds them
+
+struct Gaussians {
+    const float *means, *conics, *values, *opacities;
+};
+
+struct Lists {
+    const int* ids;
+    const long long* order;
+    const int *offsets, *firsts, *tile_of;
+    int tiles, per_camera, across;
+};
+
+struct Batch {                              // in shared memory: a Gaussian for each thread
+    float x[THREADS], y[THREADS], a[THREADS], b[THREADS], c[THREADS], opacity[THREADS];
+    float values[THREADS][CHANNELS];
+    int id[THREADS];
+    float wide[THREADS], high[THREADS];     // half the size of the box around its ellipse, in pixels
+};
+
+// The chunk of a block: its first and last entry, and the corner of its tile in pixels.
+struct Chunk {
+    int start, end;
+    float left, top;
+
+    __device__ Chunk(const Lists& lists, int chunk) {
+        int tile = lists.tile_of[chunk], within = tile % lists.per_camera;
+        start = lists.offsets[tile] + (chunk - lists.firsts[tile]) * LENGTH;
+        end = min(start + LENGTH, lists.offsets[tile + 1]);
+        left = float(within % lists.across * TILE);
+        top = float(within / lists.across * TILE);
+    }
+};
+
+// A warp covers 8 columns and 4 * PIXELS rows of the tile.
+__device__ __forceinline__ int column_of(int thread) {
+    return thread / WARP % 2 * 8 + thread % 8;
+}
+__device__ __forceinline__ int row_of(int thread, int pixel) {
+    return (thread / WARP / 2 * PIXELS + pixel) * 4 + thread % WARP / 8;
+}
+
+__device__ __forceinline__ void load(
+    Batch& batch, const Gaussians& g, const Lists& lists, const Chunk& chunk, int entry
+) {
+    int thread = threadIdx.x;
+    batch.wide[thread] = -1e9f;
+    if (entry >= chunk.end) return;
+    int i = lists.ids[lists.order[entry]];
+    long long at = i;
+    batch.id[thread] = i;
+    batch.x[thread] = g.means[2 * at] - chunk.left;
+    batch.y[thread] = g.means[2 * at + 1] - chunk.top;
+    batch.a[thread] = g.conics[3 * at];
+    batch.b[thread] = g.conics[3 * at + 1];
+    batch.c[thread] = g.conics[3 * at + 2];
+    float opacity = g.opacities[at];
+    batch.opacity[thread] = opacity;
+    float reach = __logf(opacity / MIN_ALPHA) + SLACK, a = batch.a[thread], b = batch.b[thread], c = batch.c[thread];
+    float scale = 2.0f * reach / fmaxf(a * c - b * b, 1e-20f);
+    batch.wide[thread] = sqrtf(fmaxf(scale * c, 0.0f)) + SLACK;
+    batch.high[thread] = sqrtf(fmaxf(scale * a, 0.0f)) + SLACK;
+    #pragma unroll
+    for (int k = 0; k < CHANNELS; ++k) batch.values[thread][k] = g.values[CHANNELS * at + k];
+}
+
+// The lanes whose Gaussians, those from `first` on, reach the pixels of this warp.
+__device__ __forceinline__ unsigned reaching(const Batch& batch, int first) {
+    int j = first + threadIdx.x % WARP, warp = threadIdx.x / WARP;
+    float over_x = fabsf(batch.x[j] - (warp % 2 * 8 + 4.0f)) - 3.5f;
+    float over_y = fabsf(batch.y[j] - (warp / 2 * PIXELS * 4 + 2.0f * PIXELS)) - (2.0f * PIXELS - 0.5f);
+    return __ballot_sync(EVERY_LANE, over_x <= batch.wide[j] && over_y <= batch.high[j]);
+}
+
+// The alpha of Gaussian j at the offset (dx, dy) of a pixel, 0 below MIN_ALPHA; falloff is its part without opacity.
+__device__ __forceinline__ float alpha_at(const Batch& batch, int j, float dx, float dy, float& falloff) {
+    float sigma = 0.5f * (batch.a[j] * dx * dx + batch.c[j] * dy * dy) + batch.b[j] * dx * dy;
+    falloff = __expf(-sigma);
+    float alpha = fminf(MAX_ALPHA, batch.opacity[j] * falloff);
+    return sigma < 0.0f || alpha < MIN_ALPHA ? 0.0f : alpha;
+}
+
+// Composites each chunk by itself: premultiplied values (m, 256, CHANNELS), alpha and transmittance (m, 256) by pixel,
+// and the last entry of the chunk that a pixel shows (-1: none).
+extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
+    const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
+    const long long* order, const int* offsets, const int* firsts, const int* tile_of, float* images, float* alphas,
+    float* transmittances, int* lasts, int tiles, int per_camera, int across
+) {
+    if ((int)blockIdx.x >= firsts[tiles]) return;
+    __shared__ Batch batch;
+    Gaussians g = {means, conics, values, opacities};
+    Lists lists = {ids, order, offsets, firsts, tile_of, tiles, per_camera, across};
+    Chunk chunk(lists, blockIdx.x);
+    int thread = threadIdx.x;
+    float x = column_of(thread) + 0.5f;
+    float y[PIXELS], passes[PIXELS], total[PIXELS][CHANNELS] = {};
+    int last[PIXELS];
+    bool ended[PIXELS], all_ended = false;
+    #pragma unroll
+    for (int p = 0; p < PIXELS; ++p) {
+        y[p] = row_of(thread, p) + 0.5f;
+        passes[p] = 1.0f;
+        last[p] = -1;
+        ended[p] = false;
+    }
+    for (int begin = chunk.start; begin < chunk.end; begin += THREADS) {
+        if (__syncthreads_and(all_ended)) break;
+        load(batch, g, lists, chunk, begin + thread);
+        __syncthreads();
+        for (int first = 0; first < THREADS; first += WARP)
+        for (unsigned lanes = reaching(batch, first); lanes && !__all_sync(EVERY_LANE, all_ended); lanes &= lanes - 1) {
+            int j = first + __ffs(lanes) - 1;
+            float dx = batch.x[j] - x;
+            #pragma unroll
+            for (int p = 0; p < PIXELS; ++p) {
+                float falloff, alpha = alpha_at(batch, j, dx, batch.y[j] - y[p], falloff);
+                if (ended[p] || alpha == 0.0f) continue;
+                float behind = passes[p] * (1.0f - alpha);
+                if (behind <= MIN_TRANSMITTANCE) {
+                    ended[p] = true;
+                    continue;
+                }
+                #pragma unroll
+                for (int k = 0; k < CHANNELS; ++k) total[p][k] += batch.values[j][k] * alpha * passes[p];
+                passes[p] = behind;
+                last[p] = begin - chunk.start + j;
+            }
+            all_ended = true;
+            #pragma unroll
+            for (int p = 0; p < PIXELS; ++p) all_ended &= ended[p];
+        }
+    }
+    #pragma unroll
+    for (int p = 0; p < PIXELS; ++p) {
+        long long at = (long long)blockIdx.x * TILE * TILE + row_of(thread, p) * TILE + column_of(thread);
+        #pragma unroll
+        for (int k = 0; k < CHANNELS; ++k) images[at * CHANNELS + k] = total[p][k];
+        alphas[at] = 1.0f - passes[p];
+        transmittances[at] = passes[p];
+        lasts[at] = last[p];
+    }
+}
+
+// Sums WIDTH values over the lanes of a warp. Lane l returns the sum of value l / (WARP / WIDTH): in each step lanes
+// exchange halves of what is left, so that few shuffles serve all values.
+template <int HALF>
+__device__ __forceinline__ float sum_over_lanes(float (&g)[WIDTH], int lane) {
+    constexpr int BIT = HALF * WARP / WIDTH;
+    bool upper = lane & BIT;
+    #pragma unroll
+    for (int i = 0; i < HALF; ++i) {
+        float kept = upper ? g[i + HALF] : g[i], given = upper ? g[i] : g[i + HALF];
+        g[i] = kept + __shfl_xor_sync(EVERY_LANE, given, BIT);
+    }
+    if constexpr (HALF > 1) return sum_over_lanes<HALF / 2>(g, lane);
+    #pragma unroll
+    for (int bit = BIT / 2; bit >= 1; bit /= 2) g[0] += __shfl_xor_sync(EVERY_LANE, g[0], bit);
+    return g[0];
+}
+
+// Adds the gradients of all Gaussians, given those of each chunk's values and alpha.
+extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
+    const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
+    const long long* order, const int* offsets, const int* firsts, const int* tile_of, const float* transmittances,
+    const int* lasts, const float* v_images, const float* v_alphas, float* v_means,
+    float* v_conics, float* v_values, float* v_opacities, int tiles, int per_camera, int across
+) {
+    if ((int)blockIdx.x >= firsts[tiles]) return;
+    __shared__ Batch batch;
+    __shared__ int last_of_tile;
+    Gaussians g = {means, conics, values, opacities};
+    Lists lists = {ids, order, offsets, firsts, tile_of, tiles, per_camera, across};
+    Chunk chunk(lists, blockIdx.x);
+    int thread = threadIdx.x, lane = thread % WARP;
+    float x = column_of(thread) + 0.5f;
+    // by pixel: transmittance, gradient of the values; `behind`, the gradient by all that the pixel shows behind the
+    // Gaussian at hand
+    float y[PIXELS], passes[PIXELS], behind[PIXELS], v_pixel[PIXELS][CHANNELS];
+    int last[PIXELS], last_of_warp = -1;
+    #pragma unroll
+    for (int p = 0; p < PIXELS; ++p) {
+        long long at = (long long)blockIdx.x * TILE * TILE + row_of(thread, p) * TILE + column_of(thread);
+        y[p] = row_of(thread, p) + 0.5f;
+        passes[p] = transmittances[at];
+        behind[p] = -passes[p] * v_alphas[at];
+        bool matters = v_alphas[at] != 0.0f;
+        #pragma unroll
+        for (int k = 0; k < CHANNELS; ++k) {
+            v_pixel[p][k] = v_images[at * CHANNELS + k];
+            matters |= v_pixel[p][k] != 0.0f;
+        }
+        last[p] = matters ? lasts[at] : -1;
+        last_of_warp = max(last_of_warp, last[p]);
+    }
+    #pragma unroll
+    for (int bit = WARP / 2; bit >= 1; bit /= 2)
+        last_of_warp = max(last_of_warp, __shfl_xor_sync(EVERY_LANE, last_of_warp, bit));
+    if (thread == 0) last_of_tile = -1;
+    __syncthreads();
+    if (lane == 0) atomicMax(&last_of_tile, last_of_warp);
+    __syncthreads();
+    int entries = last_of_tile + 1;
+    // where this lane adds its sum
+    const int each = WARP / WIDTH, sum = lane / each;
+    float* target = sum < CHANNELS ? v_values + sum
+        : sum < CHANNELS + 2 ? v_means + (sum - CHANNELS)
+        : sum < CHANNELS + 5 ? v_conics + (sum - CHANNELS - 2)
+        : v_opacities;
+    int stride = sum < CHANNELS ? CHANNELS : sum < CHANNELS + 2 ? 2 : sum < CHANNELS + 5 ? 3 : 1;
+    bool adds = lane % each == 0 && sum < SUMS;
+    for (int begin = (entries - 1) / THREADS * THREADS; begin >= 0 && entries > 0; begin -= THREADS) {
+        __syncthreads();
+        load(batch, g, lists, chunk, chunk.start + begin + thread);
+        __syncthreads();
+        for (int first = THREADS - WARP; first >= 0; first -= WARP)
+        for (unsigned lanes = reaching(batch, first), bit; lanes; lanes ^= bit) {
+            int lane_of = WARP - 1 - __clz(lanes), j = first + lane_of;
+            bit = 1u << lane_of;
+            if (begin + j > last_of_warp) continue;
+            float dx = batch.x[j] - x, dy[PIXELS], alpha[PIXELS], falloff[PIXELS];
+            bool shown = false;
+            #pragma unroll
+            for (int p = 0; p < PIXELS; ++p) {
+                dy[p] = batch.y[j] - y[p];
+                alpha[p] = begin + j > last[p] ? 0.0f : alpha_at(batch, j, dx, dy[p], falloff[p]);
+                shown |= alpha[p] != 0.0f;
+            }
+            if (!__any_sync(EVERY_LANE, shown)) continue;
+            float sums[WIDTH] = {}, along_x = 0.0f, along_y = 0.0f;
+            #pragma unroll
+            for (int p = 0; p < PIXELS; ++p) {
+                float left = __fdividef(1.0f, 1.0f - alpha[p]);
+                passes[p] *= left;
+                float weight = alpha[p] * passes[p], by_values = 0.0f;
+                #pragma unroll
+                for (int k = 0; k < CHANNELS; ++k) {
+                    sums[k] += weight * v_pixel[p][k];
+                    by_values += batch.values[j][k] * v_pixel[p][k];
+                }
+                float v_alpha = passes[p] * by_values - left * behind[p];
+                behind[p] += weight * by_values;
+                bool free = alpha[p] > 0.0f && batch.opacity[j] * falloff[p] <= MAX_ALPHA;
+                float v_opacity = free ? falloff[p] * v_alpha : 0.0f, v_sigma = -batch.opacity[j] * v_opacity;
+                along_x += v_sigma * dx;
+                along_y += v_sigma * dy[p];
+                sums[CHANNELS + 2] += 0.5f * v_sigma * dx * dx;
+                sums[CHANNELS + 3] += v_sigma * dx * dy[p];
+                sums[CHANNELS + 4] += 0.5f * v_sigma * dy[p] * dy[p];
+                sums[CHANNELS + 5] += v_opacity;
+            }
+            sums[CHANNELS] = batch.a[j] * along_x + batch.b[j] * along_y;
+            sums[CHANNELS + 1] = batch.b[j] * along_x + batch.c[j] * along_y;
+            float total = sum_over_lanes<WIDTH / 2>(sums, lane);
+            if (adds && total != 0.0f) atomicAdd(target + (long long)stride * batch.id[j], total);
+        }
+    }
+}
+"""

@@ -1,0 +1,102 @@
+"""The CUDA kernels that composite chunks, compared with torch and gsplat, and their compilation, which needs no GPU."""
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="Triton is not there for this system")
+from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses, gradients, lists_of_all_lengths
+
+from drivesplat.kernels.cuda import compiled, compositing
+from drivesplat.kernels.triton import chunks
+from drivesplat.kernels.triton.tiles import Footprints, tile_lists
+
+gpu = pytest.mark.gpu
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, chunks.MAX_VALUES])
+@pytest.mark.parametrize("capability", ["75", "80", "90", "120"])
+def test_they_compile_for_each_number_of_values_and_kind_of_gpu(channels, capability):
+    try:
+        binary = compiled.compiled(channels, compiled.LENGTH, capability)
+    except OSError as error:
+        pytest.skip(f"no NVRTC: {error}")
+    assert binary.startswith(b"\x7fELF")
+
+
+def test_compiled_kernels_are_kept(monkeypatch, tmp_path):
+    made = []
+    monkeypatch.setattr(compiled, "cache_folder", lambda _: tmp_path / "cache")
+    monkeypatch.setattr(compiled, "compiled", lambda *key: made.append(key) or b"kernels of %d" % key[0])
+    for channels in (3, 4, 3):
+        assert compiled._binary(channels, 256, "90") == b"kernels of %d" % channels
+    assert made == [(3, 256, "90"), (4, 256, "90")]
+
+
+def test_where_the_cache_cannot_be_written_every_process_compiles(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(compiled, "cache_folder", lambda _: tmp_path / "file" / "cache")
+    monkeypatch.setattr(compiled, "compiled", lambda *_: b"kernels")
+    assert compiled._binary(3, 256, "90") == b"kernels"
+
+
+@pytest.mark.parametrize("error", [OSError("no NVRTC"), RuntimeError("it does not compile"), AttributeError("renamed")])
+def test_where_they_do_not_compile_gsplat_replaces_them_with_a_warning(monkeypatch, caplog, error):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(compiled, "kernels", fails)
+    compiled._compiles.cache_clear()
+    assert not compiled._compiles(0) and not compiled._compiles(0)
+    compiled._compiles.cache_clear()
+    (record,) = caplog.records
+    assert str(error) in record.message and "gsplat" in record.message
+
+
+@gpu
+@needs_gpu
+@pytest.mark.parametrize(("cameras", "channels"), [(1, 3), (2, 4), (1, 1), (1, 8)])
+@pytest.mark.parametrize("length", [4, 256])
+def test_chunks_and_their_gradients_equal_those_of_torch(cameras, channels, length):
+    """For tiles with no entries, less than a chunk, a full chunk, and several chunks."""
+    given, lists, expected = lists_of_all_lengths(cameras, channels)
+    found = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT, length)
+    for mine, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=5e-3, rtol=0.0)  # torch has no least alpha
+    for theirs, mine in zip(*gradients(given, expected, found), strict=True):
+        assert theirs.any()
+        assert float((mine - theirs).norm() / theirs.norm()) < 0.02
+
+
+@gpu
+@needs_gpu
+@pytest.mark.parametrize(("cameras", "channels"), [(1, 3), (2, 1)])
+def test_images_and_gradients_equal_those_of_gsplat(cameras, channels):
+    """Of long lists, with opaque Gaussians that end rays. Alpha rounded to the other side of its limit is an
+    exception at single pixels."""
+    from gsplat import rasterize_to_pixels
+
+    width, height = 150, 80
+    gaussians, radii, depths = ellipses(cameras, 6000, width, height)
+    given = [gaussians.means, gaussians.conics, gaussians.values[..., :channels].contiguous(), gaussians.opacities]
+    given = [values.requires_grad_() for values in given]
+    lists = tile_lists(Footprints(*given), radii, depths, width, height)
+    assert int(lists.offsets.diff().max()) > 2 * chunks.LENGTH
+    expected = chunks.composite(Footprints(*given), lists, width, height, rasterize_to_pixels)
+    found = compositing.composite(Footprints(*given), lists, width, height, chunks.LENGTH)
+    for mine, theirs in zip(found, expected, strict=True):
+        off = (mine - theirs).abs()
+        assert float(off.mean()) < 1e-5 and float(off.max()) < 5e-3
+    for theirs, mine in zip(*gradients(given, expected, found), strict=True):
+        assert float((mine - theirs).norm() / theirs.norm()) < 1e-3
+
+
+@gpu
+@needs_gpu
+def test_empty_lists_give_an_empty_image_and_no_gradient():
+    given = [torch.zeros(1, 5, *tail, device=DEVICE).requires_grad_() for tail in ((2,), (3,), (3,), ())]
+    unseen = torch.zeros(1, 5, 2, dtype=torch.int32, device=DEVICE)
+    lists = tile_lists(Footprints(*given), unseen, torch.ones(1, 5, device=DEVICE), 20, 10)
+    image, alpha = compositing.composite(Footprints(*given), lists, 20, 10)
+    assert image.shape == (1, 10, 20, 3) and alpha.shape == (1, 10, 20, 1) and not image.any() and not alpha.any()
+    assert not any(gradient.any() for gradient in torch.autograd.grad(image.sum() + alpha.sum(), given))
