@@ -32,8 +32,10 @@ def ellipses(
     return on_device, radii, torch.from_numpy(rng.uniform(1, 9, (cameras, count))).float().to(DEVICE)
 
 
-def rasterized(means, conics, values, opacities, width, height, tile, offsets, ids, masks=None, packed=False):
-    """gsplat's `rasterize_to_pixels` in torch, list by list; no ray ends early."""
+def rasterized(
+    means, conics, values, opacities, width, height, tile, offsets, ids, masks=None, packed=False, least=0.0
+):
+    """gsplat's `rasterize_to_pixels` in torch, list by list. No ray ends early, and `least` is the smallest alpha."""
     cameras, down, across = offsets.shape
     ends = [*offsets.flatten().tolist()[1:], len(ids)]
     means, conics, opacities = means.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()
@@ -52,6 +54,7 @@ def rasterized(means, conics, values, opacities, width, height, tile, offsets, i
             a, b, c = conics[i]
             falls = 0.5 * (a * over_x**2 + c * over_y**2) + b * over_x * over_y
             alpha = opacities[i] * torch.exp(-falls)
+            alpha = torch.where(alpha < least, 0.0, alpha)
             total = total + (passes * alpha)[..., None] * torch.cat([values[i], values.new_ones(1)])
             passes = passes * (1.0 - alpha)
         image[camera, rows, column * tile : (column + 1) * tile] += total
@@ -73,8 +76,11 @@ def shuffled(ids: torch.Tensor, offsets: torch.Tensor) -> TileLists:
 Images = tuple[torch.Tensor, torch.Tensor]
 
 
-def lists_of_all_lengths(cameras: int, channels: int) -> tuple[list[torch.Tensor], TileLists, Images]:
-    """Gaussians in images of WIDTH x HEIGHT, lists of up to 13 of them, and the composited images."""
+def lists_of_all_lengths(
+    cameras: int, channels: int, least: float = 0.0
+) -> tuple[list[torch.Tensor], TileLists, Images]:
+    """Gaussians in images of WIDTH x HEIGHT, lists of up to 13 of them, and the images composited without alpha below
+    `least`."""
     torch.manual_seed(0)
     down, across, n = 2, 3, 30
     lengths = [0, 3, 4, 9, 1, 0] if cameras == 1 else [0, 3, 4, 9, 1, 0, 0, 8, 2, 0, 5, 13]
@@ -87,7 +93,7 @@ def lists_of_all_lengths(cameras: int, channels: int) -> tuple[list[torch.Tensor
         0.1 + 0.6 * torch.rand(cameras, n),
     ]
     given = [values.to(DEVICE).requires_grad_() for values in given]
-    return given, shuffled(ids, offsets), rasterized(*given, WIDTH, HEIGHT, TILE, offsets, ids)
+    return given, shuffled(ids, offsets), rasterized(*given, WIDTH, HEIGHT, TILE, offsets, ids, least=least)
 
 
 def gradients(given: list[torch.Tensor], *images: Images) -> list[tuple[torch.Tensor, ...]]:

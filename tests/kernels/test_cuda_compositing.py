@@ -59,13 +59,13 @@ def test_where_they_do_not_compile_gsplat_replaces_them_with_a_warning(monkeypat
 @pytest.mark.parametrize("length", [4, 256])
 def test_chunks_and_their_gradients_equal_those_of_torch(cameras, channels, length):
     """For tiles with no entries, less than a chunk, a full chunk, and several chunks."""
-    given, lists, expected = lists_of_all_lengths(cameras, channels)
+    given, lists, expected = lists_of_all_lengths(cameras, channels, 1.0 / 255.0)
     found = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT, length)
     for mine, theirs in zip(found, expected, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=5e-3, rtol=0.0)  # torch has no least alpha
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
     for theirs, mine in zip(*gradients(given, expected, found), strict=True):
         assert theirs.any()
-        assert float((mine - theirs).norm() / theirs.norm()) < 0.02
+        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
 
 
 @gpu
@@ -77,11 +77,11 @@ def test_images_and_gradients_equal_those_of_gsplat(cameras, channels):
     from gsplat import rasterize_to_pixels
 
     width, height = 150, 80
-    gaussians, radii, depths = ellipses(cameras, 6000, width, height)
+    gaussians, radii, depths = ellipses(cameras, 40_000 // cameras, width, height)
     given = [gaussians.means, gaussians.conics, gaussians.values[..., :channels].contiguous(), gaussians.opacities]
     given = [values.requires_grad_() for values in given]
     lists = tile_lists(Footprints(*given), radii, depths, width, height)
-    assert int(lists.offsets.diff().max()) > 2 * chunks.LENGTH
+    assert int(lists.offsets.diff().max()) > chunks.LENGTH
     expected = chunks.composite(Footprints(*given), lists, width, height, rasterize_to_pixels)
     found = compositing.composite(Footprints(*given), lists, width, height, chunks.LENGTH)
     for mine, theirs in zip(found, expected, strict=True):
