@@ -51,6 +51,7 @@ class Deformable(Actors):
         super().__init__(params, tracks, settings, gaussians)
         self._gait, self._field = settings.gait, field_of(settings)
         self._out_of_box_weight = settings.out_of_box_weight
+        self.penalties_depend_on_time = settings.out_of_box_weight > 0
         initial = self._field.initial(len(tracks))
         self._field_names = tuple(initial)
         self._per_track = ("stride", *(name for name in ("lattice", "embedding") if name in initial))

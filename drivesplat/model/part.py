@@ -89,6 +89,8 @@ class Part(nn.Module, ABC):
     """Whether its Gaussians are dynamic: at other places at other times."""
     has_objects = False
     """Whether its Gaussians belong to objects with tracks."""
+    penalties_depend_on_time = False
+    """Whether it has `penalties_at` times."""
     geometry: tuple[str, ...] = GEOMETRY
     """Those of `params` that both images and LiDAR scans fit."""
     decaying: tuple[str, ...] = ("means",)

@@ -2,7 +2,7 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from drivesplat.kernels.color_difference import color_difference
@@ -99,8 +99,18 @@ def depth_loss(depth: Float[Tensor, "h w"], lidar: LidarDepth) -> Float[Tensor, 
     """Mean absolute difference to the LiDAR depths in metres, without the largest 5 % (Street Gaussians, section 3.3):
     these are returns from behind an edge, or of surfaces that the image does not show."""
     errors = (depth.reshape(-1).index_select(0, lidar.pixels) - lidar.depth).abs()
+    if lidar.count is not None:
+        return _mean_of_smallest(errors, lidar.count)
     kept = max(1, int(len(errors) * (1.0 - IGNORED_DEPTHS)))
     return torch.topk(errors, kept, largest=False, sorted=False).values.mean()
+
+
+def _mean_of_smallest(errors: Float[Tensor, " m"], count: Int[Tensor, ""]) -> Float[Tensor, ""]:
+    """The mean of the first `count` errors without the largest 5 %. Does not synchronise with the device."""
+    places = torch.arange(len(errors), device=errors.device)
+    ordered = torch.where(places < count, errors, torch.inf).sort().values
+    kept = (count.double() * (1.0 - IGNORED_DEPTHS)).long().clamp(min=1)
+    return torch.where(places < kept, ordered, 0.0).sum() / kept
 
 
 def depth_roughness(

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.kernels import torch_private
-from drivesplat.model.splat_model import Picture, ScanTimeStates, SplatModel
+from drivesplat.model.splat_model import Picture, ScanTimeStates, SplatModel, TimeStates
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
+from drivesplat.training.cuda_graph.image_inputs import SharedImageInputs, can_share
 from drivesplat.training.cuda_graph.iteration_graphs import (
     GaussianCount,
     IterationGraphs,
@@ -24,7 +24,7 @@ from drivesplat.training.densify import Densifier
 from drivesplat.training.dropout import with_dropout
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
-from drivesplat.training.monitor import FiniteGuard
+from drivesplat.training.monitor import FiniteGuard, gradient_norms
 from drivesplat.training.optimizers import (
     DeviceSchedule,
     ModelOptimizers,
@@ -37,8 +37,8 @@ from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import TrainingScan, scan_index, scan_terms
 from drivesplat.training.views import TrainingView
 
-MEASURED_SCANS = 8
-"""Iterations with scans before one is captured: they measure the entries that the lists of any scan need."""
+MEASURED_SCANS, MEASURED_IMAGES = 8, 16
+"""Iterations with scans or images before one is captured: they measure the entries that the lists of any need."""
 
 
 @dataclass
@@ -58,7 +58,8 @@ class Trainer:
     graphs: IterationGraphs
     schedule: DeviceSchedule
     scan_schedule: ScanSchedule
-    scans: list[TrainingScan] = field(default_factory=list)
+    scans: list[TrainingScan]
+    image_inputs: SharedImageInputs
     scan_inputs: SharedScanInputs = field(default_factory=SharedScanInputs)
     step: int = 0
 
@@ -85,7 +86,7 @@ class Trainer:
         model.precompute([time for scan in scans for time in ScanTimeStates.times(scan.view.time)])
         return cls(
             model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
-            schedule, list(scans),
+            schedule, list(scans), SharedImageInputs(images),
         )  # fmt: skip
 
     @property
@@ -121,15 +122,24 @@ class Trainer:
             return self._fit_scan(step, rates), None, None
         with self.clock.stage("data"):
             number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
-
-        def iteration() -> tuple[Terms, Picture]:
-            return self._learn(view, step, rates)
-
         if with_picture or not self.graphs.enabled:
-            return *self.graphs.retry_without_graphs(iteration), view
-        image = Recording("image", (self.images.factor(self.step), number, self._has_entropy))
-        layout = self.images.factor(self.step), self.sh_degree(), *self._addresses()
-        return self._captured(image, lambda: iteration()[0], layout), None, view
+            return *self.graphs.retry_without_graphs(lambda: self._learn(view, step, rates)), view
+        return self._replay_image(number, view, step, rates), None, view
+
+    def _replay_image(
+        self, number: int, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
+    ) -> Terms:
+        """An iteration with an image, by its CUDA graph or the one for all of its shape, where there is one."""
+        factor, shared = self.images.factor(self.step), can_share(self.model, view)
+        layout = factor, self.sh_degree(), *self._addresses()
+        states = self.model.time_states(view.view.time) if shared else None
+        if states is None:
+            alone = Recording("image", (factor, number, self._has_entropy))
+            return self._captured(alone, lambda: self._learn(view, step, rates)[0], layout)
+        inputs = self.graphs.retry_without_graphs(lambda: self.image_inputs.load(view, states))
+        runs = min(MEASURED_IMAGES, len(self.images.views))
+        image = Recording("image", (inputs.number, self._has_entropy), runs)
+        return self._captured(image, lambda: self._learn(inputs.view, step, rates, inputs.states)[0], layout)
 
     def _fit_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
         """An iteration with the scan whose turn it is, by its CUDA graph where there is one."""
@@ -158,14 +168,19 @@ class Trainer:
         return self.graphs.run(recording, layout, gaussians, iteration)
 
     def _learn(
-        self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
+        self,
+        view: TrainingView,
+        step: int | Tensor,
+        rates: Mapping[str, Tensor] | None,
+        states: TimeStates | None = None,
     ) -> tuple[Terms, Picture]:
-        """An iteration with a view. `step` and `rates` are those of `DeviceSchedule.update`; a replay of this reads the
-        values that they hold then."""
+        """An iteration with a view; `states` are those of its time (None: to be looked up). `step` and `rates` are
+        those of `DeviceSchedule.update`; a replay of this reads the values that they hold then."""
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # gradients of an iteration that ran out of memory
         with stage("render"):
-            gaussians = self.model.gaussians_in(view.view)
+            look_up = self.model.gaussians_in
+            gaussians = look_up(view.view) if states is None else self.model.gaussians_at_time_states(states)
             if self.settings.dropout:
                 gaussians = with_dropout(gaussians, self.model, self.settings.dropout)
             picture = self.model.render(
@@ -219,7 +234,7 @@ class Trainer:
             limit_gradients()
         with stage("checks"):
             losses = {f"loss {name}": value for name, value in terms.items()}
-            self.guard.watch(step, {**losses, **self._gradient_norms()})
+            self.guard.watch(step, {**losses, **gradient_norms(self.model)})
         with stage("optimizer"):
             self.optimizers.step(rates)
         return {name: value.detach() for name, value in terms.items()}
@@ -273,16 +288,6 @@ class Trainer:
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
         return min(self.step // every, max(part.sh_degree for part in self.model.parts))
-
-    def _gradient_norms(self) -> Terms:
-        named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
-        norms = torch_private.norms([gradient for _, gradient in named])
-        return {f"gradient of {self._readable(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}
-
-    def _readable(self, parameter: str) -> str:
-        """The name of a parameter of the model in messages: 'background means', 'sky texels'."""
-        owner, *place, name = parameter.split(".")
-        return f"{self.model.parts[int(place[0])].name if owner == 'parts' else owner} {name}"
 
 
 def _scale_gradients(parameters: Iterable[Tensor], factor: float) -> None:

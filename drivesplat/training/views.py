@@ -19,10 +19,11 @@ from drivesplat.scene.training_record import TrainingRecord
 @dataclass(frozen=True)
 class LidarDepth:
     """LiDAR depth of an image: at row-major pixel indices `pixels` (m,), `depth` (m,) in metres along the optical
-    axis."""
+    axis. The first `count` entries are used (None: all), which a device can change without Python."""
 
     pixels: Int[Tensor, " m"]
     depth: Float[Tensor, " m"]
+    count: Int[Tensor, ""] | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,89 @@
+"""The inputs of captured iterations with images: one graph serves all images of the same shape.
+
+A capture takes as long as ten replays. A graph for each image would be captured again whenever the graphs become
+invalid: with 80 images that took a fifth of a training. The graph therefore reads inputs of its own, as those of LiDAR
+scans do (`scan_inputs`), into which the image of each iteration is copied.
+"""
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from drivesplat.kernels import torch_private
+from drivesplat.model.splat_model import SplatModel, TimeStates
+from drivesplat.training.coarse_to_fine import TrainingImages
+from drivesplat.training.views import LidarDepth, TrainingView
+
+
+@dataclass(frozen=True)
+class ImageInputs:
+    """An image with its camera, and the time states of the parts, whose tensors have the addresses that a graph reads;
+    `number` counts the shapes of images."""
+
+    number: int
+    image: TrainingView
+    states: TimeStates
+
+    @property
+    def view(self) -> TrainingView:
+        """The image. Its camera has no cached values, which would be those of an earlier image."""
+        return replace(self.image, view=replace(self.image.view))
+
+
+@dataclass
+class SharedImageInputs:
+    """The inputs of graphs, by shape, for the `images` of a training."""
+
+    images: TrainingImages
+    _by_shape: dict[Hashable, ImageInputs] = field(default_factory=dict)
+
+    def load(self, image: TrainingView, states: TimeStates) -> ImageInputs:
+        """The inputs of this shape, which hold an image and its time states from now on. An iteration also depends on
+        the camera's name, if the model has exposures."""
+        given = _tensors(image, states)
+        shape = (image.view.camera, image.lidar is None, *((values.shape, values.dtype) for values in given))
+        own = self._by_shape.get(shape)
+        if own is None:
+            own = self._by_shape[shape] = self._copied(image, states)
+        torch_private.copy_all(_tensors(own.image, own.states), given)
+        if image.lidar is not None and own.image.lidar is not None:
+            _load_depths(own.image.lidar, image.lidar)
+        return own
+
+    def _copied(self, image: TrainingView, states: TimeStates) -> ImageInputs:
+        """New inputs, with the shape of an image and its time states."""
+        view = replace(image.view, K=image.view.K.clone(), camera_to_world=image.view.camera_to_world.clone())
+        masks = {name: getattr(image, name) for name in ("sky", "moving", "ego_mask")}
+        copies = {name: mask.clone() for name, mask in masks.items() if mask is not None}
+        lidar = None if image.lidar is None else self._room_for(image.lidar)
+        own = replace(image, view=view, pixels=image.pixels.clone(), lidar=lidar, **copies)
+        return ImageInputs(len(self._by_shape), own, [[values.clone() for values in state] for state in states])
+
+    def _room_for(self, lidar: LidarDepth) -> LidarDepth:
+        """Depth of this kind, with room for that of any image."""
+        most = max(len(image.lidar.depth) for image in self.images.views if image.lidar is not None)
+        pixels, depth = lidar.pixels.new_zeros(most), lidar.depth.new_zeros(most)
+        return LidarDepth(pixels, depth, torch.zeros((), dtype=torch.int64, device=depth.device))
+
+
+def can_share(model: SplatModel, image: TrainingView) -> bool:
+    """Whether an iteration with an image depends on nothing but its tensors, the name of its camera and the parts' time
+    states. Otherwise Python looks up what belongs to its time, and its graph serves no other image."""
+    looks_up = model.camera_poses is not None or any(part.penalties_depend_on_time for part in model.parts)
+    return image.view.shutter is None and image.classes is None and not looks_up
+
+
+def _tensors(image: TrainingView, states: TimeStates) -> list[Tensor]:
+    """All tensors of an image but LiDAR depth, and those of time states, in a fixed order."""
+    masks = [mask for mask in (image.sky, image.moving, image.ego_mask) if mask is not None]
+    return [image.view.K, image.view.camera_to_world, image.pixels, *masks, *(v for state in states for v in state)]
+
+
+def _load_depths(own: LidarDepth, given: LidarDepth) -> None:
+    count = len(given.depth)
+    own.pixels[:count].copy_(given.pixels)
+    own.depth[:count].copy_(given.depth)
+    if own.count is not None:
+        own.count.fill_(count)

@@ -1,0 +1,107 @@
+"""Shared inputs of captured iterations with images. test_gpu.py tests the graphs, on a GPU."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers.trainings import ALL_TERMS, guided_views, settings_of, untrained_drifting, untrained_street
+
+from drivesplat.model.camera_poses import CameraPoses
+from drivesplat.settings.train import DeformableSettings
+from drivesplat.training.coarse_to_fine import TrainingImages, reduced
+from drivesplat.training.cuda_graph.image_inputs import SharedImageInputs, can_share
+from drivesplat.training.losses import depth_loss, loss_terms
+from drivesplat.training.views import LidarDepth, TrainingView
+
+
+def with_depths(view: TrainingView, count: int) -> TrainingView:
+    """A view with LiDAR depth at so many pixels; some of the errors are large."""
+    rng = np.random.default_rng(count)
+    pixels = rng.permutation(view.view.width * view.view.height)[:count]
+    depth = np.where(rng.random(count) < 0.1, 50.0, rng.uniform(2.0, 6.0, count))
+    return dataclasses.replace(view, lidar=LidarDepth(torch.from_numpy(pixels), torch.from_numpy(depth).float()))
+
+
+def inputs_for(views: list[TrainingView]) -> SharedImageInputs:
+    return SharedImageInputs(TrainingImages(views, settings_of(), 0))
+
+
+@pytest.mark.parametrize("drifting", [False, True])
+def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_image(drifting):
+    """One after the other, in inputs of the same addresses, with different amounts of LiDAR depth."""
+    settings = settings_of(**ALL_TERMS)
+    model = untrained_drifting(settings) if drifting else untrained_street(settings)
+    views = [with_depths(view, count) for view, count in zip(guided_views(), (150, 3, 200, 90, 1), strict=False)]
+    shared, addresses = inputs_for(views), set()
+    for view in views:
+        assert can_share(model, view)
+        inputs = shared.load(view, model.time_states(view.view.time))
+        addresses.add((inputs.number, inputs.image.pixels.data_ptr(), inputs.image.lidar.depth.data_ptr()))
+        alone = model.render(view.view, with_depth=True)
+        gaussians = model.gaussians_at_time_states(inputs.states)
+        together = model.render(inputs.view.view, gaussians=gaussians, with_depth=True)
+        expected, found = loss_terms(alone, view, model, settings), loss_terms(together, inputs.view, model, settings)
+        assert found.keys() == expected.keys() and {"depth", "sky_bce"} <= found.keys()
+        torch.testing.assert_close(found, expected)
+        pulls = [
+            torch.autograd.grad(sum(terms.values()), [part.params["means"] for part in model.parts])
+            for terms in (expected, found)
+        ]
+        torch.testing.assert_close(*pulls)
+    assert len(addresses) == 1 and len(views) > 2
+
+
+def test_images_of_other_shapes_and_cameras_have_inputs_of_their_own():
+    views = guided_views()
+    model = untrained_street(settings_of())
+    states = model.time_states(0.5)
+    others = [
+        views[0],
+        reduced(views[0], 2),
+        dataclasses.replace(views[0], sky=None),
+        dataclasses.replace(views[0], lidar=None),
+        dataclasses.replace(views[0], view=dataclasses.replace(views[0].view, camera="CAM_BACK")),
+    ]
+    shared = inputs_for(views)
+    assert [shared.load(view, states).number for view in (*others, *others)] == [0, 1, 2, 3, 4] * 2
+
+
+def test_inputs_do_not_change_the_image_that_they_were_made_of():
+    first, second = guided_views()[:2]
+    before = first.pixels.clone()
+    shared, states = inputs_for([first, second]), untrained_street(settings_of()).time_states(0.5)
+    inputs = shared.load(first, states)
+    shared.load(second, states)
+    assert torch.equal(first.pixels, before) and torch.equal(inputs.image.pixels, second.pixels)
+    torch.testing.assert_close(inputs.view.view.viewmat, second.view.viewmat)
+
+
+@pytest.mark.parametrize(("count", "room"), [(1, 1), (1, 40), (19, 40), (20, 20), (21, 300), (200, 300)])
+def test_the_depth_loss_ignores_unused_entries(count, room):
+    rng = np.random.default_rng(room)
+    depth = torch.from_numpy(rng.uniform(1.0, 9.0, (20, 30))).float().requires_grad_()
+    given = LidarDepth(
+        torch.from_numpy(rng.permutation(600)[:count]), torch.from_numpy(rng.uniform(1, 9, count)).float()
+    )
+    own = LidarDepth(
+        torch.cat([given.pixels, torch.full((room - count,), 7)]),
+        torch.cat([given.depth, torch.full((room - count,), torch.nan)]),
+        torch.tensor(count),
+    )
+    expected, found = depth_loss(depth, given), depth_loss(depth, own)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(*(torch.autograd.grad(loss, depth)[0] for loss in (expected, found)))
+
+
+def test_what_python_looks_up_by_time_is_not_shared():
+    (view, *_), settings = guided_views(), settings_of()
+    model = untrained_street(settings)
+    assert can_share(model, view)
+    outside = settings_of(deformable=DeformableSettings(out_of_box_weight=1.0))
+    assert not can_share(untrained_street(outside, people=True), view)
+    labelled = dataclasses.replace(view, classes=torch.zeros(view.pixels.shape[:2], dtype=torch.uint8))
+    assert not can_share(model, labelled)
+    model.camera_poses = CameraPoses.__new__(CameraPoses)
+    torch.nn.Module.__init__(model.camera_poses)
+    assert not can_share(model, view)
