@@ -1,17 +1,21 @@
 """Shared inputs of captured iterations with images. test_gpu.py tests the graphs, on a GPU."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 from helpers.trainings import ALL_TERMS, guided_views, settings_of, untrained_drifting, untrained_street
 
+from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.model.camera_poses import CameraPoses
-from drivesplat.settings.train import DeformableSettings
+from drivesplat.settings.train import DeformableSettings, McmcSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.cuda_graph.image_inputs import SharedImageInputs, can_share
+from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs, Recording
 from drivesplat.training.losses import depth_loss, loss_terms
+from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import LidarDepth, TrainingView
 
 
@@ -105,3 +109,49 @@ def test_what_python_looks_up_by_time_is_not_shared():
     model.camera_poses = CameraPoses.__new__(CameraPoses)
     torch.nn.Module.__init__(model.camera_poses)
     assert not can_share(model, view)
+
+
+def replayed(monkeypatch: pytest.MonkeyPatch, trainer: Trainer) -> list[Recording]:
+    """Has a trainer on a CPU replay iterations: a replay runs what was captured, whatever the trainer passes now.
+    Returns what it captures."""
+    captured = []
+
+    def capture(graphs: IterationGraphs, recording: Recording, gaussians: float, iteration: Callable) -> CudaGraph:
+        captured.append(recording)
+        result: dict[str, torch.Tensor] = {}
+        none = torch.zeros(0, dtype=torch.int32)
+        graph = CudaGraph(lambda: result.update(iteration()), result, none, [], none)
+        graphs._graphs[recording] = graph
+        return graph
+
+    monkeypatch.setattr(IterationGraphs, "_capture", capture)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
+    trainer.graphs.enabled = True
+    return captured
+
+
+@pytest.mark.parametrize("people", [False, True])
+def test_replays_train_as_iterations_do(people, monkeypatch):
+    """With images of two cameras, reduced at first, and with the entropy of objects in every second iteration: after
+    the first of each kind all iterations are replays."""
+    settings = settings_of(
+        **ALL_TERMS, entropy_every=2, refine_start=1.0, iterations=60, mcmc=McmcSettings(noise_lr=0.0),
+    )  # fmt: skip
+    monkeypatch.setattr(TrainingImages, "factor", lambda _, step: 2 if step < 24 else 1)
+    views = [with_depths(view, 40 + 30 * i) for i, view in enumerate(guided_views())]
+    views[0] = dataclasses.replace(views[0], view=dataclasses.replace(views[0].view, camera="CAM_BACK"))
+    losses = []
+    for replays in (False, True):
+        model = untrained_street(settings, people=people)
+        trainer = Trainer.begin(model, views, settings, 0, torch.device("cpu"))
+        captured = replayed(monkeypatch, trainer) if replays else []
+        losses.append([])
+        for _ in range(settings.iterations):
+            terms = trainer.fit_one(with_picture=False)[0]
+            losses[-1].append({name: float(value) for name, value in terms.items()})
+            trainer.step += 1
+    shapes, sizes = 2, 2
+    assert 0 < len(captured) <= 2 * shapes * sizes
+    for eager, mine in zip(*losses, strict=True):
+        assert mine == pytest.approx(eager, rel=1e-3)
+    assert sum(losses[0][-1].values()) < sum(losses[0][0].values())
