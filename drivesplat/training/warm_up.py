@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from drivesplat.errors import DriveSplatError
+from drivesplat.kernels.cube_map import face_coordinates
 from drivesplat.lidar.occlusion import unoccluded
 from drivesplat.model.background import Background
 from drivesplat.model.scans import ScanView
@@ -52,6 +53,7 @@ def warm_up(folder: Path) -> None:
     model = SplatModel([part], CubemapSky(settings.sky_resolution, torch.full((3,), 0.5), settings.lr_sky))
     folders = TrainingFolders(folder / "resume", folder / "tensorboard", "", "warm-up")
     train(model, [view], settings, 0, torch.device("cpu"), folders, scans=[_scan()])
+    face_coordinates(torch.ones(2, 2, 3))
     pixel = np.zeros(1, dtype=np.int64)
     unoccluded(pixel, pixel, np.ones(1), np.ones((1, 2)), (height, width))
 
