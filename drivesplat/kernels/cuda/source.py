@@ -126,27 +126,29 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
         if (__syncthreads_and(all_ended)) break;
         load(batch, g, lists, chunk, begin + thread);
         __syncthreads();
-        for (int first = 0; first < THREADS; first += WARP)
-        for (unsigned lanes = reaching(batch, first); lanes && !__all_sync(EVERY_LANE, all_ended); lanes &= lanes - 1) {
-            int j = first + __ffs(lanes) - 1;
-            float dx = batch.x[j] - x;
-            #pragma unroll
-            for (int p = 0; p < PIXELS; ++p) {
-                float falloff, alpha = alpha_at(batch, j, dx, batch.y[j] - y[p], falloff);
-                if (ended[p] || alpha == 0.0f) continue;
-                float behind = passes[p] * (1.0f - alpha);
-                if (behind <= MIN_TRANSMITTANCE) {
-                    ended[p] = true;
-                    continue;
-                }
+        for (int first = 0; first < THREADS; first += WARP) {
+            for (unsigned lanes = reaching(batch, first); lanes; lanes &= lanes - 1) {
+                if (__all_sync(EVERY_LANE, all_ended)) break;
+                int j = first + __ffs(lanes) - 1;
+                float dx = batch.x[j] - x;
                 #pragma unroll
-                for (int k = 0; k < CHANNELS; ++k) total[p][k] += batch.values[j][k] * alpha * passes[p];
-                passes[p] = behind;
-                last[p] = begin - chunk.start + j;
+                for (int p = 0; p < PIXELS; ++p) {
+                    float falloff, alpha = alpha_at(batch, j, dx, batch.y[j] - y[p], falloff);
+                    if (ended[p] || alpha == 0.0f) continue;
+                    float behind = passes[p] * (1.0f - alpha);
+                    if (behind <= MIN_TRANSMITTANCE) {
+                        ended[p] = true;
+                        continue;
+                    }
+                    #pragma unroll
+                    for (int k = 0; k < CHANNELS; ++k) total[p][k] += batch.values[j][k] * alpha * passes[p];
+                    passes[p] = behind;
+                    last[p] = begin - chunk.start + j;
+                }
+                all_ended = true;
+                #pragma unroll
+                for (int p = 0; p < PIXELS; ++p) all_ended &= ended[p];
             }
-            all_ended = true;
-            #pragma unroll
-            for (int p = 0; p < PIXELS; ++p) all_ended &= ended[p];
         }
     }
     #pragma unroll
@@ -231,46 +233,48 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
         __syncthreads();
         load(batch, g, lists, chunk, chunk.start + begin + thread);
         __syncthreads();
-        for (int first = THREADS - WARP; first >= 0; first -= WARP)
-        for (unsigned lanes = reaching(batch, first), bit; lanes; lanes ^= bit) {
-            int lane_of = WARP - 1 - __clz(lanes), j = first + lane_of;
-            bit = 1u << lane_of;
-            if (begin + j > last_of_warp) continue;
-            float dx = batch.x[j] - x, dy[PIXELS], alpha[PIXELS], falloff[PIXELS];
-            bool shown = false;
-            #pragma unroll
-            for (int p = 0; p < PIXELS; ++p) {
-                dy[p] = batch.y[j] - y[p];
-                alpha[p] = begin + j > last[p] ? 0.0f : alpha_at(batch, j, dx, dy[p], falloff[p]);
-                shown |= alpha[p] != 0.0f;
-            }
-            if (!__any_sync(EVERY_LANE, shown)) continue;
-            float sums[WIDTH] = {}, along_x = 0.0f, along_y = 0.0f;
-            #pragma unroll
-            for (int p = 0; p < PIXELS; ++p) {
-                float left = __fdividef(1.0f, 1.0f - alpha[p]);
-                passes[p] *= left;
-                float weight = alpha[p] * passes[p], by_values = 0.0f;
+        for (int first = THREADS - WARP; first >= 0; first -= WARP) {
+            for (unsigned lanes = reaching(batch, first), bit; lanes; lanes ^= bit) {
+                int of_lane = WARP - 1 - __clz(lanes), j = first + of_lane;
+                bit = 1u << of_lane;
+                if (begin + j > last_of_warp) continue;
+                float dx = batch.x[j] - x, dy[PIXELS], alpha[PIXELS], falloff[PIXELS];
+                bool shown = false;
                 #pragma unroll
-                for (int k = 0; k < CHANNELS; ++k) {
-                    sums[k] += weight * v_pixel[p][k];
-                    by_values += batch.values[j][k] * v_pixel[p][k];
+                for (int p = 0; p < PIXELS; ++p) {
+                    dy[p] = batch.y[j] - y[p];
+                    alpha[p] = begin + j > last[p] ? 0.0f : alpha_at(batch, j, dx, dy[p], falloff[p]);
+                    shown |= alpha[p] != 0.0f;
                 }
-                float v_alpha = passes[p] * by_values - left * behind[p];
-                behind[p] += weight * by_values;
-                bool free = alpha[p] > 0.0f && batch.opacity[j] * falloff[p] <= MAX_ALPHA;
-                float v_opacity = free ? falloff[p] * v_alpha : 0.0f, v_sigma = -batch.opacity[j] * v_opacity;
-                along_x += v_sigma * dx;
-                along_y += v_sigma * dy[p];
-                sums[CHANNELS + 2] += 0.5f * v_sigma * dx * dx;
-                sums[CHANNELS + 3] += v_sigma * dx * dy[p];
-                sums[CHANNELS + 4] += 0.5f * v_sigma * dy[p] * dy[p];
-                sums[CHANNELS + 5] += v_opacity;
+                if (!__any_sync(EVERY_LANE, shown)) continue;
+                float sums[WIDTH] = {}, along_x = 0.0f, along_y = 0.0f;
+                #pragma unroll
+                for (int p = 0; p < PIXELS; ++p) {
+                    float left = __fdividef(1.0f, 1.0f - alpha[p]);
+                    passes[p] *= left;
+                    float weight = alpha[p] * passes[p], by_values = 0.0f;
+                    #pragma unroll
+                    for (int k = 0; k < CHANNELS; ++k) {
+                        sums[k] += weight * v_pixel[p][k];
+                        by_values += batch.values[j][k] * v_pixel[p][k];
+                    }
+                    float v_alpha = passes[p] * by_values - left * behind[p];
+                    behind[p] += weight * by_values;
+                    bool free = alpha[p] > 0.0f && batch.opacity[j] * falloff[p] <= MAX_ALPHA;
+                    float v_opacity = free ? falloff[p] * v_alpha : 0.0f;
+                    float v_sigma = -batch.opacity[j] * v_opacity;
+                    along_x += v_sigma * dx;
+                    along_y += v_sigma * dy[p];
+                    sums[CHANNELS + 2] += 0.5f * v_sigma * dx * dx;
+                    sums[CHANNELS + 3] += v_sigma * dx * dy[p];
+                    sums[CHANNELS + 4] += 0.5f * v_sigma * dy[p] * dy[p];
+                    sums[CHANNELS + 5] += v_opacity;
+                }
+                sums[CHANNELS] = batch.a[j] * along_x + batch.b[j] * along_y;
+                sums[CHANNELS + 1] = batch.b[j] * along_x + batch.c[j] * along_y;
+                float total = sum_over_lanes<WIDTH / 2>(sums, lane);
+                if (adds && total != 0.0f) atomicAdd(target + (long long)stride * batch.id[j], total);
             }
-            sums[CHANNELS] = batch.a[j] * along_x + batch.b[j] * along_y;
-            sums[CHANNELS + 1] = batch.b[j] * along_x + batch.c[j] * along_y;
-            float total = sum_over_lanes<WIDTH / 2>(sums, lane);
-            if (adds && total != 0.0f) atomicAdd(target + (long long)stride * batch.id[j], total);
         }
     }
 }
