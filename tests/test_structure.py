@@ -97,7 +97,7 @@ def test_kernels_import_nothing_above_them():
 
 def test_only_kernels_choose_between_triton_numba_and_torch():
     """Callers use one function per operation: no import of a backend, no question which one is used."""
-    backends = ("drivesplat.kernels.triton.", "drivesplat.kernels.numba.")
+    backends = tuple(f"drivesplat.kernels.{name}." for name in ("cuda", "triton", "numba"))
     wrong = {
         module
         for module, others in module_graph().items()

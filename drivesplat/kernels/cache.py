@@ -15,6 +15,7 @@ import numba
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_write
 from drivesplat.kernels.cache_folder import cache_folder
+from drivesplat.provenance.code_digest import code_digest
 
 OPTIONS = {"nogil": True, "error_model": "numpy"}
 callee = numba.njit(**OPTIONS)
@@ -46,7 +47,7 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
 def _cached_source(file: Path, configured: str) -> Path:
     """A copy of `file` in its cache folder. numba names cache entries by the path of the source: with this path every
     checkout of the same code shares them. Raises ResultError where the copy cannot be written."""
-    source = cache_folder(file, configured) / file.name
+    source = cache_folder(file.stem, code_digest(file), configured) / file.name
     if not source.exists():
         with atomic_write(source) as copy:
             copy.write(file.read_bytes())

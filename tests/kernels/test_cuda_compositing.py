@@ -26,7 +26,7 @@ def test_they_compile_for_each_number_of_values_and_kind_of_gpu(channels, capabi
 
 def test_compiled_kernels_are_kept(monkeypatch, tmp_path):
     made = []
-    monkeypatch.setattr(compiled, "cache_folder", lambda _: tmp_path / "cache")
+    monkeypatch.setattr(compiled, "cache_folder", lambda *_: tmp_path / "cache")
     monkeypatch.setattr(compiled, "compiled", lambda *key: made.append(key) or b"kernels of %d" % key[0])
     for channels in (3, 4, 3):
         assert compiled._binary(channels, 256, "90") == b"kernels of %d" % channels
@@ -35,7 +35,7 @@ def test_compiled_kernels_are_kept(monkeypatch, tmp_path):
 
 def test_where_the_cache_cannot_be_written_every_process_compiles(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr(compiled, "cache_folder", lambda _: tmp_path / "file" / "cache")
+    monkeypatch.setattr(compiled, "cache_folder", lambda *_: tmp_path / "file" / "cache")
     monkeypatch.setattr(compiled, "compiled", lambda *_: b"kernels")
     assert compiled._binary(3, 256, "90") == b"kernels"
 

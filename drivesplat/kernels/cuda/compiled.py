@@ -12,6 +12,7 @@ from drivesplat.io.storage import atomic_write
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.cache_folder import cache_folder
 from drivesplat.kernels.cuda import source
+from drivesplat.provenance.code_digest import code_digest
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +48,8 @@ def _compiles(device: int) -> bool:
 
 def _binary(channels: int, length: int, capability: str) -> bytes:
     """The compiled kernels, from their file in the cache where there is one."""
-    file = cache_folder(Path(__file__)) / f"{channels}-{length}-sm{capability}-{torch.version.cuda}.cubin"
+    folder = cache_folder("cuda", code_digest(Path(__file__)))
+    file = folder / f"{channels}-{length}-sm{capability}-{torch.version.cuda}.cubin"
     try:
         return file.read_bytes()
     except OSError:
