@@ -86,7 +86,7 @@ class Trainer:
         model.precompute([time for scan in scans for time in ScanTimeStates.times(scan.view.time)])
         return cls(
             model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
-            schedule, list(scans), SharedImageInputs(images),
+            schedule, list(scans), SharedImageInputs(images, model.exposure is not None),
         )  # fmt: skip
 
     @property

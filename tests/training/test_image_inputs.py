@@ -10,6 +10,7 @@ from helpers.trainings import ALL_TERMS, guided_views, settings_of, untrained_dr
 
 from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.model.camera_poses import CameraPoses
+from drivesplat.model.exposure import Exposures
 from drivesplat.settings.train import DeformableSettings, McmcSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.cuda_graph.image_inputs import SharedImageInputs, can_share
@@ -27,8 +28,8 @@ def with_depths(view: TrainingView, count: int) -> TrainingView:
     return dataclasses.replace(view, lidar=LidarDepth(torch.from_numpy(pixels), torch.from_numpy(depth).float()))
 
 
-def inputs_for(views: list[TrainingView]) -> SharedImageInputs:
-    return SharedImageInputs(TrainingImages(views, settings_of(), 0))
+def inputs_for(views: list[TrainingView], by_camera: bool = False) -> SharedImageInputs:
+    return SharedImageInputs(TrainingImages(views, settings_of(), 0), by_camera)
 
 
 @pytest.mark.parametrize("drifting", [False, True])
@@ -56,7 +57,8 @@ def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_i
     assert len(addresses) == 1 and len(views) > 2
 
 
-def test_images_of_other_shapes_and_cameras_have_inputs_of_their_own():
+@pytest.mark.parametrize("by_camera", [False, True])
+def test_images_of_other_shapes_have_inputs_of_their_own_and_those_of_other_cameras_with_exposures(by_camera):
     views = guided_views()
     model = untrained_street(settings_of())
     states = model.time_states(0.5)
@@ -67,8 +69,8 @@ def test_images_of_other_shapes_and_cameras_have_inputs_of_their_own():
         dataclasses.replace(views[0], lidar=None),
         dataclasses.replace(views[0], view=dataclasses.replace(views[0].view, camera="CAM_BACK")),
     ]
-    shared = inputs_for(views)
-    assert [shared.load(view, states).number for view in (*others, *others)] == [0, 1, 2, 3, 4] * 2
+    shared = inputs_for(views, by_camera)
+    assert [shared.load(view, states).number for view in (*others, *others)] == [0, 1, 2, 3, 4 * by_camera] * 2
 
 
 def test_inputs_do_not_change_the_image_that_they_were_made_of():
@@ -130,8 +132,8 @@ def replayed(monkeypatch: pytest.MonkeyPatch, trainer: Trainer) -> list[Recordin
     return captured
 
 
-@pytest.mark.parametrize("people", [False, True])
-def test_replays_train_as_iterations_do(people, monkeypatch):
+@pytest.mark.parametrize(("people", "exposed"), [(False, False), (True, False), (False, True)])
+def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
     """With images of two cameras, reduced at first, and with the entropy of objects in every second iteration: after
     the first of each kind all iterations are replays."""
     settings = settings_of(
@@ -143,6 +145,7 @@ def test_replays_train_as_iterations_do(people, monkeypatch):
     losses = []
     for replays in (False, True):
         model = untrained_street(settings, people=people)
+        model.exposure = Exposures({"CAM_BACK": torch.full((3,), 0.9)}, settings.exposure) if exposed else None
         trainer = Trainer.begin(model, views, settings, 0, torch.device("cpu"))
         captured = replayed(monkeypatch, trainer) if replays else []
         losses.append([])
@@ -150,8 +153,8 @@ def test_replays_train_as_iterations_do(people, monkeypatch):
             terms = trainer.fit_one(with_picture=False)[0]
             losses[-1].append({name: float(value) for name, value in terms.items()})
             trainer.step += 1
-    shapes, sizes = 2, 2
-    assert 0 < len(captured) <= 2 * shapes * sizes
+    sizes, with_and_without_entropy, cameras = 2, 2, 1 + exposed
+    assert 0 < len(captured) <= sizes * with_and_without_entropy * cameras
     for eager, mine in zip(*losses, strict=True):
         assert mine == pytest.approx(eager, rel=1e-3)
     assert sum(losses[0][-1].values()) < sum(losses[0][0].values())

@@ -34,16 +34,18 @@ class ImageInputs:
 
 @dataclass
 class SharedImageInputs:
-    """The inputs of graphs, by shape, for the `images` of a training."""
+    """The inputs of graphs, by shape, for the `images` of a training; of each camera its own where an iteration depends
+    on the camera's name (`by_camera`)."""
 
     images: TrainingImages
+    by_camera: bool
     _by_shape: dict[Hashable, ImageInputs] = field(default_factory=dict)
 
     def load(self, image: TrainingView, states: TimeStates) -> ImageInputs:
-        """The inputs of this shape, which hold an image and its time states from now on. An iteration also depends on
-        the camera's name, if the model has exposures."""
+        """The inputs of this shape, which hold an image and its time states from now on."""
         given = _tensors(image, states)
-        shape = (image.view.camera, image.lidar is None, *((values.shape, values.dtype) for values in given))
+        camera = image.view.camera if self.by_camera else None
+        shape = (camera, image.lidar is None, *((values.shape, values.dtype) for values in given))
         own = self._by_shape.get(shape)
         if own is None:
             own = self._by_shape[shape] = self._copied(image, states)
@@ -69,8 +71,8 @@ class SharedImageInputs:
 
 
 def can_share(model: SplatModel, image: TrainingView) -> bool:
-    """Whether an iteration with an image depends on nothing but its tensors, the name of its camera and the parts' time
-    states. Otherwise Python looks up what belongs to its time, and its graph serves no other image."""
+    """Whether an iteration with an image depends on nothing but its tensors, the parts' time states and, with
+    exposures, the name of its camera. Otherwise Python looks up what belongs to its time: its graph serves no other."""
     looks_up = model.camera_poses is not None or any(part.penalties_depend_on_time for part in model.parts)
     return image.view.shutter is None and image.classes is None and not looks_up
 
