@@ -137,9 +137,9 @@ def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
     """With images of two cameras, reduced at first, and with the entropy of objects in every second iteration: after
     the first of each kind all iterations are replays."""
     settings = settings_of(
-        **ALL_TERMS, entropy_every=2, refine_start=1.0, iterations=60, mcmc=McmcSettings(noise_lr=0.0),
+        **ALL_TERMS, entropy_every=2, refine_start=1.0, iterations=40, mcmc=McmcSettings(noise_lr=0.0),
     )  # fmt: skip
-    monkeypatch.setattr(TrainingImages, "factor", lambda _, step: 2 if step < 24 else 1)
+    monkeypatch.setattr(TrainingImages, "factor", lambda _, step: 2 if step < 16 else 1)
     views = [with_depths(view, 40 + 30 * i) for i, view in enumerate(guided_views())]
     views[0] = dataclasses.replace(views[0], view=dataclasses.replace(views[0].view, camera="CAM_BACK"))
     losses = []
