@@ -41,7 +41,8 @@ def _compiles(device: int) -> bool:
     try:
         kernels(3, LENGTH, device)
     except (RuntimeError, OSError, AttributeError, ImportError) as error:  # no NVRTC, or another version of torch
-        log.warning("CUDA kernels cannot be compiled (%s): gsplat's replace them; trainings take longer", error)
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        log.warning("CUDA kernels cannot be compiled (%s): gsplat's replace them; trainings take longer", reason)
         return False
     return True
 
