@@ -58,6 +58,18 @@ def test_torch_can_release_the_memory_pool_of_a_broken_capture(name):
     assert hasattr(torch._C, name), f"torch has no _C.{name} any more: adapt drivesplat/kernels/torch_private.py"
 
 
+def test_torch_compiles_and_loads_cuda_with_the_arguments_that_we_pass():
+    from torch.cuda import _utils
+
+    compiling = list(inspect.signature(_utils._nvrtc_compile).parameters)
+    assert compiling[:3] == ["kernel_source", "kernel_name", "compute_capability"] and "nvcc_options" in compiling
+    assert list(inspect.signature(_utils._cuda_load_module).parameters) == ["ptx", "kernel_names"]
+    launching = inspect.signature(_utils._CudaKernel.__call__).parameters
+    assert {"grid", "block", "args"} <= set(launching), (
+        "torch has changed it: adapt drivesplat/kernels/torch_private.py"
+    )
+
+
 @pytest.mark.parametrize(("function", "parameters"), GSPLAT, ids=[function.__name__ for function, _ in GSPLAT])
 def test_gsplats_private_functions_are_unchanged(function: Callable, parameters: str):
     found = " ".join(inspect.signature(function).parameters)
