@@ -179,8 +179,10 @@ class Trainer:
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # gradients of an iteration that ran out of memory
         with stage("render"):
-            look_up = self.model.gaussians_in
-            gaussians = look_up(view.view) if states is None else self.model.gaussians_at_time_states(states)
+            if states is None:
+                gaussians = self.model.gaussians_in(view.view)
+            else:
+                gaussians = self.model.gaussians_at_time_states(states)
             if self.settings.dropout:
                 gaussians = with_dropout(gaussians, self.model, self.settings.dropout)
             picture = self.model.render(

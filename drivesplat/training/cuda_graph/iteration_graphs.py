@@ -1,9 +1,10 @@
 """Training iterations captured as CUDA graphs and replayed: Python launches one graph in place of a thousand kernels.
 
 At 640x360 the GPU runs an iteration's hundreds of kernels faster than Python can launch them. A graph keeps the
-addresses of what it reads and writes, so it belongs to one image, or to the inputs that LiDAR scans of one shape are
-copied into (`scan_inputs`), and stays valid while the model's tensors keep their addresses: preallocated rows let the
-number of Gaussians grow meanwhile. A graph is captured after the first runs have shown how many entries its lists need.
+addresses of what it reads and writes, so it belongs to the inputs that images or LiDAR scans of one shape are copied
+into (`image_inputs`, `scan_inputs`), or to one image, and stays valid while the model's tensors keep their addresses:
+preallocated rows let the number of Gaussians grow meanwhile. A graph is captured after the first runs have shown how
+many entries its lists need.
 """
 
 import logging
@@ -36,8 +37,8 @@ replayed since."""
 
 @dataclass(frozen=True)
 class Recording:
-    """What an iteration fits: an image, or any LiDAR scan of one shape, by its `index` among those of its `kind`. It is
-    captured after so many `runs`, which measure the entries that its lists need."""
+    """What an iteration fits: an image, or any image or LiDAR scan of one shape, by its `index` among those of its
+    `kind`. It is captured after so many `runs`, which measure the entries that its lists need."""
 
     kind: str
     index: Hashable
