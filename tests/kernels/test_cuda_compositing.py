@@ -14,11 +14,14 @@ gpu = pytest.mark.gpu
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4, chunks.MAX_VALUES])
+@pytest.mark.parametrize(
+    ("program", "channels"),
+    [*((compiled.IMAGES, count) for count in (1, 3, 4, 8)), *((compiled.SCANS, count) for count in (0, 2, 4, 8))],
+)
 @pytest.mark.parametrize("capability", ["75", "80", "90", "120"])
-def test_they_compile_for_each_number_of_values_and_kind_of_gpu(channels, capability):
+def test_they_compile_for_each_number_of_values_and_kind_of_gpu(program, channels, capability):
     try:
-        binary = compiled.compiled(channels, compiled.LENGTH, capability)
+        binary = compiled.compiled(program, channels, compiled.LENGTH, capability)
     except OSError as error:
         pytest.skip(f"no NVRTC: {error}")
     assert binary.startswith(b"\x7fELF")
@@ -27,21 +30,22 @@ def test_they_compile_for_each_number_of_values_and_kind_of_gpu(channels, capabi
 def test_compiled_kernels_are_kept(monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(compiled, "cache_folder", lambda *_: tmp_path / "cache")
-    monkeypatch.setattr(compiled, "compiled", lambda *key: made.append(key) or b"kernels of %d" % key[0])
-    for channels in (3, 4, 3):
-        assert compiled._binary(channels, 256, "90") == b"kernels of %d" % channels
-    assert made == [(3, 256, "90"), (4, 256, "90")]
+    monkeypatch.setattr(compiled, "compiled", lambda *key: made.append(key) or b"%d" % len(made))
+    programs = (compiled.IMAGES, 3), (compiled.IMAGES, 4), (compiled.SCANS, 3)
+    for number, key in enumerate(programs * 2):
+        assert compiled._binary(*key, 256, "90") == b"%d" % (number % 3 + 1)
+    assert made == [(*key, 256, "90") for key in programs]
 
 
 def test_where_the_cache_cannot_be_written_every_process_compiles(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(compiled, "cache_folder", lambda *_: tmp_path / "file" / "cache")
     monkeypatch.setattr(compiled, "compiled", lambda *_: b"kernels")
-    assert compiled._binary(3, 256, "90") == b"kernels"
+    assert compiled._binary(compiled.SCANS, 3, 256, "90") == b"kernels"
 
 
 @pytest.mark.parametrize("error", [OSError("no NVRTC"), RuntimeError("fails:\nline 3"), AttributeError("renamed")])
-def test_where_they_do_not_compile_gsplat_replaces_them_with_a_warning(monkeypatch, caplog, error):
+def test_where_they_do_not_compile_others_replace_them_with_a_warning(monkeypatch, caplog, error):
     def fails(*_):
         raise error
 

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,15 +12,27 @@ from torch import Tensor
 from drivesplat.io.storage import atomic_write
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.cache_folder import cache_folder
-from drivesplat.kernels.cuda import source
+from drivesplat.kernels.cuda import scan_source, source
 from drivesplat.provenance.code_digest import code_digest
 
 log = logging.getLogger(__name__)
 
 LENGTH = 256
 """Maximum number of Gaussians in a chunk."""
-PIXELS = 2
-"""Pixels of a thread."""
+MAX_VALUES = 8
+"""Maximum number of values of a Gaussian."""
+
+
+class Program(NamedTuple):
+    """CUDA C++ `source`, the names of its kernels, and the name of its files in the cache."""
+
+    name: str
+    source: str
+    kernels: tuple[str, ...]
+
+
+IMAGES = Program("images", source.SOURCE, source.KERNELS)
+SCANS = Program("scans", scan_source.SOURCE, scan_source.KERNELS)
 
 
 def usable_for(tensor: Tensor) -> bool:
@@ -28,33 +41,33 @@ def usable_for(tensor: Tensor) -> bool:
 
 
 @cache
-def kernels(channels: int, length: int, device: int) -> Mapping[str, Callable[..., None]]:
-    """The kernels for Gaussians with so many values and chunks of at most `length` of them, loaded for a device, by
-    name. Raises RuntimeError or OSError where they cannot be compiled."""
+def kernels(program: Program, channels: int, length: int, device: int) -> Mapping[str, Callable[..., None]]:
+    """The kernels of a program for Gaussians with so many values and chunks of at most `length` of them, loaded for a
+    device, by name. Raises RuntimeError or OSError where they cannot be compiled."""
     with torch.cuda.device(device):
         capability = "{}{}".format(*torch.cuda.get_device_capability())
-        return torch_private.loaded_cuda(_binary(channels, length, capability), source.KERNELS)
+        return torch_private.loaded_cuda(_binary(program, channels, length, capability), program.kernels)
 
 
 @cache
 def _compiles(device: int) -> bool:
     try:
-        kernels(3, LENGTH, device)
+        kernels(IMAGES, 3, LENGTH, device)
     except (RuntimeError, OSError, AttributeError, ImportError) as error:  # no NVRTC, or another version of torch
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        log.warning("CUDA kernels cannot be compiled (%s): gsplat's replace them; trainings take longer", reason)
+        log.warning("CUDA kernels cannot be compiled (%s): others replace them; trainings take longer", reason)
         return False
     return True
 
 
-def _binary(channels: int, length: int, capability: str) -> bytes:
+def _binary(program: Program, channels: int, length: int, capability: str) -> bytes:
     """The compiled kernels, from their file in the cache where there is one."""
     folder = cache_folder("cuda", code_digest(Path(__file__)))
-    file = folder / f"{channels}-{length}-sm{capability}-{torch.version.cuda}.cubin"
+    file = folder / f"{program.name}-{channels}-{length}-sm{capability}-{torch.version.cuda}.cubin"
     try:
         return file.read_bytes()
     except OSError:
-        binary = compiled(channels, length, capability)
+        binary = compiled(program, channels, length, capability)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(file) as copy:
@@ -64,7 +77,7 @@ def _binary(channels: int, length: int, capability: str) -> bytes:
     return binary
 
 
-def compiled(channels: int, length: int, capability: str) -> bytes:
+def compiled(program: Program, channels: int, length: int, capability: str) -> bytes:
     """The kernels compiled for GPUs of a compute capability, such as "90"."""
-    defined = {"CHANNELS": channels, "LENGTH": length, "PIXELS": PIXELS}
-    return torch_private.compiled_cuda(source.SOURCE, source.KERNELS[0], defined, capability)
+    defined = {"CHANNELS": channels, "LENGTH": length}
+    return torch_private.compiled_cuda(program.source, program.kernels[0], defined, capability)

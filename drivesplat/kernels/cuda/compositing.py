@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.cuda.compiled import LENGTH, PIXELS, kernels
+from drivesplat.kernels.cuda.compiled import IMAGES, LENGTH, kernels
+from drivesplat.kernels.cuda.source import PIXELS
 from drivesplat.kernels.triton.chunks import Chunks, join
 from drivesplat.kernels.triton.tiles import TILE, Footprints, TileLists
 
@@ -59,5 +60,5 @@ class _ChunkImages(torch.autograd.Function):
 
 def _launch(kernel: str, chunks: Chunks, values: Tensor, *arguments: Tensor | int) -> None:
     """Runs a kernel for the chunks of Gaussians with `values` (c, n, v), on their device."""
-    run = kernels(values.shape[-1], chunks.length, values.device.index)[kernel]
+    run = kernels(IMAGES, values.shape[-1], chunks.length, values.device.index)[kernel]
     run(grid=(chunks.count, 1, 1), block=(THREADS, 1, 1), args=list(arguments))

@@ -1,22 +1,28 @@
 """The CUDA C++ source of the kernels that composite chunks of tiles' lists (`drivesplat.kernels.cuda.compositing`).
 
-CHANNELS, the number of values of a Gaussian, LENGTH, the most entries of a chunk, and PIXELS, the number of pixels of a
-thread, are defined when it is compiled. Rays end and contributions are skipped as in gsplat's kernels.
+CHANNELS, the number of values of a Gaussian, and LENGTH, the most entries of a chunk, are defined when it is compiled.
+Rays end and contributions are skipped as in gsplat's kernels.
 """
+
+from drivesplat.kernels.cuda.warps import WARPS
 
 KERNELS = ("composite_chunks", "composite_chunks_backward")
 
-SOURCE = r"""
+PIXELS = 2
+"""Pixels of a thread."""
+
+SOURCE = (
+    f"""
+#define PIXELS {PIXELS}
+#define SUMS (CHANNELS + 6)                 // gradients of a Gaussian: values, mean, conic, opacity
+{WARPS}"""
+    + r"""
 #define TILE 16
-#define WARP 32
-#define EVERY_LANE 0xffffffffu
 #define THREADS (TILE * TILE / PIXELS)
 #define MAX_ALPHA 0.999f
 #define MIN_ALPHA (1.0f / 255.0f)
 #define MIN_TRANSMITTANCE 1e-4f
 #define SLACK 0.01f                         // of the exponent, against rounding
-#define SUMS (CHANNELS + 6)                 // gradients of a Gaussian: values, mean, conic, opacity
-#define WIDTH (SUMS <= 8 ? 8 : 16)          // the power of two that holds them
 
 struct Gaussians {
     const float *means, *conics, *values, *opacities;
@@ -162,23 +168,6 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     }
 }
 
-// Sums WIDTH values over the lanes of a warp. Lane l returns the sum of value l / (WARP / WIDTH): in each step lanes
-// exchange halves of what is left, so that few shuffles serve all values.
-template <int HALF>
-__device__ __forceinline__ float sum_over_lanes(float (&g)[WIDTH], int lane) {
-    constexpr int BIT = HALF * WARP / WIDTH;
-    bool upper = lane & BIT;
-    #pragma unroll
-    for (int i = 0; i < HALF; ++i) {
-        float kept = upper ? g[i + HALF] : g[i], given = upper ? g[i] : g[i + HALF];
-        g[i] = kept + __shfl_xor_sync(EVERY_LANE, given, BIT);
-    }
-    if constexpr (HALF > 1) return sum_over_lanes<HALF / 2>(g, lane);
-    #pragma unroll
-    for (int bit = BIT / 2; bit >= 1; bit /= 2) g[0] += __shfl_xor_sync(EVERY_LANE, g[0], bit);
-    return g[0];
-}
-
 // Adds the gradients of all Gaussians, given those of each chunk's values and alpha.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
@@ -279,3 +268,4 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     }
 }
 """
+)
