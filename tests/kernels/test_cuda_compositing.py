@@ -1,11 +1,15 @@
 """The CUDA kernels that composite chunks, compared with torch and gsplat, and their compilation, which needs no GPU."""
 
+import ctypes
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
 from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses, gradients, lists_of_all_lengths
 
+from drivesplat.kernels import torch_private
 from drivesplat.kernels.cuda import compiled, compositing
 from drivesplat.kernels.triton import chunks
 from drivesplat.kernels.triton.tiles import Footprints, tile_lists
@@ -55,6 +59,24 @@ def test_where_they_do_not_compile_others_replace_them_with_a_warning(monkeypatc
     compiled._compiles.cache_clear()
     (record,) = caplog.records
     assert f"({str(error).splitlines()[0]})" in record.message and "\n" not in record.message
+
+
+def test_kernels_read_the_addresses_of_tensors_and_the_values_of_integers(monkeypatch):
+    """With a driver of our own in place of CUDA's, which reads the arguments as a kernel does."""
+    seen, tensors = [], [torch.zeros(3), torch.zeros(2, dtype=torch.int64)]
+
+    def launch(function, *sizes_and_stream_and_arguments):
+        *sizes, shared, stream, places, _ = sizes_and_stream_and_arguments
+        pointers = [ctypes.cast(places[i], ctypes.POINTER(ctypes.c_void_p)).contents.value for i in (0, 2)]
+        integers = [ctypes.cast(places[i], ctypes.POINTER(ctypes.c_int)).contents.value for i in (1, 3)]
+        seen.append((function, sizes, shared, stream, pointers, integers))
+        return 0
+
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(_as_parameter_="stream"))
+    driver, kernel = SimpleNamespace(cuLaunchKernel=launch), SimpleNamespace(func="kernel")
+    torch_private._launch(driver, kernel, 7, 128, [tensors[0], 5, tensors[1], 2**31 - 1])
+    addresses = [tensor.data_ptr() for tensor in tensors]
+    assert seen == [("kernel", [7, 1, 1, 128, 1, 1], 0, "stream", addresses, [5, 2**31 - 1])]
 
 
 @gpu

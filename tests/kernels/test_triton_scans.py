@@ -1,5 +1,5 @@
-"""LiDAR scans by Triton's kernels against the reference. Without a GPU they run in Triton's interpreter, see
-conftest.py."""
+"""LiDAR scans by Triton's kernels, and on a GPU by CUDA C++ kernels, against the reference. Without a GPU Triton's run
+in its interpreter, see conftest.py."""
 
 from dataclasses import replace
 from unittest.mock import patch
@@ -13,7 +13,10 @@ from drivesplat.kernels import triton_support
 from drivesplat.rasterization import RayGrid, ScanMotion
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
+from drivesplat.kernels.cuda import scans as cuda_scans
+
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+ON_GPU = [pytest.mark.gpu, pytest.mark.skipif(DEVICE.type == "cpu", reason="no GPU")]
 RAYS = ("azimuths", "elevations", "offsets_s")
 INPUTS = ("means", "quats", "scales", "opacities", "values")
 SEEN = ("range", "alpha", "values", "alpha_before")
@@ -21,6 +24,15 @@ AGREEMENT = 1e-4
 """Maximum error of 98 % of the values of a tensor, relative to its maximum: in float32 a ray may end one Gaussian
 earlier or later, or a Gaussian be met at the firing before or after."""
 MOTION = ScanMotion(torch.tensor([9.0, -2.0, 0.5]).double(), torch.tensor([0.1, -0.2, 0.8]).double())
+
+
+@pytest.fixture(autouse=True, params=["Triton", pytest.param("CUDA C++", marks=ON_GPU)])
+def compositing(request, monkeypatch):
+    """Which kernels composite."""
+    if request.param == "Triton":
+        monkeypatch.setattr(cuda_scans, "can_composite", lambda values: False)
+    else:
+        assert cuda_scans.can_composite(torch.ones(1, 2, device=DEVICE))
 
 
 def seen_and_gradients(scene: ScanScene, backend: str = "cpu", **options) -> dict[str, torch.Tensor]:

@@ -61,4 +61,4 @@ class _ChunkImages(torch.autograd.Function):
 def _launch(kernel: str, chunks: Chunks, values: Tensor, *arguments: Tensor | int) -> None:
     """Runs a kernel for the chunks of Gaussians with `values` (c, n, v), on their device."""
     run = kernels(IMAGES, values.shape[-1], chunks.length, values.device.index)[kernel]
-    run(grid=(chunks.count, 1, 1), block=(THREADS, 1, 1), args=list(arguments))
+    run(chunks.count, THREADS, arguments)

@@ -66,8 +66,4 @@ class GatheredChunks(ScanChunks):
         lists = self.lists.ids, self.lists.order, self.lists.offsets, self.chunks.firsts, self.chunks.tile_of
         sizes = (len(self.firsts) - 1, *rays.sizes)
         blocks = math.ceil(self.count / WARPS_PER_BLOCK)
-        run(
-            grid=(blocks, 1, 1),
-            block=(RAYS * WARPS_PER_BLOCK, 1, 1),
-            args=[*self.gaussians, *lists, *rays, *arguments, *sizes],
-        )
+        run(blocks, RAYS * WARPS_PER_BLOCK, [*self.gaussians, *lists, *rays, *arguments, *sizes])
