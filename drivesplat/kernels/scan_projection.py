@@ -6,6 +6,7 @@ T = J W R S (scales S, rotation R, world to sensor W) and T's rows a, e and d, t
 has the determinant |a × e|², which neither cancels nor turns negative as xx yy - xy² does for needles in float32.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -39,10 +40,11 @@ class Placement(NamedTuple):
 
 def scanned(
     means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"],
-    opacities: Float[Tensor, " n"], world_to_sensor: Float[Tensor, "4 4"], revolution: Revolution | None,
+    opacities: Float[Tensor, " n"], world_to_sensor: Float[Tensor, "4 4"], revolutions: Sequence[Revolution] | None,
     beam_spread: tuple[float, float], max_range: float,
-) -> ScannedGaussians:  # fmt: skip
-    """Gaussians as a LiDAR sees them, with `revolution` where they are when the beams pass them.
+) -> list[ScannedGaussians]:  # fmt: skip
+    """Gaussians as a LiDAR sees them, in each of the parts of a revolution where they are when its beams pass them.
+    There are one or two parts, which differ in their firings. None: one part, whose rays share one time.
 
     `beam_spread` are the standard deviations (radians) of the beams' footprint in azimuth and elevation, which
     Gaussians are widened by. The times are taken as constants: gradients treat a Gaussian as if it always met the
@@ -51,13 +53,12 @@ def scanned(
     if triton_support.usable_for(means) and means.dtype == torch.float32 and not world_to_sensor.requires_grad:
         from drivesplat.kernels.triton.scan_projection import ScanProjection, sensor_motion
 
-        motion = sensor_motion(world_to_sensor, revolution)
+        motion = sensor_motion(world_to_sensor, revolutions)
         projected = ScanProjection.apply(means, quats, scales, opacities, motion, beam_spread, max_range)
-        return ScannedGaussians(*projected, opacities)
+        return [ScannedGaussians(*projected[at : at + 6], opacities) for at in range(0, len(projected), 6)]
     gaussians = _placed(means, quats, scales, world_to_sensor)
-    if revolution is not None:
-        gaussians = _at_firing(gaussians, revolution, world_to_sensor)
-    return _project(gaussians, opacities, beam_spread, max_range)
+    parts = [gaussians] if revolutions is None else [_at_firing(gaussians, it, world_to_sensor) for it in revolutions]
+    return [_project(part, opacities, beam_spread, max_range) for part in parts]
 
 
 def _placed(

@@ -71,6 +71,10 @@ class Halves:
         places = [] if self.places is None else [self.places]
         return [*(values for part in self.parts for values in part.tensors), *self.firings, *places]
 
+    def revolutions(self, motion: "ScanMotion") -> list[Revolution]:
+        """The motion during each half."""
+        return [Revolution(part.firings, motion.linear, motion.angular, motion.velocities) for part in self.parts]
+
     def joined(self, parts: Sequence[CompositedScan]) -> CompositedScan:
         """What the rays of the scan measure, by that of the parts."""
         whole = (torch.cat(values, dim=1) for values in zip(*parts, strict=True))
@@ -174,16 +178,14 @@ def rasterize_scan(
     """
     if rays.azimuths.numel() == 0:
         raise ValueError(f"a scan needs rays; this one has {rays.azimuths.shape[0]} beams x {rays.azimuths.shape[1]}")
-    gaussians = means, quats, scales, opacities, world_to_sensor
+    revolutions = None if motion is None else rays.halves.revolutions(motion)
+    projected = scanned(means, quats, scales, opacities, world_to_sensor, revolutions, beam_spread, max_range)
     if motion is None:
-        met = [MetPart(rays.whole, scanned(*gaussians, None, beam_spread, max_range), before)]
+        met = [MetPart(rays.whole, projected[0], before)]
         (composited,) = composite_scan(met, values)
     else:
-        met = []
-        for part, firings in zip(rays.halves.parts, rays.halves.firings, strict=True):
-            revolution = Revolution(part.firings, motion.linear, motion.angular, motion.velocities)
-            projected = scanned(*gaussians, revolution, beam_spread, max_range)
-            met.append(MetPart(part, projected, None if before is None else before[:, firings]))
+        borders = [None if before is None else before[:, firings] for firings in rays.halves.firings]
+        met = [MetPart(*part) for part in zip(rays.halves.parts, projected, borders, strict=True)]
         composited = rays.halves.joined(composite_scan(met, values))
     range_sum, alpha, nearer, out, median = composited
     expected = range_sum / alpha.clamp(min=1e-10)

@@ -343,7 +343,8 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, chunks, color_difference, cube_map, echoes, exploration, placement, probe
 from drivesplat.kernels.triton import regularizers, tiles, time_varying_colors, view_colors
-from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_tiles
+from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
+from drivesplat.kernels.triton import scan_tiles
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "exists": "*i1",
@@ -352,6 +353,7 @@ NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "se
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each"), "i32")
 NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps"), "fp32")
 NUMBERS |= dict.fromkeys(("rows", "columns", "beams", "firings"), "i32")
+NUMBERS |= dict.fromkeys(("first_count", "last_count"), "i32")
 NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range"), "fp32")
 IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
@@ -360,7 +362,7 @@ SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.
 RAYS = {"numbers": "*i32", "values": FLOATS}
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS}) | {scan_chunks._copy: RAYS}
-SCAN |= dict.fromkeys((scan_compositing._pass, scan_compositing._composite, scan_compositing._join), RAYS)
+SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
 
 def compiled(kernel, **constants):
@@ -392,17 +394,18 @@ for kernel in (chunks._split, chunks._sum_copies):
 for kernel in (chunks._composite, chunks._composite_backward):
     compiled(kernel, CHANNELS=3, WIDTH=4)
 for motion in (True, False):
-    compiled(scan_projection._project, WITH_MOTION=motion, MOVING=motion, STEPS=4, BLOCK=scan_projection.BLOCK)
-    compiled(scan_projection._project_backward, WITH_MOTION=motion, MOVING=motion, BLOCK=scan_projection.BLOCK)
+    options = {"WITH_MOTION": motion, "MOVING": motion, "PARTS": 1 + motion, "BLOCK": scan_projection.BLOCK}
+    compiled(scan_projection._project, STEPS=4, **options)
+    compiled(scan_projection._project_backward, **options)
 compiled(scan_tiles._count_tiles, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
 compiled(scan_tiles._list, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
 compiled(scan_chunks._copy, CHANNELS=2, BLOCK=scan_chunks.BLOCK)
-compiled(scan_compositing._pass, GROUP=scan_compositing.GROUP)
+compiled(scan_sums._pass, GROUP=scan_sums.GROUP)
 compiled(scan_compositing._arrive, JOINED=scan_compositing.JOINED)
-compiled(scan_compositing._composite, CHANNELS=2, WIDTH=2, GROUP=scan_compositing.GROUP)
+compiled(scan_sums._composite, CHANNELS=2, WIDTH=2, GROUP=scan_sums.GROUP)
 for kernel in (scan_compositing._join, scan_gradients.remain):
     compiled(kernel, CHANNELS=2, JOINED=scan_compositing.JOINED)
-compiled(scan_gradients.add_gradients, CHANNELS=2, GROUP=scan_compositing.GROUP_BACKWARD)
+compiled(scan_gradients.add_gradients, CHANNELS=2, GROUP=scan_sums.GROUP_BACKWARD)
 compiled(exploration._move, BLOCK=exploration.BLOCK)
 compiled(cube_map._blend, BLOCK=cube_map.BLOCK)
 compiled(cube_map._gradients, BLOCK=cube_map.BLOCK)

@@ -1,9 +1,16 @@
-"""Loads and stores of the rows of (n, 3) and (n, 4) arrays."""
+"""Loads and stores of the rows of (n, 2), (n, 3) and (n, 4) arrays."""
 
 from typing import no_type_check
 
 import triton
 import triton.language as tl
+
+
+@triton.jit
+@no_type_check
+def two(values, i, valid):
+    """Row i of an (n, 2) array."""
+    return tl.load(values + 2 * i, mask=valid, other=0.0), tl.load(values + 2 * i + 1, mask=valid, other=0.0)
 
 
 @triton.jit
