@@ -19,8 +19,8 @@ from drivesplat.kernels.scanned_gaussians import MIN_ALPHA, ScannedGaussians
 from drivesplat.kernels.triton.tiles import TileLists
 from drivesplat.kernels.triton.vectors import around
 
-BLOCK, WARP = 128, 32
-"""Gaussians per program, one for each thread, and threads of a warp."""
+BLOCK = 128
+"""Gaussians per program."""
 FAINTEST = tl.constexpr(MIN_ALPHA)
 SLACK = tl.constexpr(1e-5)
 """Margin of ellipses in radians, larger than rounding errors of azimuths."""
@@ -47,7 +47,7 @@ def reached_tiles(gaussians: ScannedGaussians, table: TileTable) -> ReachedTiles
     nearness = torch.empty_like(gaussians.ranges)
     _count_tiles[(triton.cdiv(count, BLOCK),)](
         *_seen(gaussians), gaussians.ranges.contiguous(), *_arcs(table), counts, nearness, count, rows, columns,
-        rows.bit_length(), BINS, BLOCK, num_warps=BLOCK // WARP,
+        rows.bit_length(), BINS, BLOCK,
     )  # fmt: skip
     nearest = torch.argsort(nearness, stable=True)
     return ReachedTiles(counts, nearest, torch.cumsum(counts[nearest], dim=0, dtype=torch.int32))
@@ -65,7 +65,7 @@ def scan_lists(gaussians: ScannedGaussians, table: TileTable, reached: ReachedTi
     if reached is not None:
         _list[(triton.cdiv(count, BLOCK),)](
             *_seen(gaussians), *_arcs(table), *reached, keys, ids, capacity, count, rows, columns, rows.bit_length(),
-            BINS, BLOCK, num_warps=BLOCK // WARP,
+            BINS, BLOCK,
         )  # fmt: skip
     keys, order = torch.sort(keys, stable=True)
     each_tile = torch.arange(tiles + 1, dtype=kind, device=device)
