@@ -36,7 +36,7 @@ def composite(
         if values.shape[-1] <= chunks.MAX_VALUES:
             footprints = tiles.Footprints(means2d, conics, values, opacities)
             lists = tiles.tile_lists(footprints, radii, depths, width, height)
-            if compiled.usable_for(values):
+            if compiled.usable_for(values, compiled.IMAGES):
                 return compositing.composite(footprints, lists, width, height)
             return chunks.composite(footprints, lists, width, height, rasterize_to_pixels)
     cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)

@@ -6,8 +6,14 @@ from typing import NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-RAYS = 32
+from drivesplat.kernels.scan_borders import ON_GPU
+
+RAYS = ON_GPU.beams * ON_GPU.firings
 """Rays of a tile."""
+MAX_ALPHA, MIN_TRANSMITTANCE = 0.999, 1e-4
+"""The limit of alpha, and the transmittance at which a ray ends."""
+NOTHING = 1e-6
+"""Transmittance at which a chunk is not multiplied on: what is behind it is not drawn."""
 
 
 class TileRays(NamedTuple):

@@ -24,9 +24,10 @@ class CompositedScan(NamedTuple):
 
 
 def composite_scan(met: Sequence[MetPart], values: Float[Tensor, "n v"]) -> list[CompositedScan]:
-    """Composites Gaussians along the rays of each part of a scan, in Triton on a GPU and in numba elsewhere. Where
-    Triton cannot be used, or for float64, tensors on a GPU are copied to the CPU and back."""
-    if triton_support.usable_for(values) and values.dtype == torch.float32:
+    """Composites Gaussians along the rays of each part of a scan, by CUDA C++ kernels or Triton's on a GPU and in numba
+    elsewhere. Where Triton cannot be used, or for float64, tensors on a GPU are copied to the CPU and back."""
+    single = all(tensor.dtype == torch.float32 for tensor in (values, *met[0].gaussians))
+    if triton_support.usable_for(values) and single:
         from drivesplat.kernels.triton.scan_compositing import composite_parts
 
         return [CompositedScan(*composited) for composited in composite_parts(met, values)]

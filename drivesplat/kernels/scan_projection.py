@@ -43,8 +43,8 @@ def scanned(
     opacities: Float[Tensor, " n"], world_to_sensor: Float[Tensor, "4 4"], revolutions: Sequence[Revolution] | None,
     beam_spread: tuple[float, float], max_range: float,
 ) -> list[ScannedGaussians]:  # fmt: skip
-    """Gaussians as a LiDAR sees them, in each of the parts of a revolution where they are when its beams pass them.
-    There are one or two parts, which differ in their firings. None: one part, whose rays share one time.
+    """Gaussians as a LiDAR sees them, for each of the parts of a revolution: they are where its beams meet them. There
+    are one or two parts, which differ in their firings. None: one part, whose rays share one time.
 
     `beam_spread` are the standard deviations (radians) of the beams' footprint in azimuth and elevation, which
     Gaussians are widened by. The times are taken as constants: gradients treat a Gaussian as if it always met the

@@ -130,12 +130,12 @@ def rasterize_scan(
     composited front to back by the range of their centres. A ray meets a Gaussian at range + slopes · offset: on the
     plane of a flat Gaussian, within three standard deviations of the range in its footprint. Gaussians nearer than
     0.2 m, farther than `max_range`, or within 10° of the sensor's axis are skipped. The CPU composites in float32 or
-    float64, in as many threads as torch uses and with results that do not depend on their number; a GPU in float32, in
-    Triton. Gradients reach the first six arguments.
+    float64, in as many threads as torch uses and with results that do not depend on their number; a GPU in float32.
+    Gradients reach the first six arguments.
 
     With `motion` a Gaussian is where it is when the beams pass its centre. All rays share that time, and gradients
-    treat it as constant. The halves of the revolution are rendered one after the other: where it begins and ends, a
-    Gaussian is at two places, and the rays of each time meet it at its own.
+    treat it as constant. The halves of the revolution are projected and composited separately: where it begins and
+    ends, a Gaussian is at two places, and the rays of each time meet it at its own.
 
     Args:
         means: Centres in world coordinates, metres.

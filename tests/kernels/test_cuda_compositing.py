@@ -55,10 +55,13 @@ def test_where_they_do_not_compile_others_replace_them_with_a_warning(monkeypatc
 
     monkeypatch.setattr(compiled, "kernels", fails)
     compiled._compiles.cache_clear()
-    assert not compiled._compiles(0) and not compiled._compiles(0)
+    assert not compiled._compiles(compiled.SCANS, 0) and not compiled._compiles(compiled.SCANS, 0)
     compiled._compiles.cache_clear()
     (record,) = caplog.records
-    assert f"({str(error).splitlines()[0]})" in record.message and "\n" not in record.message
+    assert (
+        f"kernels of scans cannot be compiled ({str(error).splitlines()[0]})" in record.message
+        and "\n" not in record.message
+    )
 
 
 def test_kernels_read_the_addresses_of_tensors_and_the_values_of_integers(monkeypatch):
@@ -77,6 +80,15 @@ def test_kernels_read_the_addresses_of_tensors_and_the_values_of_integers(monkey
     torch_private._launch(driver, kernel, 7, 128, [tensors[0], 5, tensors[1], 2**31 - 1])
     addresses = [tensor.data_ptr() for tensor in tensors]
     assert seen == [("kernel", [7, 1, 1, 128, 1, 1], 0, "stream", addresses, [5, 2**31 - 1])]
+
+
+def test_programs_are_usable_one_by_one(monkeypatch):
+    """Where those of scans alone do not compile, those of images are used."""
+    on_gpu = SimpleNamespace(is_cuda=True, device=torch.device("cuda", 0))
+    monkeypatch.setattr(torch.version, "hip", None)
+    monkeypatch.setattr(compiled, "_compiles", lambda program, device: program is compiled.IMAGES)
+    assert compiled.usable_for.__wrapped__(on_gpu, compiled.IMAGES)
+    assert not compiled.usable_for.__wrapped__(on_gpu, compiled.SCANS)
 
 
 @gpu

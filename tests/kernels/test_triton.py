@@ -353,7 +353,7 @@ NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "se
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each"), "i32")
 NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps"), "fp32")
 NUMBERS |= dict.fromkeys(("rows", "columns", "beams", "firings"), "i32")
-NUMBERS |= dict.fromkeys(("first_count", "last_count"), "i32")
+NUMBERS |= dict.fromkeys(("first_count", "last_count", "room"), "i32")
 NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range"), "fp32")
 IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
@@ -393,8 +393,8 @@ for kernel in (chunks._split, chunks._sum_copies):
     compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
 for kernel in (chunks._composite, chunks._composite_backward):
     compiled(kernel, CHANNELS=3, WIDTH=4)
-for motion in (True, False):
-    options = {"WITH_MOTION": motion, "MOVING": motion, "PARTS": 1 + motion, "BLOCK": scan_projection.BLOCK}
+for motion, moving, parts in ((True, True, 2), (True, False, 2), (True, True, 1), (False, False, 1)):
+    options = {"WITH_MOTION": motion, "MOVING": moving, "PARTS": parts, "BLOCK": scan_projection.BLOCK}
     compiled(scan_projection._project, STEPS=4, **options)
     compiled(scan_projection._project_backward, **options)
 compiled(scan_tiles._count_tiles, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)

@@ -81,8 +81,10 @@ def test_every_size_of_scan_agrees(beams, firings):
     assert not disagreements(scene)
 
 
-def test_moving_sensor_and_gaussians_agree():
-    scene = random_scan(6, n=50, rays=uneven_rays(6, 4, 70))
+@pytest.mark.parametrize("firings", [70, 71, 3, 1])
+def test_moving_sensor_and_gaussians_agree(firings):
+    """Also where the halves of a revolution have different numbers of firings, and where there is one half."""
+    scene = random_scan(6, n=50, rays=uneven_rays(6, 4, firings))
     velocities = torch.randn(50, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) * 5.0
     assert not disagreements(scene, MOTION)
     assert not disagreements(scene, replace(MOTION, velocities=velocities))
@@ -103,7 +105,7 @@ def test_firings_in_any_order_agree(order):
     assert not disagreements(random_scan(4, n=50, rays=part))
 
 
-@pytest.mark.parametrize("channels", [0, 3])
+@pytest.mark.parametrize("channels", [0, 3, 8, 9])
 def test_any_number_of_channels_agrees(channels):
     scene = random_scan(7, n=30, rays=even_rays(3, 40))
     scene.values = torch.from_numpy(np.random.default_rng(channels).normal(size=(30, channels)))

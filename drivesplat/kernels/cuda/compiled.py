@@ -19,8 +19,6 @@ log = logging.getLogger(__name__)
 
 LENGTH = 256
 """Maximum number of Gaussians in a chunk."""
-MAX_VALUES = 8
-"""Maximum number of values of a Gaussian."""
 
 
 class Program(NamedTuple):
@@ -35,9 +33,9 @@ IMAGES = Program("images", source.SOURCE, source.KERNELS)
 SCANS = Program("scans", scan_source.SOURCE, scan_source.KERNELS)
 
 
-def usable_for(tensor: Tensor) -> bool:
-    """Whether the kernels can process a tensor: it is on an NVIDIA GPU, and NVRTC compiles for it."""
-    return tensor.is_cuda and torch.version.hip is None and _compiles(tensor.device.index)
+def usable_for(tensor: Tensor, program: Program) -> bool:
+    """Whether the kernels of a program can process a tensor: it is on an NVIDIA GPU, and NVRTC compiles for it."""
+    return tensor.is_cuda and torch.version.hip is None and _compiles(program, tensor.device.index)
 
 
 @cache
@@ -50,12 +48,12 @@ def kernels(program: Program, channels: int, length: int, device: int) -> Mappin
 
 
 @cache
-def _compiles(device: int) -> bool:
+def _compiles(program: Program, device: int) -> bool:
     try:
-        kernels(IMAGES, 3, LENGTH, device)
+        kernels(program, 3, LENGTH, device)
     except (RuntimeError, OSError, AttributeError, ImportError) as error:  # no NVRTC, or another version of torch
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        log.warning("CUDA kernels cannot be compiled (%s): others replace them; trainings take longer", reason)
+        log.warning("CUDA kernels of %s cannot be compiled (%s): trainings take longer", program.name, reason)
         return False
     return True
 

@@ -59,6 +59,6 @@ class _ChunkImages(torch.autograd.Function):
 
 
 def _launch(kernel: str, chunks: Chunks, values: Tensor, *arguments: Tensor | int) -> None:
-    """Runs a kernel for the chunks of Gaussians with `values` (c, n, v), on their device."""
+    """Runs a kernel for the chunks of Gaussians with `values` (c, n, v), which have to be on the current device."""
     run = kernels(IMAGES, values.shape[-1], chunks.length, values.device.index)[kernel]
     run(chunks.count, THREADS, arguments)

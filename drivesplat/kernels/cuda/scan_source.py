@@ -1,33 +1,34 @@
 """The CUDA C++ source of the kernels that composite chunks of a LiDAR scan's lists (`drivesplat.kernels.cuda.scans`).
 
 A warp has a chunk: a lane is a ray of its tile, and loads one of each 32 Gaussians for all lanes. CHANNELS, the number
-of values of a Gaussian, and LENGTH, the most entries of a chunk, are defined when it is compiled. All formulas are
-those of `drivesplat.kernels.triton.scan_compositing`.
+of values of a Gaussian, and LENGTH, the maximum number of entries of a chunk, are defined when it is compiled. All
+formulas are those of `scan_chunks`, `scan_sums` and `scan_gradients` in `drivesplat.kernels.triton`.
 """
 
 from drivesplat.kernels.cuda.warps import WARPS
 from drivesplat.kernels.scan_borders import ON_GPU
-from drivesplat.kernels.scan_chunks import RAYS
+from drivesplat.kernels.scan_chunks import MAX_ALPHA, MIN_TRANSMITTANCE, NOTHING, RAYS
 from drivesplat.kernels.scanned_gaussians import MIN_ALPHA
 
 KERNELS = ("scan_transmittances", "scan_sums", "scan_gradients")
 
 WARPS_PER_BLOCK = 4
 
-assert ON_GPU.beams * ON_GPU.firings == RAYS == 32, "a lane of a warp is a ray of a tile"
+if RAYS != 32:
+    raise ValueError("a lane of a warp is a ray of a tile")
 
 SOURCE = (
     f"""
-#define SUMS (CHANNELS + 9)                 // gradients of a Gaussian: values, mean, conic, slopes, opacity, range
+#define GRADIENTS (CHANNELS + 9)            // of a Gaussian: values, mean, conic, slopes, opacity, range
 #define BEAMS {ON_GPU.beams}
 #define FIRINGS {ON_GPU.firings}
 #define MIN_ALPHA {MIN_ALPHA!r}f
+#define MAX_ALPHA {MAX_ALPHA!r}f
+#define MIN_TRANSMITTANCE {MIN_TRANSMITTANCE!r}f
+#define NOTHING {NOTHING!r}f
 #define WARPS_PER_BLOCK {WARPS_PER_BLOCK}
 {WARPS}"""
     + r"""
-#define MAX_ALPHA 0.999f
-#define MIN_TRANSMITTANCE 1e-4f
-#define NOTHING 1e-6f                       // transmittance at which a chunk is not multiplied on
 #define PI 3.14159265358979f
 #define RAY_SUMS (CHANNELS + 3)             // sums of a ray: range, alpha, alpha before `until`, values
 
@@ -125,7 +126,7 @@ struct Pass {
         de = chunk.elevation - batch.elevation[j];
         float exponent = -(0.5f * batch.a[j] * da + batch.b[j] * de) * da - 0.5f * batch.c[j] * de * de;
         raw = batch.opacity[j] * __expf(fminf(exponent, 0.0f));
-        if (exponent > 0.0f || raw < MIN_ALPHA) raw = 0.0f;
+        raw = exponent <= 0.0f && raw >= MIN_ALPHA ? raw : 0.0f;
     }
 
     __device__ __forceinline__ float alpha() const {
@@ -223,7 +224,7 @@ extern "C" __global__ void __launch_bounds__(WARP * WARPS_PER_BLOCK) scan_gradie
         : own < 7 ? v_slopes + (own - 5)
         : own < 8 ? v_opacities : v_ranges;
     int stride = own < 0 ? CHANNELS : own < 2 ? 2 : own < 5 ? 3 : own < 7 ? 2 : 1;
-    bool adds = chunk.lane % each == 0 && sum < SUMS;
+    bool adds = chunk.lane % each == 0 && sum < GRADIENTS;
     for (int first = chunk.start; first < chunk.end; first += WARP) {
         if (!__any_sync(EVERY_LANE, left > MIN_TRANSMITTANCE)) break;
         int count = load<true>(batch, g, lists, chunk, first);

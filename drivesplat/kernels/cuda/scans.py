@@ -10,17 +10,20 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drivesplat.kernels.cuda.compiled import LENGTH, MAX_VALUES, SCANS, kernels, usable_for
+from drivesplat.kernels.cuda.compiled import LENGTH, SCANS, kernels, usable_for
 from drivesplat.kernels.cuda.scan_source import WARPS_PER_BLOCK
 from drivesplat.kernels.scan_chunks import RAYS, RaySums, ScanChunks, ScanGradients, TileRays
 from drivesplat.kernels.scanned_gaussians import ScannedGaussians
 from drivesplat.kernels.triton.chunks import Chunks
 from drivesplat.kernels.triton.tiles import TileLists
 
+MAX_VALUES = 8
+"""Maximum number of values of a Gaussian. Kernels are compiled for each number."""
+
 
 def can_composite(values: Float[Tensor, "n v"]) -> bool:
     """Whether these kernels can composite Gaussians with such values."""
-    return values.shape[1] <= MAX_VALUES and usable_for(values)
+    return values.shape[1] <= MAX_VALUES and usable_for(values, SCANS)
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class GatheredChunks(ScanChunks):
         self._launch("scan_gradients", rays, passes, rests, *given, *gradients)
 
     def _launch(self, kernel: str, rays: TileRays, *arguments: Tensor) -> None:
-        """Runs a kernel for all chunks, on their device."""
+        """Runs a kernel for all chunks, which have to be on the current device."""
         *_, values = self.gaussians
         run = kernels(SCANS, values.shape[1], self.chunks.length, values.device.index)[kernel]
         lists = self.lists.ids, self.lists.order, self.lists.offsets, self.chunks.firsts, self.chunks.tile_of

@@ -1,7 +1,7 @@
 """The CUDA C++ source of the kernels that composite chunks of tiles' lists (`drivesplat.kernels.cuda.compositing`).
 
-CHANNELS, the number of values of a Gaussian, and LENGTH, the most entries of a chunk, are defined when it is compiled.
-Rays end and contributions are skipped as in gsplat's kernels.
+CHANNELS, the number of values of a Gaussian, and LENGTH, the maximum number of entries of a chunk, are defined when it
+is compiled. Rays end and contributions are skipped as in gsplat's kernels.
 """
 
 from drivesplat.kernels.cuda.warps import WARPS
@@ -14,7 +14,7 @@ PIXELS = 2
 SOURCE = (
     f"""
 #define PIXELS {PIXELS}
-#define SUMS (CHANNELS + 6)                 // gradients of a Gaussian: values, mean, conic, opacity
+#define GRADIENTS (CHANNELS + 6)            // of a Gaussian: values, mean, conic, opacity
 {WARPS}"""
     + r"""
 #define TILE 16
@@ -217,7 +217,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
         : sum < CHANNELS + 5 ? v_conics + (sum - CHANNELS - 2)
         : v_opacities;
     int stride = sum < CHANNELS ? CHANNELS : sum < CHANNELS + 2 ? 2 : sum < CHANNELS + 5 ? 3 : 1;
-    bool adds = lane % each == 0 && sum < SUMS;
+    bool adds = lane % each == 0 && sum < GRADIENTS;
     for (int begin = (entries - 1) / THREADS * THREADS; begin >= 0 && entries > 0; begin -= THREADS) {
         __syncthreads();
         load(batch, g, lists, chunk, chunk.start + begin + thread);

@@ -3,7 +3,7 @@
 WARPS = r"""
 #define WARP 32
 #define EVERY_LANE 0xffffffffu
-#define WIDTH (SUMS <= 8 ? 8 : SUMS <= 16 ? 16 : 32)  // the power of two that holds SUMS values
+#define WIDTH (GRADIENTS <= 8 ? 8 : GRADIENTS <= 16 ? 16 : 32)  // the power of two that holds them
 
 // Sums WIDTH values over the lanes of a warp. Lane l returns the sum of value l / (WARP / WIDTH): in each step lanes
 // exchange halves of what is left, so that few shuffles serve all values.
@@ -22,4 +22,4 @@ __device__ __forceinline__ float sum_over_lanes(float (&g)[WIDTH], int lane) {
     return g[0];
 }
 """
-"""A warp, and sums of SUMS values, which the source before it defines."""
+"""A warp, and sums over its lanes. GRADIENTS, the number of values to sum, has to be defined before it."""

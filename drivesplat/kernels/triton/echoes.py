@@ -66,7 +66,7 @@ def _values_backward(means, sensor, measured, v_measured, v_echoes, count, BLOCK
 @no_type_check
 def _factors(means, sensor, i, valid, entry):
     """The factors of the 4 x 2 echoes of Gaussian i, a row each, in its logits: 1 and the unit vector from the sensor.
-    A row of them is read and written at once, which is three times as fast as one by one."""
+    A row of them is read and written at once."""
     x, y, z = three(means, i, valid)
     toward = x - tl.load(sensor), y - tl.load(sensor + 1), z - tl.load(sensor + 2)
     x, y, z = scaled(1.0 / tl.maximum(tl.sqrt(dot(toward, toward)), 1e-12), toward)

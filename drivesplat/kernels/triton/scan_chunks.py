@@ -11,6 +11,7 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from drivesplat.kernels import scan_chunks
 from drivesplat.kernels.scan_borders import ON_GPU
 from drivesplat.kernels.scanned_gaussians import MIN_ALPHA, ScannedGaussians
 from drivesplat.kernels.triton.chunks import count_chunks, tile_of
@@ -22,15 +23,14 @@ LENGTH = tl.constexpr(256)
 BLOCK, TILES = 256, 4096
 """Entries that a program copies; tiles counted at a time."""
 BEAMS, FIRINGS = tl.constexpr(ON_GPU.beams), tl.constexpr(ON_GPU.firings)
-RAYS = tl.constexpr(ON_GPU.beams * ON_GPU.firings)
+RAYS = tl.constexpr(scan_chunks.RAYS)
 FAINTEST = tl.constexpr(MIN_ALPHA)
 AZIMUTH, ELEVATION, CONIC_AA, CONIC_AE, CONIC_EE, OPACITY, RANGE, SLOPE_A, SLOPE_E, LIMIT, VALUES = (
     tl.constexpr(field) for field in range(11)
 )
 """Fields of an entry; its values are the last ones."""
-MAX_ALPHA, MIN_TRANSMITTANCE = tl.constexpr(0.999), tl.constexpr(1e-4)
-NOTHING = tl.constexpr(1e-6)
-"""Transmittance at which a chunk is not multiplied on: what is behind it is not drawn."""
+MAX_ALPHA, MIN_TRANSMITTANCE = tl.constexpr(scan_chunks.MAX_ALPHA), tl.constexpr(scan_chunks.MIN_TRANSMITTANCE)
+NOTHING = tl.constexpr(scan_chunks.NOTHING)
 SUMS = tl.constexpr(3)
 """Sums of a ray that those of the values follow: of ranges, of alpha, and of alpha before `until`."""
 SIZES = ["capacity", "tiles", "steps", "beams", "firings", "across"]

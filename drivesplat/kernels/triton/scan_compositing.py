@@ -47,7 +47,7 @@ class ScanCompositing(torch.autograd.Function):
         gaussians = ScannedGaussians(means2d, ranges, conics, slopes, range_limits, radii, opacities)
         chunks = _chunks_of(gaussians, values, scan_lists(gaussians, part.tiles, reached, capacity))
         until = torch.zeros_like(part.azimuths) if until is None else until
-        given = [t.contiguous() for t in (part.within, part.elevations, until)]
+        given = [t.to(values).contiguous() for t in (part.within, part.elevations, until)]
         rays, shape, channels = TileRays(part.tiles.tiles, *given), part.azimuths.shape, values.shape[1]
         passes, middles = (values.new_empty(chunks.count, RAYS.value) for _ in range(2))
         sums = values.new_empty(chunks.count, SUMS.value + channels, RAYS.value)
@@ -61,15 +61,16 @@ class ScanCompositing(torch.autograd.Function):
         )
         range_sum, alpha, before, median = whole
         ctx.chunks, ctx.channels, ctx.count = chunks, channels, len(ranges)
-        ctx.save_for_backward(*rays, passes, sums, range_sum, alpha, before, out)
+        read = means2d, ranges, conics, slopes, range_limits, opacities, values  # by the chunks: not to be changed
+        ctx.save_for_backward(*rays, passes, sums, range_sum, alpha, before, out, *read)
         ctx.mark_non_differentiable(median)
         return range_sum, alpha, before, out, median
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        *rays, passes, sums, range_sum, alpha, before, out = ctx.saved_tensors
-        rays, rendered = TileRays(*rays), RaySums(range_sum, alpha, before, out)
+        rays, saved = TileRays(*ctx.saved_tensors[:4]), ctx.saved_tensors[4:]
+        passes, sums, rendered = *saved[:2], RaySums(*saved[2:6])
         given, rest = RaySums(*(gradient.contiguous() for gradient in gradients[:4])), torch.empty_like(passes)
         remain[(len(ctx.chunks.firsts) - 1,)](
             ctx.chunks.firsts, rays.numbers, sums, *rendered, *given, rest, *rays.sizes, ctx.channels, JOINED,

@@ -42,6 +42,8 @@ from drivesplat.kernels.triton.vectors import (
 
 BLOCK = 128
 """Gaussians per program."""
+ALIGNED = 4
+"""Rows of the parts of a revolution are a multiple of this: the address of each is one of 16 bytes."""
 FAINTEST, DEVIATIONS = tl.constexpr(MIN_ALPHA), tl.constexpr(MAX_DEVIATIONS)
 
 
@@ -75,7 +77,7 @@ def sensor_motion(world_to_sensor: Float[Tensor, "4 4"], revolutions: Sequence[R
 
 class ScanProjection(torch.autograd.Function):
     """The first six fields of `drivesplat.kernels.scan_projection.ScannedGaussians` for each part of a revolution.
-    Gradients reach means, quats and scales; parts are added up before they are written."""
+    Gradients reach means, quats and scales: the kernel sums those of the parts."""
 
     @staticmethod
     def forward(
@@ -84,17 +86,18 @@ class ScanProjection(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:  # fmt: skip
         gaussians = tuple(values.contiguous() for values in (means, quats, scales))
         count, parts, sizes = len(means), len(motion.counts), ((2,), (), (3,), (2,), (), (2,), ())
-        *projected, offsets = (means.new_empty(parts, count, *size) for size in sizes)
+        room = triton.cdiv(count, ALIGNED) * ALIGNED
+        *projected, offsets = (means.new_empty(parts, room, *size) for size in sizes)
         ctx.options = (*beam_spread, max_range)
         if count:
             _project[(triton.cdiv(count, BLOCK),)](
                 *gaussians, opacities.contiguous(), *motion[:4], *projected, offsets, motion.counts[0],
-                motion.counts[-1], (max(motion.counts) + 1).bit_length(), *ctx.options, count,
+                motion.counts[-1], (max(motion.counts) + 1).bit_length(), *ctx.options, count, room,
                 len(motion.middles) > 0, len(motion.velocities) > 0, FIRING_STEPS, parts, BLOCK,
             )  # fmt: skip
         ctx.motion = motion
         ctx.save_for_backward(*gaussians, offsets)
-        by_part = [tuple(values[part] for values in projected) for part in range(parts)]
+        by_part = [tuple(values[part, :count] for values in projected) for part in range(parts)]
         ctx.mark_non_differentiable(*(values for found in by_part for values in found[4:]))
         return tuple(values for found in by_part for values in found)
 
@@ -103,21 +106,23 @@ class ScanProjection(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *gaussians, offsets = ctx.saved_tensors
         v_gaussians = tuple(torch.empty_like(values) for values in gaussians)
-        (parts, count), motion = offsets.shape, ctx.motion
+        count, (parts, room), motion = len(gaussians[0]), offsets.shape, ctx.motion
         first, last = ([values.contiguous() for values in gradients[at : at + 4]] for at in (0, 6 * (parts - 1)))
         if count:
             _project_backward[(triton.cdiv(count, BLOCK),)](
                 *gaussians, offsets, motion.view, motion.velocities, *first, *last, *v_gaussians, *ctx.options, count,
-                len(motion.middles) > 0, len(motion.velocities) > 0, parts, BLOCK,
+                room, len(motion.middles) > 0, len(motion.velocities) > 0, parts, BLOCK,
             )  # fmt: skip
         return *v_gaussians, None, None, None, None
 
 
-@triton.jit(do_not_specialize=["first_count", "last_count", "steps", "spread_a", "spread_e", "max_range", "count"])
+@triton.jit(
+    do_not_specialize=["first_count", "last_count", "steps", "spread_a", "spread_e", "max_range", "count", "room"]
+)
 @no_type_check
 def _project(
     means, quats, scales, opacities, view, velocities, middles, offsets_s, means2d, ranges, conics, slopes, limits,
-    radii, offsets, first_count, last_count, steps, spread_a, spread_e, max_range, count,
+    radii, offsets, first_count, last_count, steps, spread_a, spread_e, max_range, count, room,
     WITH_MOTION: tl.constexpr, MOVING: tl.constexpr, STEPS: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Projects Gaussians for one or two parts of a revolution, which have `first_count` and `last_count` middles."""
@@ -134,7 +139,7 @@ def _project(
             for _ in range(STEPS):
                 turn, moved = turn_of(view, offset), added(center, scaled(offset, velocity))
                 offset = offsets_at(atan2(dot(turn[1], moved), dot(turn[0], moved)), own, times_s, firings, steps)
-        place = part * count.to(tl.int64) + i
+        place = part * room.to(tl.int64) + i
         tl.store(offsets + place, offset, mask=valid)
         center, seen, axes, _, _ = met(
             means, quats, scales, view, velocities, offset, i, valid, max_range, WITH_MOTION, MOVING
@@ -159,11 +164,11 @@ def _project(
         tl.store(radii + 2 * place + 1, reaches * tl.sqrt(wide_e), mask=valid)
 
 
-@triton.jit(do_not_specialize=["spread_a", "spread_e", "max_range", "count"])
+@triton.jit(do_not_specialize=["spread_a", "spread_e", "max_range", "count", "room"])
 @no_type_check
 def _project_backward(
     means, quats, scales, offsets, view, velocities, v_means2d, v_ranges, v_conics, v_slopes, v_means2d_last,
-    v_ranges_last, v_conics_last, v_slopes_last, v_means, v_quats, v_scales, spread_a, spread_e, max_range, count,
+    v_ranges_last, v_conics_last, v_slopes_last, v_means, v_quats, v_scales, spread_a, spread_e, max_range, count, room,
     WITH_MOTION: tl.constexpr, MOVING: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The gradients of Gaussians by those of the first and the last part of a revolution."""
@@ -174,7 +179,7 @@ def _project_backward(
     w, x, y, z, length = unit(quats, i, valid)
     rotation, size = rotation_rows(w, x, y, z), three(scales, i, valid)
     for part in tl.static_range(PARTS):
-        offset = tl.load(offsets + part * count.to(tl.int64) + i, mask=valid, other=0.0)
+        offset = tl.load(offsets + part * room.to(tl.int64) + i, mask=valid, other=0.0)
         given = (
             (v_means2d, v_ranges, v_conics, v_slopes) if part == 0
             else (v_means2d_last, v_ranges_last, v_conics_last, v_slopes_last)
