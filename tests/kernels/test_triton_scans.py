@@ -81,7 +81,7 @@ def test_every_size_of_scan_agrees(beams, firings):
     assert not disagreements(scene)
 
 
-@pytest.mark.parametrize("firings", [70, 71, 3, 1])
+@pytest.mark.parametrize("firings", [41, 3, 1])
 def test_moving_sensor_and_gaussians_agree(firings):
     """Also where the halves of a revolution have different numbers of firings, and where there is one half."""
     scene = random_scan(6, n=50, rays=uneven_rays(6, 4, firings))
