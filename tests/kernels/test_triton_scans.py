@@ -147,3 +147,16 @@ def test_the_gradient_of_the_pose_is_computed_without_triton():
     with patch.object(triton_support, "usable_for", lambda tensor: DEVICE.type == "cpu"):
         scene.render().alpha.sum().backward()
     assert pose.grad is not None and pose.grad.any()
+
+
+def test_alpha_before_ranges_of_another_type_is_the_same():
+    scene = random_scan(7, n=30, rays=even_rays(3, 40)).float()
+    on_device = {name: getattr(scene, name).to(DEVICE) for name in (*INPUTS, "world_to_sensor")}
+    rays = RayGrid(*(getattr(scene.rays, name).to(DEVICE) for name in RAYS))
+    before = torch.full_like(rays.azimuths, 6.0)
+    with patch.object(triton_support, "usable_for", lambda tensor: True):
+        single, double = (
+            replace(scene, **on_device, rays=rays).render("cpu", before=ranges).alpha_before
+            for ranges in (before, before.double())
+        )
+    assert single.any() and torch.equal(single, double)
