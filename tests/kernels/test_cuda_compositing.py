@@ -10,7 +10,7 @@ pytest.importorskip("triton", reason="Triton is not there for this system")
 from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses, gradients, lists_of_all_lengths
 
 from drivesplat.kernels import torch_private
-from drivesplat.kernels.cuda import compiled, compositing
+from drivesplat.kernels.cuda import compiled, compositing, scans
 from drivesplat.kernels.triton import chunks
 from drivesplat.kernels.triton.tiles import Footprints, tile_lists
 
@@ -20,7 +20,10 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
 @pytest.mark.parametrize(
     ("program", "channels"),
-    [*((compiled.IMAGES, count) for count in (1, 3, 4, 8)), *((compiled.SCANS, count) for count in (0, 2, 4, 8))],
+    [
+        *((compiled.IMAGES, count) for count in (1, 3, 4, chunks.MAX_VALUES)),
+        *((compiled.SCANS, count) for count in (0, 2, 4, scans.MAX_VALUES)),
+    ],
 )
 @pytest.mark.parametrize("capability", ["75", "80", "90", "120"])
 def test_they_compile_for_each_number_of_values_and_kind_of_gpu(program, channels, capability):
@@ -58,10 +61,8 @@ def test_where_they_do_not_compile_others_replace_them_with_a_warning(monkeypatc
     assert not compiled._compiles(compiled.SCANS, 0) and not compiled._compiles(compiled.SCANS, 0)
     compiled._compiles.cache_clear()
     (record,) = caplog.records
-    assert (
-        f"kernels of scans cannot be compiled ({str(error).splitlines()[0]})" in record.message
-        and "\n" not in record.message
-    )
+    assert f"kernels of scans cannot be compiled ({str(error).splitlines()[0]})" in record.message
+    assert "\n" not in record.message
 
 
 def test_kernels_read_the_addresses_of_tensors_and_the_values_of_integers(monkeypatch):

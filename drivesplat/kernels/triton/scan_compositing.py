@@ -61,7 +61,8 @@ class ScanCompositing(torch.autograd.Function):
         )
         range_sum, alpha, before, median = whole
         ctx.chunks, ctx.channels, ctx.count = chunks, channels, len(ranges)
-        read = means2d, ranges, conics, slopes, range_limits, opacities, values  # by the chunks: not to be changed
+        # `chunks` may read these again: saved here, so that torch notices if they have changed by then
+        read = means2d, ranges, conics, slopes, range_limits, opacities, values
         ctx.save_for_backward(*rays, passes, sums, range_sum, alpha, before, out, *read)
         ctx.mark_non_differentiable(median)
         return range_sum, alpha, before, out, median
