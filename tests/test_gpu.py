@@ -40,6 +40,7 @@ from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, n
 from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
 from drivesplat.model.background import Background
+from drivesplat.model.gaussians import concatenate
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
@@ -472,14 +473,14 @@ def test_frames_of_a_camera_of_the_rig_are_not_captured(street_film, captures):
 
 def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film, monkeypatch, caplog):
     model, views, expected = street_film
-    together = SplatModel.gaussians_at_time_states
+    of_states = SplatModel.sets_at_time_states
 
-    def counting(self, states):
-        found = together(self, states)
-        assert float(found.means.sum()) < 1e9
+    def waiting(self, states):
+        found = of_states(self, states)
+        assert all(float(own.means.sum()) < 1e9 for own in found)
         return found
 
-    monkeypatch.setattr(SplatModel, "gaussians_at_time_states", counting)
+    monkeypatch.setattr(SplatModel, "sets_at_time_states", waiting)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     (record,) = caplog.records
     assert record.message.startswith("frames of films cannot be captured as a CUDA graph")
@@ -628,14 +629,19 @@ def test_a_growing_training_learns_the_same_by_cuda_graphs():
 
 def test_each_replay_drops_out_other_gaussians():
     model = untrained_street(settings_of()).to(GPU)
-    gaussians = model.gaussians_at(0.5)
+    sets = model.sets_at(0.5)
+    before = concatenate(sets).opacities
+
+    def dropped_out() -> torch.Tensor:
+        return concatenate(with_dropout(sets, model, 0.5)).opacities
+
     with capture_stream(GPU), torch.no_grad():
-        graph = capture(lambda: with_dropout(gaussians, model, 0.5).opacities, [], new_pool(), GPU, "dropout")
+        graph = capture(dropped_out, [], new_pool(), GPU, "dropout")
         assert graph is not None
         left_out = []
         for _ in range(3):
             graph.replay()
-            left_out.append((graph.result != gaussians.opacities).clone())
+            left_out.append((graph.result != before).clone())
     torch.cuda.synchronize()
     assert all(a.any() and not torch.equal(a, b) for a, b in pairwise(left_out))
     trainer, losses = trained_with(True, dropout=0.1)

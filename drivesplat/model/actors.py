@@ -19,7 +19,7 @@ from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners,
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
 from drivesplat.model.actor_placements import placement_sets, with_placements
-from drivesplat.model.gaussians import Gaussians, concatenate, recolored
+from drivesplat.model.gaussians import Gaussians, concatenate, recolored, without_colors
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
@@ -103,6 +103,10 @@ class Actors(Part):
     def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
         state = TimeState(*time_state)
         return self.placed(state, self.poses(state))
+
+    def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+        state = TimeState(*time_state)
+        return without_colors(*place(self.local(state), self.poses(state), self.params["owner"], self._owns))
 
     def poses(self, state: TimeState) -> ObjectPoses:
         """The annotated poses of the actors with their learned corrections."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, without_colors
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part
 from drivesplat.settings.train import GaussianSettings
@@ -54,16 +54,25 @@ class Background(Part):
         )
 
     def seen_by_lidar(self, gaussians: Gaussians) -> Gaussians:
+        return replace(gaussians, **self._offset()) if self._has_offsets else gaussians
+
+    def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+        return without_colors(**self._offset()) if self._has_offsets else super().scanned_at_time_state(time_state)
+
+    @property
+    def _has_offsets(self) -> bool:
+        """Whether a LiDAR sees its Gaussians elsewhere than cameras do."""
+        return "lidar_means" in self.params
+
+    def _offset(self) -> dict[str, Tensor]:
+        """The fields of Gaussians that a LiDAR sees elsewhere than cameras do."""
         p = self.params
-        if "lidar_means" not in p:
-            return gaussians
-        return replace(
-            gaussians,
-            means=p["means"] + p["lidar_means"],
-            quats=p["quats"] + p["lidar_quats"],
-            scales=torch.exp(p["scales"] + p["lidar_scales"]),
-            opacities=torch.sigmoid(p["opacities"] + p["lidar_opacities"]),
-        )
+        return {
+            "means": p["means"] + p["lidar_means"],
+            "quats": p["quats"] + p["lidar_quats"],
+            "scales": torch.exp(p["scales"] + p["lidar_scales"]),
+            "opacities": torch.sigmoid(p["opacities"] + p["lidar_opacities"]),
+        }
 
     def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
         return self.params.get("echoes")

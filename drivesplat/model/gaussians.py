@@ -84,11 +84,12 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """The same Gaussians with spherical harmonics of at least this degree: coefficients that they lack are 0."""
-    lacking = max(0, (degree + 1) ** 2 - 1 - gaussians.shN.shape[1])
-    return replace(gaussians, shN=F.pad(gaussians.shN, (0, 0, 0, lacking)))
+    lacking = (degree + 1) ** 2 - 1 - gaussians.shN.shape[1]
+    return gaussians if lacking <= 0 else replace(gaussians, shN=F.pad(gaussians.shN, (0, 0, 0, lacking)))
 
 
-def with_constant_colors(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians with the colours of degree 0, for sensors that see none: copying all coefficients of a million
-    Gaussians takes time."""
-    return replace(gaussians, shN=gaussians.shN[:, :0])
+def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Gaussians:
+    """Gaussians whose coefficients are 0, of degree 0, for sensors that see no colours: copying the coefficients of a
+    million Gaussians takes time."""
+    black = means.new_zeros(1, 1, 3).expand(len(means), 1, 3)
+    return Gaussians(means, quats, scales, opacities, black, black[:, :0])

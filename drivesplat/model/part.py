@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, without_colors
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.scene.motion import HALF_STEP, Motion
@@ -158,6 +158,12 @@ class Part(nn.Module, ABC):
     def seen_by_lidar(self, gaussians: Gaussians) -> Gaussians:
         """Its Gaussians where a LiDAR sees them, by those that cameras see (`at`)."""
         return gaussians
+
+    def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+        """Its Gaussians where a LiDAR sees them, without colours and echoes, by a `time_state`. Depends on these
+        tensors alone, as `at_time_state`."""
+        seen = self.seen_by_lidar(self.at_time_state(time_state))
+        return without_colors(seen.means, seen.quats, seen.scales, seen.opacities)
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one

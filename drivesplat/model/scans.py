@@ -1,6 +1,7 @@
 """A LiDAR's revolution as a model sees it: a view of rays, and the scan that Gaussians give."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.kernels.echoes import echo_values
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
 from drivesplat.scene.scan import RenderedScan
@@ -47,11 +48,12 @@ class ScanView:
 
 @dataclass(frozen=True)
 class ScanPicture:
-    """What b beams and a firings measure of `gaussians`. `range` in metres, 0 where nothing is met; `returned`, the
-    probability of a return; `intensity` in [0, 1]; `alpha`, of all that is met, and `alpha_before`, of what is nearer
-    than given ranges (None: none were given)."""
+    """What b beams and a firings measure of `gaussians`, which are `sets` one after the other, without their echoes.
+    `range` in metres, 0 where nothing is met; `returned`, the probability of a return; `intensity` in [0, 1]; `alpha`,
+    of all that is met, and `alpha_before`, of what is nearer than given ranges (None: none were given)."""
 
     gaussians: Gaussians
+    sets: Sequence[Gaussians]
     range: Float[Tensor, "b a"]
     returned: Float[Tensor, "b a"]
     intensity: Float[Tensor, "b a"]
@@ -73,18 +75,22 @@ def view_of_scan(recorded: RecordedScan, beam_spread: tuple[float, float], devic
     return ScanView(pose, rays, linear, angular, recorded.seconds, beam_spread, blocked)
 
 
-def scan_picture(gaussians: Gaussians, view: ScanView, before: Float[Tensor, "b a"] | None = None) -> ScanPicture:
-    """The scan of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets nothing, or
-    that the vehicle blocks, is not returned. Raises ResultError for Gaussians without echoes."""
-    if gaussians.echoes is None:
-        raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
-    values = echo_values(gaussians.echoes, gaussians.means, view.sensor_to_world[:3, 3])
-    rendering = _rasterized(gaussians, view, values, before)
+def scan_picture(sets: Sequence[Gaussians], view: ScanView, before: Float[Tensor, "b a"] | None = None) -> ScanPicture:
+    """The scan of sets of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets
+    nothing, or that the vehicle blocks, is not returned. Raises ResultError for Gaussians without echoes."""
+    values, sensor = [], view.sensor_to_world[:3, 3]
+    for own in sets:  # two values of each Gaussian are concatenated, not its eight echoes
+        if own.echoes is None:
+            raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
+        values.append(echo_values(own.echoes, own.means, sensor))
+    gaussians = concatenate([replace(own, echoes=None) for own in sets])
+    rendering = _rasterized(gaussians, view, torch.cat(values), before)
     intensity, returned = rendering.values.unbind(dim=-1)
     if view.blocked is not None:
         returned = torch.where(view.blocked, 0.0, returned)
     met = rendering.alpha.clamp(min=NOTHING)
-    return ScanPicture(gaussians, rendering.range, returned, intensity / met, rendering.alpha, rendering.alpha_before)
+    nearer = rendering.alpha_before
+    return ScanPicture(gaussians, sets, rendering.range, returned, intensity / met, rendering.alpha, nearer)
 
 
 def group_met(gaussians: Gaussians, view: ScanView, groups: Int[Tensor, " n"]) -> Int[Tensor, "b a"]:

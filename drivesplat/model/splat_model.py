@@ -13,7 +13,7 @@ from drivesplat.errors import ResultError
 from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
-from drivesplat.model.gaussians import Gaussians, concatenate, with_constant_colors
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.view import View, depth_at_lines, where_seen
@@ -23,10 +23,12 @@ from drivesplat.scene.motion import HALF_STEP
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendering of `gaussians`: `image` with sky and the exposure of the view's camera; `splats` without sky in the
-    model's own colours (premultiplied by their `alpha`), `depth` in metres or None."""
+    """A rendering of `gaussians`, which are `sets` one after the other: `image` with sky and the exposure of the view's
+    camera; `splats` without sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or
+    None."""
 
     gaussians: Gaussians
+    sets: Sequence[Gaussians]
     image: Float[Tensor, "h w 3"]
     splats: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
@@ -98,35 +100,38 @@ class SplatModel(nn.Module):
     def gaussians_at(self, time: float, with_velocities: bool = False, with_echoes: bool = False) -> Gaussians:
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order;
         `with_velocities` of those that move, which rolling shutters and LiDARs need, and `with_echoes` for LiDARs."""
+        return concatenate(self.sets_at(time, with_velocities, with_echoes))
+
+    def sets_at(self, time: float, with_velocities: bool = False, with_echoes: bool = False) -> list[Gaussians]:
+        """As `gaussians_at`, the set of each part."""
         found = []
         for part in self.parts:
             velocities = part.velocities(time) if with_velocities else None
             shown = part.seen_by_lidar(part.at(time)) if with_echoes else part.at(time)
             found.append(replace(shown, velocities=velocities, echoes=part.echoes(time) if with_echoes else None))
-        return concatenate(found)
+        return found
 
     def time_states(self, time: float) -> TimeStates | None:
         """The time state of every part: see `Part.time_state`. None where one has none."""
         states = [part.time_state(time) for part in self.parts]
         return None if any(state is None for state in states) else states
 
-    def gaussians_at_time_states(self, states: TimeStates) -> Gaussians:
-        """As `gaussians_at`, by the parts' time states."""
-        return concatenate([part.at_time_state(state) for part, state in zip(self.parts, states, strict=True)])
+    def sets_at_time_states(self, states: TimeStates) -> list[Gaussians]:
+        """As `sets_at`, by the parts' time states."""
+        return [part.at_time_state(state) for part, state in zip(self.parts, states, strict=True)]
 
     def scan_states(self, time: float) -> ScanTimeStates | None:
         """The time states that a scan at a time depends on; None where a part has none."""
         now, before, after = (self.time_states(at) for at in ScanTimeStates.times(time))
         return None if now is None or before is None or after is None else ScanTimeStates(now, before, after)
 
-    def gaussians_at_scan_states(self, states: ScanTimeStates) -> Gaussians:
-        """As `gaussians_at` with velocities and echoes and with constant colours, by the parts' time states."""
+    def sets_at_scan_states(self, states: ScanTimeStates) -> list[Gaussians]:
+        """As `sets_at` with velocities and echoes, but without colours, by the parts' time states."""
         found = []
         for part, now, before, after in zip(self.parts, *states, strict=True):
-            shown = with_constant_colors(part.seen_by_lidar(part.at_time_state(now)))
-            velocities, echoes = part.velocities_between(before, after), part.echoes_at_time_state(now)
-            found.append(replace(shown, velocities=velocities, echoes=echoes))
-        return concatenate(found)
+            shown, echoes = part.scanned_at_time_state(now), part.echoes_at_time_state(now)
+            found.append(replace(shown, velocities=part.velocities_between(before, after), echoes=echoes))
+        return found
 
     def gaussians_with_placements(
         self,
@@ -200,15 +205,16 @@ class SplatModel(nn.Module):
         view: View,
         sh_degree: int | None = None,
         *,
-        gaussians: Gaussians | None = None,
+        gaussians: Gaussians | Sequence[Gaussians] | None = None,
         absgrad: bool = False,
         with_depth: bool = False,
     ) -> Picture:
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
-        `gaussians` replace `gaussians_in(view)`.
+        `gaussians`, a set or several, replace `sets_in(view)`.
         """
-        shown = self.gaussians_in(view) if gaussians is None else gaussians
+        sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
+        shown = concatenate(sets)
         seen_from = self.seen_from(view)
         colors, degree = _colors(shown, seen_from, sh_degree)
         means, scales = where_seen(shown, seen_from)
@@ -224,22 +230,31 @@ class SplatModel(nn.Module):
         if self.exposure is not None:
             image = self.exposure.applied(image, view.camera)
         depth = None if rendering.depth is None else depth_at_lines(rendering.depth[0, ..., 0], seen_from)
-        return Picture(shown, image, splats, alpha[..., 0], depth, rendering.info)
+        return Picture(shown, sets, image, splats, alpha[..., 0], depth, rendering.info)
 
     def scan(
-        self, view: ScanView, *, gaussians: Gaussians | None = None, before: Float[Tensor, "b a"] | None = None
+        self,
+        view: ScanView,
+        *,
+        gaussians: Gaussians | Sequence[Gaussians] | None = None,
+        before: Float[Tensor, "b a"] | None = None,
     ) -> ScanPicture:
-        """What a LiDAR measures in a revolution. `gaussians` replace the model's own; `before`: see `scan_picture`.
+        """What a LiDAR measures in a revolution. `gaussians`, a set or several, replace the model's own; `before`: see
+        `scan_picture`.
 
         Raises ResultError for a model that was trained without LiDAR.
         """
         if gaussians is None:
-            gaussians = self.gaussians_at(view.time, with_velocities=True, with_echoes=True)
-        return scan_picture(gaussians, view, before)
+            gaussians = self.sets_at(view.time, with_velocities=True, with_echoes=True)
+        return scan_picture(_sets(gaussians), view, before)
 
     def gaussians_in(self, view: View) -> Gaussians:
         """The Gaussians that `render` shows in a view."""
-        return self.gaussians_at(view.time, with_velocities=self.rolling_shutter and view.shutter is not None)
+        return concatenate(self.sets_in(view))
+
+    def sets_in(self, view: View) -> list[Gaussians]:
+        """As `gaussians_in`, the set of each part."""
+        return self.sets_at(view.time, with_velocities=self.rolling_shutter and view.shutter is not None)
 
     def seen_from(self, view: View) -> View:
         """The view from its camera's corrected pose, where this model corrects poses, and without rolling shutter,
@@ -248,9 +263,9 @@ class SplatModel(nn.Module):
         return shown if self.camera_poses is None else self.camera_poses.corrected(shown)
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
-        """The alpha of the parts with objects rendered alone, for a picture of this model; None without such parts."""
-        of_parts = zip(self.parts, self.rows, strict=True)
-        objects = [picture.gaussians[rows] for part, rows in of_parts if part.has_objects]
+        """The alpha of the parts with objects rendered alone, for a picture with a set of each part; None without such
+        parts."""
+        objects = [own for part, own in zip(self.parts, picture.sets, strict=True) if part.has_objects]
         if not objects:
             return None
         alone = concatenate(objects)
@@ -270,6 +285,10 @@ class SplatModel(nn.Module):
             means, gaussians.quats, scales, gaussians.opacities, values,
             seen_from.viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
         )  # fmt: skip
+
+
+def _sets(gaussians: Gaussians | Sequence[Gaussians]) -> Sequence[Gaussians]:
+    return [gaussians] if isinstance(gaussians, Gaussians) else gaussians
 
 
 def _colors(gaussians: Gaussians, view: View, sh_degree: int | None) -> tuple[Tensor, int | None]:

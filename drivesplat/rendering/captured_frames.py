@@ -140,7 +140,7 @@ class _FrameGraph:
         own_states = [[values.clone() for values in state] for state in states]
 
         def render() -> RenderedFrame:
-            return _render(model, own_view, model.gaussians_at_time_states(own_states))
+            return _render(model, own_view, model.sets_at_time_states(own_states))
 
         pool = new_pool()
         with capture_stream(device):  # a second thread encodes the film meanwhile
@@ -162,7 +162,7 @@ class _FrameGraph:
         return self.graph
 
 
-def _render(model: SplatModel, view: View, gaussians: Gaussians | None) -> RenderedFrame:
+def _render(model: SplatModel, view: View, gaussians: Gaussians | Sequence[Gaussians] | None) -> RenderedFrame:
     """A frame of a view, on the device."""
     image = model.render(view, gaussians=gaussians).image
     return RenderedFrame(to_uint8(image), torch.isfinite(image).all())

@@ -1,5 +1,6 @@
 """Dropout of Gaussians: each iteration with an image leaves some of them out at random."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -18,15 +19,15 @@ def dropout_share(record: TrainingRecord, settings: TrainSettings) -> float:
     return settings.dropout * min(1.0, settings.dropout_images * cameras / max(1, len(images)))
 
 
-def with_dropout(gaussians: Gaussians, model: SplatModel, share: float) -> Gaussians:
-    """The Gaussians of a model with a random `share` of those of its static parts left out: their opacity is 0.
+def with_dropout(sets: Sequence[Gaussians], model: SplatModel, share: float) -> list[Gaussians]:
+    """The sets of Gaussians of a model's parts, with a random `share` of static ones left out: their opacity is 0.
 
     As DropGaussian (Park et al., CVPR 2025), but with a constant share and without raising the opacity of the others.
     Loss terms that ignore Gaussians of opacity 0 (opacity, scale, road) ignore these, too, and pictures of the training
     lack them. Uses torch's global random generator. No host synchronisation.
     """
-    kept = torch.rand_like(gaussians.opacities) >= share
-    for part, rows in zip(model.parts, model.rows, strict=True):
-        if part.moves:
-            kept[rows] = True
-    return replace(gaussians, opacities=gaussians.opacities * kept)
+    found = []
+    for part, own in zip(model.parts, sets, strict=True):
+        kept = 1.0 if part.moves else torch.rand_like(own.opacities) >= share
+        found.append(own if part.moves else replace(own, opacities=own.opacities * kept))
+    return found

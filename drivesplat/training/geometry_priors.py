@@ -1,11 +1,13 @@
 """Geometry known beside the images, free space and road, and the loss terms of surfaces: flatness and road."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.regularizers import mean_thickness
 from drivesplat.kernels.road_distance import Road, road_distance
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.free_space_record import FreeSpace
@@ -42,25 +44,21 @@ def geometry_priors(record: TrainingRecord, space: FreeSpace | None, settings: T
 
 
 def geometry_terms(
-    gaussians: Gaussians, model: SplatModel, priors: GeometryPriors, settings: TrainSettings
+    sets: Sequence[Gaussians], model: SplatModel, priors: GeometryPriors, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The weighted loss terms of the surfaces of static parts, from all `gaussians` of the model at one time."""
+    """The weighted loss terms of the surfaces of static parts, from the `sets` of Gaussians of all parts at one
+    time."""
     if not settings.flatness_weight and priors.road is None:
         return {}
-    parts = [(part, rows) for part, rows in zip(model.parts, model.rows, strict=True) if not part.moves]
-    static = concatenate([gaussians[rows] for _, rows in parts])
+    parts = [(part, own) for part, own in zip(model.parts, sets, strict=True) if not part.moves]
+    static = concatenate([own for _, own in parts])
     terms = {}
     if settings.flatness_weight:
-        terms["flatness"] = settings.flatness_weight * thickness(static) / active_fraction([part for part, _ in parts])
+        thickness = mean_thickness(static.scales)
+        terms["flatness"] = settings.flatness_weight * thickness / active_fraction([part for part, _ in parts])
     if priors.road is not None:
         terms["road"] = settings.road_weight * road_loss(static, priors.road)
     return terms
-
-
-def thickness(gaussians: Gaussians) -> Float[Tensor, ""]:
-    """The mean smallest scale in metres, 0 for disc-shaped Gaussians: the regulariser of NeuSG (Chen et al. 2023,
-    arXiv 2312.00846) and PGSR (Chen et al. 2024, arXiv 2406.06521)."""
-    return gaussians.scales.min(dim=1).values.mean()
 
 
 def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:

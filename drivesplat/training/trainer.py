@@ -179,22 +179,19 @@ class Trainer:
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # gradients of an iteration that ran out of memory
         with stage("render"):
-            if states is None:
-                gaussians = self.model.gaussians_in(view.view)
-            else:
-                gaussians = self.model.gaussians_at_time_states(states)
+            sets = self.model.sets_in(view.view) if states is None else self.model.sets_at_time_states(states)
             if self.settings.dropout:
-                gaussians = with_dropout(gaussians, self.model, self.settings.dropout)
+                sets = with_dropout(sets, self.model, self.settings.dropout)
             picture = self.model.render(
                 view.view,
                 self.sh_degree(),
-                gaussians=gaussians,
+                gaussians=sets,
                 absgrad=by_gradient and self.settings.default.absgrad,
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self._image_settings())
-            terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
+            terms |= geometry_terms(picture.sets, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
         if by_gradient:
             picture.info["means2d"].retain_grad()
@@ -212,12 +209,12 @@ class Trainer:
         self.model.zero_grad()
         with stage("render"):
             before = (scan.range - settings.sight_margin).clamp(min=0.0) if settings.sight_weight else None
-            gaussians = None if states is None else self.model.gaussians_at_scan_states(states)
-            picture = self.model.scan(scan.view, gaussians=gaussians, before=before)
+            sets = None if states is None else self.model.sets_at_scan_states(states)
+            picture = self.model.scan(scan.view, gaussians=sets, before=before)
         with stage("loss"):
             terms = scan_terms(picture, scan, self.model, self.settings)
             if not self.images.views:
-                terms |= geometry_terms(picture.gaussians, self.model, self.priors, self.settings)
+                terms |= geometry_terms(picture.sets, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
         return self._follow(loss, terms, step, rates, self._limit_gradients)
 

@@ -29,7 +29,7 @@ from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
 from drivesplat.kernels.quaternions import rotation_matrix
-from drivesplat.kernels.regularizers import mean_opacity_and_scale
+from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness
 from drivesplat.kernels.road_distance import Road, road_distance
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.kernels.time_varying_colors import colors_in_world
@@ -166,6 +166,19 @@ def test_regularized_means_and_their_gradients_agree_with_torch():
     expected, found = both_ways(mean_opacity_and_scale, *inputs)
     torch.testing.assert_close(found, expected)
     assert_same_gradients([expected, found], inputs, atol=1e-9, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 1500])
+def test_the_mean_thickness_and_its_gradient_agree_with_torch(count):
+    torch.manual_seed(count)
+    scales = torch.rand(count, 3, device=DEVICE).requires_grad_()
+    expected, found = both_ways(lambda: [mean_thickness(scales)])
+    torch.testing.assert_close(found, expected)
+    assert_same_gradients([expected, found], [scales], atol=1e-9, rtol=1e-5)
+    broken = scales.detach().clone()
+    broken[0, 1] = torch.nan
+    with triton(True):
+        assert mean_thickness(broken).isnan()
 
 
 @pytest.mark.parametrize("count", [0, 1, 700])

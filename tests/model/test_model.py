@@ -273,7 +273,7 @@ def test_gaussians_follow_the_time_state_copied_into_the_tensors():
         for places, state in zip(lying, states, strict=True):
             for place, values in zip(places, state, strict=True):
                 place.copy_(values)
-        found, expected = model.gaussians_at_time_states(lying), model.gaussians_at(time)
+        found, expected = concatenate(model.sets_at_time_states(lying)), model.gaussians_at(time)
         assert all(torch.equal(values, expected.tensors[name]) for name, values in found.tensors.items())
     assert not torch.equal(model.gaussians_at(0.3).means, model.gaussians_at(1.6).means)
 

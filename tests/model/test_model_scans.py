@@ -11,7 +11,7 @@ from torch import nn
 
 from drivesplat.errors import ResultError
 from drivesplat.kernels import torch_private
-from drivesplat.model.gaussians import concatenate, with_constant_colors
+from drivesplat.model.gaussians import concatenate
 from drivesplat.model.scans import ScanView, group_met, scan_picture, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rasterization.scans import RayGrid
@@ -117,7 +117,7 @@ def test_the_echoes_of_an_actor_turn_with_it():
 
 
 def test_gaussians_follow_the_time_states_copied_into_the_tensors():
-    """With what they echo and how fast they move then, in constant colours."""
+    """With what they echo and how fast they move then, without colours."""
     motion = motion_through([0.0, 2.0, 4.0], [[10.0, 0.0, 1.0], [14.0, 0.0, 1.0], [26.0, 3.0, 1.0]], [0.0, 0.5, 1.0])
     actors = actors_of(track_of(motion), count=4)
     actors.params["echoes"] = nn.Parameter(torch.randn(4, 4, 2, generator=torch.Generator().manual_seed(0)))
@@ -126,11 +126,11 @@ def test_gaussians_follow_the_time_states_copied_into_the_tensors():
     inputs = early.copied()
     for time, states in ((0.5, early), (3.2, late)):
         torch_private.copy_all(inputs.tensors, states.tensors)
-        found = model.gaussians_at_scan_states(inputs)
-        expected = with_constant_colors(model.gaussians_at(time, with_velocities=True, with_echoes=True))
-        assert found.shN.numel() == 0
-        assert found.tensors.keys() == expected.tensors.keys() >= {"velocities", "echoes"}
-        assert all(torch.equal(values, expected.tensors[name]) for name, values in found.tensors.items())
+        found = concatenate(model.sets_at_scan_states(inputs)).tensors
+        expected = model.gaussians_at(time, with_velocities=True, with_echoes=True).tensors
+        assert found.keys() == expected.keys() >= {"velocities", "echoes"}
+        assert not found.pop("sh0").any() and found.pop("shN").numel() == 0
+        assert all(torch.equal(values, expected[name]) for name, values in found.items())
 
 
 def test_alpha_before_a_range_is_that_of_what_is_nearer():
@@ -163,7 +163,7 @@ def test_a_model_trained_without_lidar_is_refused():
     gaussians = walls().gaussians_at(0.0)
     assert gaussians.echoes is None, "images need no echoes"
     with pytest.raises(ResultError):
-        scan_picture(gaussians, view())
+        scan_picture([gaussians], view())
 
 
 def test_rays_that_the_vehicle_blocks_do_not_return():

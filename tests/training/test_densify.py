@@ -336,7 +336,7 @@ def test_each_part_grows_by_the_gradients_of_its_own_rows(wanting):
     strengths, nothing = torch.zeros(70), torch.zeros(24, 32, 3)
     strengths[wanting] = 1.0
     before, together = [len(part) for part in model.parts], model.gaussians_at(0.0)
-    trainer.densify(Picture(together, nothing, nothing, nothing[..., 0], None, screen_gradients(strengths)))
+    trainer.densify(Picture(together, [together], nothing, nothing, nothing[..., 0], None, screen_gradients(strengths)))
     grown = [part.at(0.0)[count:] for part, count in zip(model.parts, before, strict=True)]
     assert torch.equal(torch.cat([new.means for new in grown]), together.means[wanting])
     assert len(grown[0]) == sum(row < 30 for row in wanting)

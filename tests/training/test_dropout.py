@@ -6,6 +6,7 @@ import torch
 from helpers.records import training_record_of
 from helpers.trainings import inputs_in, job_of, settings_of, untrained_street
 
+from drivesplat.model.gaussians import concatenate
 from drivesplat.training.dropout import dropout_share, with_dropout
 from drivesplat.training.run import prepare
 
@@ -14,20 +15,21 @@ from drivesplat.training.run import prepare
 def test_a_random_share_of_the_static_gaussians_is_left_out(share):
     torch.manual_seed(0)
     model = untrained_street(settings_of())
-    gaussians, moving = model.gaussians_at(0.5), model.moving()
-    left_out = torch.stack([with_dropout(gaussians, model, share).opacities != gaussians.opacities for _ in range(400)])
+    sets, moving = model.sets_at(0.5), model.moving()
+    gaussians = concatenate(sets)
+    shown = [concatenate(with_dropout(sets, model, share)) for _ in range(400)]
+    left_out = torch.stack([some.opacities != gaussians.opacities for some in shown])
     assert not left_out[:, moving].any()
     often = left_out[:, ~moving].float().mean(dim=0)
     assert float(often.mean()) == pytest.approx(share, abs=0.02) and float((often - share).abs().max()) < 0.15
-    once = with_dropout(gaussians, model, share)
+    once = shown[0]
     assert set(once.opacities[once.opacities != gaussians.opacities].tolist()) == {0.0}
 
 
 def test_gaussians_left_out_get_no_gradient():
     torch.manual_seed(1)
     model = untrained_street(settings_of())
-    gaussians = model.gaussians_at(0.5)
-    shown = with_dropout(gaussians, model, 0.5)
+    shown = concatenate(with_dropout(model.sets_at(0.5), model, 0.5))
     shown.opacities.sum().backward()
     static = model.parts[0].params["opacities"]
     left_out = shown.opacities[model.rows[0]] == 0.0

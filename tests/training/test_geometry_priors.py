@@ -9,6 +9,7 @@ from helpers.hand_made import actors_of, looking_at, motion_through, round_gauss
 from helpers.records import training_record_of
 from scipy.spatial.transform import Rotation
 
+from drivesplat.kernels.regularizers import mean_thickness
 from drivesplat.kernels.road_distance import ROUGHNESS, Road
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
@@ -24,7 +25,6 @@ from drivesplat.training.geometry_priors import (
     geometry_priors,
     geometry_terms,
     road_loss,
-    thickness,
 )
 from drivesplat.training.road import CELL, driven_road, lidar_road, road_of
 
@@ -253,7 +253,7 @@ def known() -> GeometryPriors:
 def test_terms_are_weighted_and_apply_to_static_parts_only():
     model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
-    terms = geometry_terms(picture.gaussians, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
+    terms = geometry_terms(picture.sets, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
     still = model.parts[0].at(0.0)
     torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
     torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known().road))
@@ -269,11 +269,11 @@ def test_without_their_weights_there_are_no_terms():
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
     plain = TrainSettings()
     assert geometry_priors(record, None, plain) == NO_PRIORS
-    assert geometry_terms(picture.gaussians, model, geometry_priors(record, None, plain), plain) == {}
+    assert geometry_terms(picture.sets, model, geometry_priors(record, None, plain), plain) == {}
     for changes, term in (({"flatness_weight": 0.1}, "flatness"), ({"road_weight": 0.1}, "road")):
         settings = TrainSettings(**changes)
         priors = geometry_priors(record, None, settings)
-        assert geometry_terms(picture.gaussians, model, priors, settings).keys() == {term}
+        assert geometry_terms(picture.sets, model, priors, settings).keys() == {term}
     assert geometry_priors(training_record_of(0), None, TrainSettings(road_weight=0.1)) == NO_PRIORS
 
 
@@ -281,7 +281,7 @@ def test_flatness_makes_the_shortest_axis_shorter_and_no_other():
     part = round_gaussians(np.zeros((2, 3)), sizes=0.2)
     with torch.no_grad():
         part.params["scales"] += torch.log(torch.tensor([[1.0, 0.5, 2.0], [3.0, 2.0, 0.25]]))
-    flat = thickness(part.at(0.0))
+    flat = mean_thickness(part.at(0.0).scales)
     assert float(flat.detach()) == pytest.approx(0.2 * (0.5 + 0.25) / 2)
     flat.backward()
     assert (part.params["scales"].grad > 0).tolist() == [[False, True, False], [False, False, True]]

@@ -139,7 +139,7 @@ def test_preallocated_rows_do_not_change_the_loss():
 def test_preallocated_rows_do_not_change_flatness():
     model, _, _, _ = grown(True, 4)
     part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
-    found = geometry_terms(model.render(a_view()).gaussians, model, NO_PRIORS, settings)
+    found = geometry_terms(model.render(a_view()).sets, model, NO_PRIORS, settings)
     expected = part.at(0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
     assert part.preallocated and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
 

@@ -32,8 +32,8 @@ def revolution(x: float, seconds: float) -> RecordedScan:
 
 def terms_of(model: SplatModel, scan: TrainingScan, inputs: ScanInputs | None = None) -> dict[str, float]:
     """The loss terms of a scan; with `inputs` by their tensors alone."""
-    gaussians = None if inputs is None else model.gaussians_at_scan_states(inputs.states)
-    picture = model.scan(scan.view, gaussians=gaussians, before=scan.range - 0.5)
+    sets = None if inputs is None else model.sets_at_scan_states(inputs.states)
+    picture = model.scan(scan.view, gaussians=sets, before=scan.range - 0.5)
     return {name: float(value.detach()) for name, value in scan_terms(picture, scan, model, SETTINGS).items()}
 
 

@@ -53,7 +53,7 @@ def picture_of(scan, **changes) -> ScanPicture:
     gaussians = round_gaussians([[0.0, 0.0, 5.0]]).at(0.0)
     ones = torch.ones_like(scan.range)
     exact = {"range": scan.range, "returned": scan.returned.float(), "intensity": scan.intensity, "alpha": ones}
-    return ScanPicture(**{"gaussians": gaussians, **exact, "alpha_before": 0.0 * ones, **changes})
+    return ScanPicture(**{"gaussians": gaussians, "sets": [gaussians], **exact, "alpha_before": 0.0 * ones, **changes})
 
 
 def terms_of(picture: ScanPicture, scan, **weights) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The mean opacity and scale of Gaussians in one pass, and their gradients in another."""
+"""The mean opacity and scale of Gaussians, or their mean thickness, in one pass, and the gradients in another."""
 
 from typing import Any, no_type_check
 
@@ -8,8 +8,12 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from drivesplat.kernels.triton.rows import store_three, three
+
 BLOCK = 1024
 """Gaussians per program."""
+NAN = tl.constexpr(tl.PropagateNan.ALL)
+"""Makes a minimum with NaN NaN, as torch's is."""
 
 
 class MeanOpacityAndScale(torch.autograd.Function):
@@ -33,6 +37,49 @@ class MeanOpacityAndScale(torch.autograd.Function):
         v_opacities, v_scales = torch.empty_like(opacities), opacities.new_empty(count, 3)
         _spread[(triton.cdiv(count, BLOCK),)](opacities, v_opacity, v_scale, v_opacities, v_scales, count, BLOCK)
         return v_opacities, v_scales
+
+
+class MeanThickness(torch.autograd.Function):
+    """`drivesplat.kernels.regularizers.mean_thickness`, of at least one Gaussian."""
+
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor) -> Tensor:
+        scales, count = scales.contiguous(), len(scales)
+        blocks = triton.cdiv(count, BLOCK)
+        partial = scales.new_empty(blocks)
+        _thinnest[(blocks,)](scales, partial, count, BLOCK)
+        ctx.save_for_backward(scales)
+        return partial.sum() / count
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_thickness: Tensor) -> Tensor:
+        (scales,) = ctx.saved_tensors
+        v_scales = torch.empty_like(scales)
+        _spread_to_thinnest[(triton.cdiv(len(scales), BLOCK),)](scales, v_thickness, v_scales, len(scales), BLOCK)
+        return v_scales
+
+
+@triton.jit(do_not_specialize=["count"])
+@no_type_check
+def _thinnest(scales, partial, count, BLOCK: tl.constexpr):
+    """A block's sum of smallest scales."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    x, y, z = three(scales, i, i < count)
+    thinnest = tl.minimum(tl.minimum(x, y, NAN), z, NAN)
+    tl.store(partial + tl.program_id(0), tl.sum(thinnest))
+
+
+@triton.jit(do_not_specialize=["count"])
+@no_type_check
+def _spread_to_thinnest(scales, v_thickness, v_scales, count, BLOCK: tl.constexpr):
+    """Writes the gradients of scales: that of the smallest one, the first of equal ones, is not 0."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside, share = i < count, tl.load(v_thickness) / count
+    x, y, z = three(scales, i, inside)
+    by_x, by_y = (x <= y) & (x <= z), (y < x) & (y <= z)
+    by_z = ~by_x & ~by_y
+    store_three(v_scales, i, tl.where(by_x, share, 0.0), tl.where(by_y, share, 0.0), tl.where(by_z, share, 0.0), inside)
 
 
 @triton.jit(do_not_specialize=["count"])
