@@ -106,7 +106,9 @@ class Actors(Part):
 
     def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
         state = TimeState(*time_state)
-        return without_colors(*place(self.local(state), self.poses(state), self.params["owner"], self._owns))
+        poses, owner, owns = self.poses(state), self.params["owner"], self._owns
+        echoes = self._echoes(poses) if "echoes" in self.params else None
+        return without_colors(*place(self.local(state), poses, owner, owns), echoes)
 
     def poses(self, state: TimeState) -> ObjectPoses:
         """The annotated poses of the actors with their learned corrections."""

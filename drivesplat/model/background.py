@@ -57,7 +57,9 @@ class Background(Part):
         return replace(gaussians, **self._offset()) if self._has_offsets else gaussians
 
     def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
-        return without_colors(**self._offset()) if self._has_offsets else super().scanned_at_time_state(time_state)
+        if not self._has_offsets:
+            return super().scanned_at_time_state(time_state)
+        return without_colors(**self._offset(), echoes=self.echoes_at_time_state(time_state))
 
     @property
     def _has_offsets(self) -> bool:

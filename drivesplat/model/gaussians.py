@@ -88,8 +88,8 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     return gaussians if lacking <= 0 else replace(gaussians, shN=F.pad(gaussians.shN, (0, 0, 0, lacking)))
 
 
-def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Gaussians:
+def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, echoes: Tensor | None) -> Gaussians:
     """Gaussians whose coefficients are 0, of degree 0, for sensors that see no colours: copying the coefficients of a
     million Gaussians takes time."""
     black = means.new_zeros(1, 1, 3).expand(len(means), 1, 3)
-    return Gaussians(means, quats, scales, opacities, black, black[:, :0])
+    return Gaussians(means, quats, scales, opacities, black, black[:, :0], echoes=echoes)

@@ -160,10 +160,10 @@ class Part(nn.Module, ABC):
         return gaussians
 
     def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
-        """Its Gaussians where a LiDAR sees them, without colours and echoes, by a `time_state`. Depends on these
+        """Its Gaussians where a LiDAR sees them, with echoes but without colours, by a `time_state`. Depends on these
         tensors alone, as `at_time_state`."""
-        seen = self.seen_by_lidar(self.at_time_state(time_state))
-        return without_colors(seen.means, seen.quats, seen.scales, seen.opacities)
+        seen, echoes = self.seen_by_lidar(self.at_time_state(time_state)), self.echoes_at_time_state(time_state)
+        return without_colors(seen.means, seen.quats, seen.scales, seen.opacities, echoes)
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one

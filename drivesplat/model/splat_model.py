@@ -127,11 +127,10 @@ class SplatModel(nn.Module):
 
     def sets_at_scan_states(self, states: ScanTimeStates) -> list[Gaussians]:
         """As `sets_at` with velocities and echoes, but without colours, by the parts' time states."""
-        found = []
-        for part, now, before, after in zip(self.parts, *states, strict=True):
-            shown, echoes = part.scanned_at_time_state(now), part.echoes_at_time_state(now)
-            found.append(replace(shown, velocities=part.velocities_between(before, after), echoes=echoes))
-        return found
+        return [
+            replace(part.scanned_at_time_state(now), velocities=part.velocities_between(before, after))
+            for part, now, before, after in zip(self.parts, *states, strict=True)
+        ]
 
     def gaussians_with_placements(
         self,

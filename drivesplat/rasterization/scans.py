@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -43,7 +44,7 @@ class RayGrid:
         order = times.argsort(stable=True)
         firings = [half for half in order.tensor_split(2) if len(half)]
         parts = [ScanPart(*(values[:, half] for values in self.rays)) for half in firings]
-        return Halves(parts, firings, None if bool((times.diff() >= 0).all()) else order.argsort())
+        return Halves(parts, order, firings, None if bool((times.diff() >= 0).all()) else order.argsort())
 
     @property
     def rays(self) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"], Float[Tensor, "b a"]]:
@@ -58,10 +59,11 @@ class RayGrid:
 
 @dataclass(frozen=True)
 class Halves:
-    """The halves of a revolution as `parts`, the firings that each has in the scan, and the places of all firings of
-    the scan in the halves one after the other, unless they are in this order."""
+    """The halves of a revolution as `parts`, the firings of the scan in the `order` of their times, those that each
+    half has, and the places of all firings of the scan in this order, unless the scan has it."""
 
     parts: list[ScanPart]
+    order: Int[Tensor, " a"]
     firings: list[Int[Tensor, " _"]]
     places: Int[Tensor, " a"] | None
 
@@ -69,7 +71,7 @@ class Halves:
     def tensors(self) -> list[Tensor]:
         """All tensors, in a fixed order."""
         places = [] if self.places is None else [self.places]
-        return [*(values for part in self.parts for values in part.tensors), *self.firings, *places]
+        return [*(values for part in self.parts for values in part.tensors), self.order, *self.firings, *places]
 
     def revolutions(self, motion: "ScanMotion") -> list[Revolution]:
         """The motion during each half."""
@@ -77,8 +79,25 @@ class Halves:
 
     def joined(self, parts: Sequence[CompositedScan]) -> CompositedScan:
         """What the rays of the scan measure, by that of the parts."""
-        whole = (torch.cat(values, dim=1) for values in zip(*parts, strict=True))
-        return CompositedScan(*(values if self.places is None else values[:, self.places] for values in whole))
+        whole = [torch.cat(values, dim=1) for values in zip(*parts, strict=True)]
+        if self.places is None:
+            return CompositedScan(*whole)
+        return CompositedScan(*(_Permuted.apply(values, self.places, self.order) for values in whole))
+
+
+class _Permuted(torch.autograd.Function):
+    """The columns of an array at `places`, which are all columns in another order: its `inverse` gathers gradients,
+    where torch, which does not know that no place occurs twice, sorts them."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, places: Tensor, inverse: Tensor) -> Tensor:
+        ctx.save_for_backward(inverse)
+        return values.index_select(1, places)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (inverse,) = ctx.saved_tensors
+        return gradient.index_select(1, inverse), None, None
 
 
 @dataclass(frozen=True)

@@ -110,11 +110,11 @@ def scan_terms(
     weights = settings.scans
     returned = scan.returned.float()
     count = returned.sum().clamp(min=1.0)
-    certain = picture.returned.clamp(CERTAIN, 1.0 - CERTAIN)
-    surprise = -torch.where(scan.returned, torch.log(certain), torch.log1p(-certain))
+    certain, measured = picture.returned.clamp(CERTAIN, 1.0 - CERTAIN), scan.measured.float()
+    likelihood = torch.where(scan.returned, certain, 1.0 - certain)
     terms = {
         "scan_range": weights.range_weight * range_loss(picture.range, picture.alpha, scan),
-        "scan_drop": weights.drop_weight * (surprise * scan.measured).sum() / scan.measured.sum().clamp(min=1),
+        "scan_drop": -weights.drop_weight * (likelihood.log() * measured).sum() / measured.sum().clamp(min=1.0),
     }
     if scan.intensity is not None:
         errors = (picture.intensity - scan.intensity).square()
@@ -129,7 +129,8 @@ def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan
     edge. A ray that meets nothing has none."""
     met = scan.returned & (alpha > CERTAIN)
     errors = torch.where(met, (expected - scan.range).abs(), 0.0)
-    with torch.no_grad():  # NaN where no ray counts, which no error is below
-        largest = torch.nanquantile(torch.where(met, errors, torch.nan), 1.0 - IGNORED_DEPTHS)
-        kept = met & (errors <= largest)
+    with torch.no_grad():
+        ascending = errors.masked_fill(~met, torch.inf).flatten().sort().values
+        last = ((1.0 - IGNORED_DEPTHS) * (met.sum().double() - 1.0)).clamp(min=0.0).long()
+        kept = met & (errors <= ascending.gather(0, last[None]))
     return (errors * kept).sum() / kept.sum().clamp(min=1)
