@@ -222,14 +222,14 @@ class SplatModel(nn.Module):
             seen_from.viewmat[None], view.K[None], view.width, view.height, sh_degree=degree,
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
         )  # fmt: skip
-        splats, alpha = rendering.image[0], rendering.alpha[0]
+        splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
         image = splats
         if self.sky is not None:
             image = self.sky.behind(splats, alpha, seen_from)
         if self.exposure is not None:
             image = self.exposure.applied(image, view.camera)
-        depth = None if rendering.depth is None else depth_at_lines(rendering.depth[0, ..., 0], seen_from)
-        return Picture(shown, sets, image, splats, alpha[..., 0], depth, rendering.info)
+        depth = None if rendering.depth is None else depth_at_lines(rendering.depth.squeeze((0, 3)), seen_from)
+        return Picture(shown, sets, image, splats, alpha.squeeze(2), depth, rendering.info)
 
     def scan(
         self,
@@ -268,14 +268,14 @@ class SplatModel(nn.Module):
         if not objects:
             return None
         alone = concatenate(objects)
-        return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha[0, ..., 0]
+        return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha.squeeze((0, 3))
 
     def class_logits(self, picture: Picture, view: View) -> Float[Tensor, "h w c"] | None:
         """The rendered class logits of a picture of this model; None for a model without semantic classes."""
         if not all("classes" in part.params for part in self.parts):
             return None
         logits = torch.cat([part.params["classes"] for part in self.parts])
-        return self._composited(picture.gaussians, logits, view).image[0]
+        return self._composited(picture.gaussians, logits, view).image.squeeze(0)
 
     def _composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
         seen_from = self.seen_from(view)

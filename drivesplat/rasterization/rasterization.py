@@ -115,4 +115,5 @@ def assembled(
     info = {**projected, "width": width, "height": height, "n_cameras": cameras, "gaussian_ids": None}
     if not with_depth:
         return Rendering(composited, alpha, None, info)
-    return Rendering(composited[..., :-1], alpha, composited[..., -1:] / alpha.clamp(min=1e-10), info)
+    image, depth_sum = composited.split([composited.shape[-1] - 1, 1], dim=-1)  # slices would copy in their gradients
+    return Rendering(image, alpha, depth_sum / alpha.clamp(min=1e-10), info)

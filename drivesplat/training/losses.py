@@ -2,9 +2,10 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.gaussians import Gaussians
@@ -42,7 +43,7 @@ def loss_terms(
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
-        terms["sky_bce"] = settings.sky_bce_weight * sky_cross_entropy(alpha, view.sky)
+        terms["sky_bce"] = settings.sky_bce_weight * mean_cross_entropy(alpha, view.sky)
     if view.lidar is not None and picture.depth is not None:
         terms["depth"] = settings.depth_weight * depth_loss(picture.depth, view.lidar)
     if picture.depth is not None and settings.smoothness_weight:
@@ -79,13 +80,8 @@ def _dynamic_terms(
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
         seen = alpha if view.ego_mask is None else alpha.masked_fill(view.ego_mask, 1.0)
-        terms["entropy"] = settings.entropy_weight * entropy(seen)
+        terms["entropy"] = settings.entropy_weight * mean_entropy(seen)
     return terms
-
-
-def sky_cross_entropy(alpha: Float[Tensor, "h w"], sky: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """Mean binary cross entropy between alpha and the absence of sky."""
-    return F.binary_cross_entropy(alpha.clamp(1e-4, 1.0 - 1e-4), 1.0 - sky.float())
 
 
 def class_cross_entropy(logits: Float[Tensor, "h w c"], classes: UInt8[Tensor, "h w"]) -> Float[Tensor, ""]:
@@ -136,12 +132,6 @@ def depth_roughness(
         inside = opaque.narrow(axis, 0, count) & opaque.narrow(axis, 1, count) & opaque.narrow(axis, 2, count)
         total = total + (curvature * torch.exp(-EDGE_DECAY * edge) * inside).mean()
     return total
-
-
-def entropy(alpha: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """Mean of -o ln o - (1 - o) ln (1 - o): smallest for opacities near 0 or 1."""
-    o = alpha.clamp(1e-4, 1.0 - 1e-4)
-    return -(o * torch.log(o) + (1.0 - o) * torch.log1p(-o)).mean()
 
 
 def sky_alpha_loss(alpha: Float[Tensor, "h w"], sky: Tensor) -> Float[Tensor, ""]:

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.kernels import triton_support
+from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
 from drivesplat.kernels.echoes import echo_values
@@ -179,6 +180,25 @@ def test_the_mean_thickness_and_its_gradient_agree_with_torch(count):
     broken[0, 1] = torch.nan
     with triton(True):
         assert mean_thickness(broken).isnan()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("width", [1, 77])
+def test_the_entropy_of_alpha_and_its_gradient_agree_with_torch(masked, width):
+    torch.manual_seed(width)
+    alpha = (1.2 * torch.rand(23, width, device=DEVICE) - 0.1).clamp(0.0, 1.0).requires_grad_()
+    empty = torch.rand(23, width, device=DEVICE) < 0.3
+
+    def mean() -> list[torch.Tensor]:
+        return [mean_cross_entropy(alpha, empty) if masked else mean_entropy(alpha)]
+
+    expected, found = both_ways(mean)
+    torch.testing.assert_close(found, expected)
+    assert_same_gradients([expected, found], [alpha], atol=1e-7, rtol=1e-4)
+    broken = alpha.detach().clone()
+    broken[2, 0] = torch.nan
+    with triton(True):
+        assert mean_entropy(broken).isnan() and mean_cross_entropy(broken, empty).isnan()
 
 
 @pytest.mark.parametrize("count", [0, 1, 700])

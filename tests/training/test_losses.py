@@ -9,6 +9,7 @@ import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, track_of
 from skimage.metrics import structural_similarity
 
+from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import masked_l1, ssim, ssim_in_torch
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -20,10 +21,8 @@ from drivesplat.training.losses import (
     class_cross_entropy,
     depth_loss,
     depth_roughness,
-    entropy,
     loss_terms,
     sky_alpha_loss,
-    sky_cross_entropy,
 )
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import LidarDepth, TrainingView
@@ -231,7 +230,7 @@ def test_the_cross_entropy_of_the_sky_is_closed_form_and_finite():
     """-ln (1 - alpha) on the sky, -ln alpha elsewhere; alphas of 0 and 1 count as 1e-4 from them."""
     alpha = torch.tensor([[0.2, 0.7, 0.0], [0.9, 1.0, 1.0]], requires_grad=True)
     sky = torch.tensor([[True, False, True], [True, False, True]])
-    loss = sky_cross_entropy(alpha, sky)
+    loss = mean_cross_entropy(alpha, sky)
     terms = [0.8, 0.7, 1.0 - 1e-4, 0.1, 1.0 - 1e-4, 1e-4]
     assert float(loss.detach()) == pytest.approx(-np.log(terms).mean(), rel=1e-3)
     loss.backward()
@@ -318,21 +317,21 @@ def test_what_the_ego_vehicle_hides_is_not_smoothed():
 def test_entropy_is_that_of_a_coin():
     alpha = torch.tensor([[0.5, 0.1], [0.9, 0.3]])
     expected = np.mean([-(o * np.log(o) + (1 - o) * np.log(1 - o)) for o in (0.5, 0.1, 0.9, 0.3)])
-    assert float(entropy(alpha)) == pytest.approx(expected, rel=1e-5)
-    assert float(entropy(torch.full((2, 2), 0.5))) == pytest.approx(math.log(2.0))
+    assert float(mean_entropy(alpha)) == pytest.approx(expected, rel=1e-5)
+    assert float(mean_entropy(torch.full((2, 2), 0.5))) == pytest.approx(math.log(2.0))
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0])
 def test_entropy_is_zero_with_a_finite_gradient_for_certain_pixels(alpha):
     sure = torch.full((2, 2), alpha, requires_grad=True)
-    loss = entropy(sure)
+    loss = mean_entropy(sure)
     loss.backward()
     assert float(loss.detach()) == pytest.approx(0.0, abs=2e-3) and torch.isfinite(sure.grad).all()
 
 
 def test_entropy_pushes_away_from_even():
     alpha = torch.tensor([[0.4, 0.6]], requires_grad=True)
-    entropy(alpha).backward()
+    mean_entropy(alpha).backward()
     assert float(alpha.grad[0, 0]) > 0.0 > float(alpha.grad[0, 1])
 
 
@@ -441,10 +440,10 @@ def test_terms_are_what_they_are_called():
     model, picture, view = street()
     settings = TrainSettings(sky_bce_weight=0.3, depth_weight=0.4, entropy_weight=0.5, dynamic_weight=0.6)
     terms = loss_terms(picture, view, model, settings)
-    torch.testing.assert_close(terms["sky_bce"], 0.3 * sky_cross_entropy(picture.alpha, view.sky))
+    torch.testing.assert_close(terms["sky_bce"], 0.3 * mean_cross_entropy(picture.alpha, view.sky))
     torch.testing.assert_close(terms["depth"], 0.4 * depth_loss(picture.depth, view.lidar))
     alone = SplatModel([model.parts[1]], None).render(view.view).alpha
-    torch.testing.assert_close(terms["entropy"], 0.5 * entropy(alone))
+    torch.testing.assert_close(terms["entropy"], 0.5 * mean_entropy(alone))
     torch.testing.assert_close(terms["dynamic"], 0.6 * masked_l1(picture.image, view.target(), view.moving))
     penalties = model.parts[1].penalties()
     assert penalties.keys() == {"track_size", "track_bend"}
