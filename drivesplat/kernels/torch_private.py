@@ -12,7 +12,6 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 
@@ -25,11 +24,6 @@ def copy_all(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
     """Copies every source into its target, in a call for each type of values."""
     for dtype in {source.dtype for source in sources}:
         torch._foreach_copy_(*([values for values in side if values.dtype == dtype] for side in (targets, sources)))
-
-
-def norms(tensors: Sequence[Tensor]) -> Sequence[Float[Tensor, ""]]:
-    """The Euclidean norm of every tensor, in one call."""
-    return torch._foreach_norm(tensors)
 
 
 def fused_adam_step(

@@ -88,6 +88,15 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     return gaussians if lacking <= 0 else replace(gaussians, shN=F.pad(gaussians.shN, (0, 0, 0, lacking)))
 
 
+def concatenate_shapes(sets: Sequence[Gaussians]) -> Gaussians:
+    """Several sets as one, as `concatenate`, without colours and echoes."""
+    fields = zip(*((own.means, own.quats, own.scales, own.opacities) for own in sets), strict=True)
+    velocities = [torch.zeros_like(own.means) if own.velocities is None else own.velocities for own in sets]
+    moving = any(own.velocities is not None for own in sets)
+    joined = without_colors(*(torch.cat(values) for values in fields), None)
+    return replace(joined, velocities=torch.cat(velocities)) if moving else joined
+
+
 def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, echoes: Tensor | None) -> Gaussians:
     """Gaussians whose coefficients are 0, of degree 0, for sensors that see no colours: copying the coefficients of a
     million Gaussians takes time."""

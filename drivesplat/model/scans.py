@@ -1,7 +1,7 @@
 """A LiDAR's revolution as a model sees it: a view of rays, and the scan that Gaussians give."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.kernels.echoes import echo_values
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import Gaussians, concatenate_shapes
 from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
 from drivesplat.scene.scan import RenderedScan
@@ -48,9 +48,9 @@ class ScanView:
 
 @dataclass(frozen=True)
 class ScanPicture:
-    """What b beams and a firings measure of `gaussians`, which are `sets` one after the other, without their echoes.
-    `range` in metres, 0 where nothing is met; `returned`, the probability of a return; `intensity` in [0, 1]; `alpha`,
-    of all that is met, and `alpha_before`, of what is nearer than given ranges (None: none were given)."""
+    """What b beams and a firings measure of `gaussians`, which are `sets` one after the other, without colours and
+    echoes. `range` in metres, 0 where nothing is met; `returned`, the probability of a return; `intensity` in [0, 1];
+    `alpha`, of all that is met, and `alpha_before`, of what is nearer than given ranges (None: none were given)."""
 
     gaussians: Gaussians
     sets: Sequence[Gaussians]
@@ -83,7 +83,7 @@ def scan_picture(sets: Sequence[Gaussians], view: ScanView, before: Float[Tensor
         if own.echoes is None:
             raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
         values.append(echo_values(own.echoes, own.means, sensor))
-    gaussians = concatenate([replace(own, echoes=None) for own in sets])
+    gaussians = concatenate_shapes(sets)
     rendering = _rasterized(gaussians, view, torch.cat(values), before)
     intensity, returned = rendering.values.unbind(dim=-1)
     if view.blocked is not None:

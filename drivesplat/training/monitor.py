@@ -9,14 +9,12 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.io.storage import unwritable
-from drivesplat.kernels import torch_private
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.training.views import TrainingView
 
@@ -30,17 +28,11 @@ PICTURE_HEIGHT = 360
 """Approximate maximum height in pixels of images in TensorBoard."""
 
 
-def gradient_norms(model: SplatModel) -> dict[str, Float[Tensor, ""]]:
-    """The Euclidean norms of the gradients of a model's parameters, by readable names."""
-    named = [(name, p.grad) for name, p in model.named_parameters() if p.grad is not None]
-    norms = torch_private.norms([gradient for _, gradient in named])
-    return {f"gradient of {_readable(name, model)}": norm for (name, _), norm in zip(named, norms, strict=True)}
-
-
-def _readable(parameter: str, model: SplatModel) -> str:
-    """The name of a parameter of a model in messages: 'background means', 'sky texels'."""
-    owner, *place, name = parameter.split(".")
-    return f"{model.parts[int(place[0])].name if owner == 'parts' else owner} {name}"
+def readable(optimizer: str, model: SplatModel) -> str:
+    """The name in messages of the parameter of an optimizer of a model (`ModelOptimizers.all`): 'background means',
+    'sky texels'."""
+    owner, *_, name = optimizer.split(".")
+    return f"{model.parts[int(owner)].name if owner.isdigit() else owner} {name}"
 
 
 class FiniteGuard:

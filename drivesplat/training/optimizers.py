@@ -23,14 +23,16 @@ FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.3, 2.0
 
 class Adam(torch.optim.Adam):
     """torch.optim.Adam, fused, of one parameter, for `ModelOptimizers`: the same fields and format of state. Its own
-    methods avoid torch's, whose first call imports torch's compiler, which takes a second or more. The state exists
-    from the beginning: a CUDA graph that captured its creation would reset it at every replay."""
+    methods avoid torch's, whose first call imports torch's compiler, which takes a second or more. The state and
+    `broken` (`adam_step`) exist from the beginning: a CUDA graph that captured their creation would reset them at every
+    replay."""
 
     def __init__(self, parameter: nn.Parameter, rate: float):
         super().__init__([parameter], lr=rate, eps=1e-15, fused=True)
         step = torch.zeros((), dtype=torch.float32, device=parameter.device)
         moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
         self.state[parameter] = {"step": step, **moments}
+        self.broken = torch.zeros((), device=parameter.device)
 
     @property
     def parameter(self) -> nn.Parameter:
@@ -66,24 +68,23 @@ class ModelOptimizers:
         ]
 
     @torch.no_grad()
-    def step(self, rates: Mapping[str, Tensor] | None = None) -> None:
+    def step(self, rates: Mapping[str, Tensor] | None = None) -> dict[str, Float[Tensor, ""]]:
         """Steps every optimizer that has a gradient and drops the gradient; with the `rates` in device memory, by name,
-        where given.
+        where given. Returns, by name, values that are finite only if the gradients are.
 
         The same as torch.optim.Adam with `fused`, but all step counters are incremented at once: separate steps take
         Python longer than the GPU.
         """
-        ready: list[tuple[nn.Parameter, dict[str, Tensor], float | Tensor, dict[str, Any]]] = []
-        for name, optimizer in self.all():
-            parameter, (group,) = optimizer.parameter, optimizer.param_groups
-            if parameter.grad is not None:
-                rate = group["lr"] if rates is None else rates[name]
-                ready.append((parameter, optimizer.state[parameter], rate, group))
+        ready = [(name, optimizer) for name, optimizer in self.all() if optimizer.parameter.grad is not None]
         if ready:
-            torch_private.increment([state["step"] for _, state, _, _ in ready])
-        for parameter, state, rate, group in ready:
-            adam_step(parameter, state, rate, group["betas"], group["eps"])
+            torch_private.increment([optimizer.state[optimizer.parameter]["step"] for _, optimizer in ready])
+        watched = {}
+        for name, optimizer in ready:
+            parameter, (group,) = optimizer.parameter, optimizer.param_groups
+            rate, state = group["lr"] if rates is None else rates[name], optimizer.state[parameter]
+            watched[name] = adam_step(parameter, state, rate, group["betas"], group["eps"], optimizer.broken)
             parameter.grad = None
+        return watched
 
 
 class DeviceSchedule:

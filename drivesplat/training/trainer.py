@@ -24,7 +24,7 @@ from drivesplat.training.densify import Densifier
 from drivesplat.training.dropout import with_dropout
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
-from drivesplat.training.monitor import FiniteGuard, gradient_norms
+from drivesplat.training.monitor import FiniteGuard, readable
 from drivesplat.training.optimizers import (
     DeviceSchedule,
     ModelOptimizers,
@@ -231,11 +231,12 @@ class Trainer:
         with stage("backward"):
             loss.backward()
             limit_gradients()
+        with stage("optimizer"):
+            watched = self.optimizers.step(rates)
         with stage("checks"):
             losses = {f"loss {name}": value for name, value in terms.items()}
-            self.guard.watch(step, {**losses, **gradient_norms(self.model)})
-        with stage("optimizer"):
-            self.optimizers.step(rates)
+            gradients = {f"gradient of {readable(name, self.model)}": value for name, value in watched.items()}
+            self.guard.watch(step, losses | gradients)
         return {name: value.detach() for name, value in terms.items()}
 
     def _limit_gradients(self) -> None:

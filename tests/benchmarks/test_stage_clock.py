@@ -75,7 +75,7 @@ def test_the_stages_of_a_training_are_timed_and_it_learns_the_same(tmp_path):
     timed, untimed = trained(tmp_path / "timed", clock), trained(tmp_path / "untimed", UNTIMED)
     shares = clock.shares()
     assert list(shares) == [
-        "data", "render", "loss", "backward", "checks", "optimizer", "densification", OTHER, ITERATION,
+        "data", "render", "loss", "backward", "optimizer", "checks", "densification", OTHER, ITERATION,
     ]  # fmt: skip
     assert sum(share.device_ms for share in shares.values()) == pytest.approx(2 * shares[ITERATION].device_ms)
     assert all(share.device_ms > 0 for share in shares.values())

@@ -19,7 +19,6 @@ MODULES = {"drivesplat/kernels/torch_private.py", "drivesplat/kernels/gsplat_pri
 TORCH = {
     "_foreach_add_.Scalar": "(Tensor(a!)[] self, Scalar scalar) -> ()",
     "_foreach_copy_": "(Tensor(a!)[] self, Tensor[] src, bool non_blocking=False) -> ()",
-    "_foreach_norm.Scalar": "(Tensor[] self, Scalar ord=2, ScalarType? dtype=None) -> Tensor[]",
     "_fused_adam_.tensor_lr": "(Tensor(a!)[] self, Tensor(b!)[] grads, Tensor(c!)[] exp_avgs, "
     "Tensor(d!)[] exp_avg_sqs, Tensor(e!)[] max_exp_avg_sqs, Tensor[] state_steps, *, Tensor lr, float beta1, "
     "float beta2, float weight_decay, "

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.kernels import triton_support
+from drivesplat.kernels.adam import adam_step
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
@@ -111,21 +112,38 @@ def test_an_empty_moving_mask_gives_no_difference_and_no_gradient():
 
 
 def test_adam_steps_agree_with_torch():
-    from drivesplat.kernels.triton.adam import adam_step
+    from drivesplat.kernels.triton.adam import adam_step as fused_step
 
     torch.manual_seed(0)
     theirs = torch.randn(700, 3, device=DEVICE)
     mine, rate = theirs.clone(), torch.tensor(0.02, device=DEVICE)
     states = {"exp_avg": torch.zeros_like(mine), "exp_avg_sq": torch.zeros_like(mine), "step": rate.new_zeros(())}
+    broken = rate.new_zeros(())
     adam = torch.optim.Adam([theirs], lr=0.02, eps=1e-15, fused=True)
     for step in range(25):
         theirs.grad = torch.randn_like(theirs) * 10.0 ** -(step % 7)
         rate.fill_(0.02 * 0.9**step)
         adam.param_groups[0]["lr"] = 0.02 * 0.9**step
         states["step"] += 1
-        adam_step(mine, theirs.grad, states, rate, (0.9, 0.999), 1e-15)
+        fused_step(mine, theirs.grad, states, rate, (0.9, 0.999), 1e-15, broken)
         adam.step()
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+    assert broken == 0.0
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("used", [True, False])
+def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
+    """For good: a later gradient may be finite again."""
+    parameter, rate = torch.nn.Parameter(torch.ones(700, 3, device=DEVICE)), torch.tensor(0.02, device=DEVICE)
+    moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+    states, broken, found = {**moments, "step": rate.new_ones(())}, rate.new_zeros(()), []
+    for wrong in (0.5, value):
+        parameter.grad = torch.full_like(parameter, 0.5)
+        parameter.grad[650, 1] = wrong
+        with triton(used):
+            found.append(bool(adam_step(parameter, states, rate, (0.9, 0.999), 1e-15, broken).isfinite()))
+    assert found == [True, False] and (broken.isinf() or not used)
 
 
 @pytest.mark.parametrize("degree", [0, 1])
@@ -374,17 +392,18 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.kernels.triton import adam, chunks, color_difference, cube_map, echoes, exploration, placement, probe
-from drivesplat.kernels.triton import regularizers, tiles, time_varying_colors, view_colors
+from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
+from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
 
-FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
+FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "empty": "*i1", "index": "*i64",
+              "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "exists": "*i1",
               "radii": "*i32", "counts": "*i32", "nearest": "*i64", "ends": "*i32", "keys": "*i16"}
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each"), "i32")
-NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps"), "fp32")
+NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps", "certain"), "fp32")
 NUMBERS |= dict.fromkeys(("rows", "columns", "beams", "firings"), "i32")
 NUMBERS |= dict.fromkeys(("first_count", "last_count", "room"), "i32")
 NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range"), "fp32")
@@ -419,6 +438,11 @@ compiled(echoes._values, BLOCK=echoes.BLOCK)
 compiled(echoes._values_backward, BLOCK=echoes.BLOCK)
 compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
 compiled(regularizers._spread, BLOCK=regularizers.BLOCK)
+compiled(regularizers._thinnest, BLOCK=regularizers.BLOCK)
+compiled(regularizers._spread_to_thinnest, BLOCK=regularizers.BLOCK)
+for masked in (False, True):
+    compiled(alpha_entropy._sums, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
+    compiled(alpha_entropy._gradients, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
 compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
 compiled(tiles._list, BLOCK=tiles.BLOCK)
 compiled(chunks.count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)

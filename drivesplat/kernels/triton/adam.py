@@ -21,6 +21,7 @@ def adam_step(
     rate: Float[Tensor, ""],
     betas: tuple[float, float],
     eps: float,
+    broken: Float[Tensor, ""],
 ) -> None:
     """See `drivesplat.kernels.adam.adam_step`; `gradient` is the parameter's."""
     count = parameter.numel()
@@ -29,7 +30,7 @@ def adam_step(
     beta1, beta2 = betas
     _step[(triton.cdiv(count, BLOCK),)](
         parameter, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], state["step"], rate, count,
-        beta1, 1.0 - beta1, math.log(beta1), beta2, 1.0 - beta2, math.log(beta2), eps, BLOCK,
+        beta1, 1.0 - beta1, math.log(beta1), beta2, 1.0 - beta2, math.log(beta2), eps, broken, BLOCK,
     )  # fmt: skip
 
 
@@ -37,7 +38,7 @@ def adam_step(
 @no_type_check
 def _step(
     values, gradients, averages, squares, counted, rate, count, beta1, rest1, log_beta1, beta2, rest2, log_beta2, eps,
-    BLOCK: tl.constexpr,
+    broken, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < count
@@ -45,6 +46,8 @@ def _step(
     size = (tl.load(rate) / (1.0 - tl.exp(done * log_beta1))).to(tl.float32)
     spread = tl.sqrt(1.0 - tl.exp(done * log_beta2)).to(tl.float32)
     gradient = tl.load(gradients + i, mask=inside, other=0.0)
+    infinite = tl.full((BLOCK,), float("inf"), tl.float32)
+    tl.store(broken + tl.zeros((BLOCK,), tl.int32), infinite, mask=inside & ~(tl.abs(gradient) < infinite))
     average = beta1 * tl.load(averages + i, mask=inside, other=0.0) + rest1 * gradient
     square = beta2 * tl.load(squares + i, mask=inside, other=0.0) + rest2 * gradient * gradient
     value = tl.load(values + i, mask=inside, other=0.0)

@@ -5,6 +5,9 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
+ALIGNED = 4
+"""Values in 16 bytes: the addresses of arrays that follow each other in memory are multiples of as much."""
+
 
 @triton.jit
 @no_type_check

@@ -10,12 +10,14 @@ remaining sum R_i = sum over j > i of w_j (g · value_j), the gradient of alpha_
 alpha_i); the sum over all j is known from the rendered scan, and that of earlier chunks from their sums.
 """
 
+import math
 from collections.abc import Sequence
-from typing import Any, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import torch
 import triton
 import triton.language as tl
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -24,6 +26,7 @@ from drivesplat.kernels.cuda import scans as cuda_scans
 from drivesplat.kernels.scan_chunks import RaySums, ScanChunks, ScanGradients, TileRays
 from drivesplat.kernels.scan_part import MetPart, ScanPart
 from drivesplat.kernels.scanned_gaussians import ScannedGaussians
+from drivesplat.kernels.triton.rows import ALIGNED
 from drivesplat.kernels.triton.scan_chunks import RAYS, SIZES, SUMS, rays_of
 from drivesplat.kernels.triton.scan_gradients import remain
 from drivesplat.kernels.triton.scan_sums import CopiedChunks
@@ -34,54 +37,99 @@ JOINED = 8
 """Chunks of a tile that are joined at a time."""
 
 
+FIELDS = len(ScannedGaussians._fields) - 1
+"""Fields of the projected Gaussians of a part: all but their opacities."""
+
+
+class Listed(NamedTuple):
+    """A part of a scan, the ranges (metres) before which alpha is wanted, too, and the tiles that Gaussians reach, with
+    the `capacity` of their lists."""
+
+    part: ScanPart
+    until: Float[Tensor, "b a"] | None
+    reached: ReachedTiles | None
+    capacity: int
+
+
 class ScanCompositing(torch.autograd.Function):
-    """Sums of ranges, alpha, alpha before `until` and values along rays, and the median range without gradient, in the
-    order of `drivesplat.kernels.scan_compositing.CompositedScan`. Gradients reach neither rays nor `range_limits`."""
+    """Sums of ranges, alpha, alpha before `until` and values along the rays of each part of a scan, and the median
+    range without gradient, in the order of `drivesplat.kernels.scan_compositing.CompositedScan`, part after part.
+
+    `projected` are the FIELDS of the Gaussians of each part. Gradients reach neither rays nor `range_limits`. Those of
+    opacities and values are added for all parts in one place.
+    """
 
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, ranges: Tensor, conics: Tensor, slopes: Tensor, range_limits: Tensor, radii: Tensor,
-        opacities: Tensor, values: Tensor, part: ScanPart, until: Tensor | None, reached: ReachedTiles | None,
-        capacity: int,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
-        gaussians = ScannedGaussians(means2d, ranges, conics, slopes, range_limits, radii, opacities)
-        chunks = _chunks_of(gaussians, values, scan_lists(gaussians, part.tiles, reached, capacity))
-        until = torch.zeros_like(part.azimuths) if until is None else until
-        given = [t.to(values).contiguous() for t in (part.within, part.elevations, until)]
-        rays, shape, channels = TileRays(part.tiles.tiles, *given), part.azimuths.shape, values.shape[1]
-        passes, middles = (values.new_empty(chunks.count, RAYS.value) for _ in range(2))
-        sums = values.new_empty(chunks.count, SUMS.value + channels, RAYS.value)
-        whole, out = [values.new_empty(shape) for _ in range(4)], values.new_empty(*shape, channels)
-        tiles = (len(chunks.firsts) - 1,)
-        chunks.write_transmittances(rays, passes)
-        _arrive[tiles](chunks.firsts, passes, JOINED, num_warps=1)
-        chunks.write_sums(rays, passes, sums, middles)
-        _join[tiles](
-            chunks.firsts, rays.numbers, sums, middles, *whole, out, *rays.sizes, channels, JOINED, num_warps=1
-        )
-        range_sum, alpha, before, median = whole
-        ctx.chunks, ctx.channels, ctx.count = chunks, channels, len(ranges)
-        # `chunks` may read these again: saved here, so that torch notices if they have changed by then
-        read = means2d, ranges, conics, slopes, range_limits, opacities, values
-        ctx.save_for_backward(*rays, passes, sums, range_sum, alpha, before, out, *read)
-        ctx.mark_non_differentiable(median)
-        return range_sum, alpha, before, out, median
+        ctx: Any, opacities: Tensor, values: Tensor, parts: Sequence[Listed], *projected: Tensor
+    ) -> tuple[Tensor, ...]:
+        ctx.chunks, ctx.shape, saved, found = [], values.shape, [opacities, values], []
+        for listed, fields in zip(parts, _by_part(projected, FIELDS), strict=True):
+            chunks, kept, seen = _composited(ScannedGaussians(*fields, opacities), values, listed)
+            ctx.chunks.append(chunks)
+            # `chunks` may read these again: saved here, so that torch notices if they have changed by then
+            saved += [*kept, *fields[:-1]]
+            found += seen
+        ctx.save_for_backward(*saved)
+        ctx.mark_non_differentiable(*found[4::5])
+        return tuple(found)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        rays, saved = TileRays(*ctx.saved_tensors[:4]), ctx.saved_tensors[4:]
-        passes, sums, rendered = *saved[:2], RaySums(*saved[2:6])
-        given, rest = RaySums(*(gradient.contiguous() for gradient in gradients[:4])), torch.empty_like(passes)
-        remain[(len(ctx.chunks.firsts) - 1,)](
-            ctx.chunks.firsts, rays.numbers, sums, *rendered, *given, rest, *rays.sizes, ctx.channels, JOINED,
-            num_warps=1,
-        )  # fmt: skip
-        widths = ((2,), (), (3,), (2,), (), (ctx.channels,))
-        found = ScanGradients(*(passes.new_zeros(ctx.count, *width) for width in widths))
-        ctx.chunks.add_gradients(rays, passes, rest, given, found)
-        of_gaussians = found.means2d, found.ranges, found.conics, found.slopes, None, None, found.opacities
-        return *of_gaussians, found.values, None, None, None, None
+        opacities, _, *saved = ctx.saved_tensors
+        count, channels = ctx.shape
+        by_part = _by_part(saved, len(saved) // len(ctx.chunks)), _by_part(gradients, 5)
+        v_opacities, v_values, *zeros = _zeros(opacities, count, ((), (channels,), *len(ctx.chunks) * SHAPES))
+        of_fields: list[Tensor | None] = []
+        for chunks, kept, given, own in zip(ctx.chunks, *by_part, _by_part(zeros, len(SHAPES)), strict=True):
+            rays, passes, sums, rendered = TileRays(*kept[:4]), kept[4], kept[5], RaySums(*kept[6:10])
+            given = RaySums(*(gradient.contiguous() for gradient in given[:4]))
+            rest = torch.empty_like(passes)
+            remain[(len(chunks.firsts) - 1,)](
+                chunks.firsts, rays.numbers, sums, *rendered, *given, rest, *rays.sizes, channels, JOINED, num_warps=1,
+            )  # fmt: skip
+            chunks.add_gradients(rays, passes, rest, given, ScanGradients(*own, v_opacities, v_values))
+            of_fields += [*own, None, None]
+        return v_opacities, v_values, None, *of_fields
+
+
+SHAPES: tuple[tuple[int, ...], ...] = ((2,), (), (3,), (2,))
+"""The shapes of a Gaussian's means, range, conic and slopes."""
+
+
+def _by_part(tensors: Sequence[Tensor], each: int) -> list[Sequence[Tensor]]:
+    """The tensors of each part, of which there are so many."""
+    return [tensors[at : at + each] for at in range(0, len(tensors), each)]
+
+
+def _zeros(like: Tensor, count: int, shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
+    """Tensors of zeros with so many rows of each shape, filled at once. All addresses are multiples of 16 bytes."""
+    sizes = [count * math.prod(shape) for shape in shapes]
+    rooms = [triton.cdiv(size, ALIGNED) * ALIGNED for size in sizes]
+    parts = zip(like.new_zeros(sum(rooms)).split(rooms), sizes, shapes, strict=True)
+    return [room[:size].view(count, *shape) for room, size, shape in parts]
+
+
+def _composited(
+    gaussians: ScannedGaussians, values: Tensor, listed: Listed
+) -> tuple[ScanChunks, list[Tensor], list[Tensor]]:
+    """The chunks of a part, what its gradients need, and what its rays measure."""
+    part = listed.part
+    chunks = _chunks_of(gaussians, values, scan_lists(gaussians, part.tiles, listed.reached, listed.capacity))
+    until = torch.zeros_like(part.azimuths) if listed.until is None else listed.until
+    given = [t.to(values).contiguous() for t in (part.within, part.elevations, until)]
+    rays, shape, channels = TileRays(part.tiles.tiles, *given), part.azimuths.shape, values.shape[1]
+    passes, middles = (values.new_empty(chunks.count, RAYS.value) for _ in range(2))
+    sums = values.new_empty(chunks.count, SUMS.value + channels, RAYS.value)
+    whole, out = [values.new_empty(shape) for _ in range(4)], values.new_empty(*shape, channels)
+    tiles = (len(chunks.firsts) - 1,)
+    chunks.write_transmittances(rays, passes)
+    _arrive[tiles](chunks.firsts, passes, JOINED, num_warps=1)
+    chunks.write_sums(rays, passes, sums, middles)
+    _join[tiles](chunks.firsts, rays.numbers, sums, middles, *whole, out, *rays.sizes, channels, JOINED, num_warps=1)
+    range_sum, alpha, before, median = whole
+    return chunks, [*rays, passes, sums, range_sum, alpha, before, out], [range_sum, alpha, before, out, median]
 
 
 def _chunks_of(gaussians: ScannedGaussians, values: Tensor, lists: TileLists) -> ScanChunks:
@@ -94,10 +142,9 @@ def composite_parts(met: Sequence[MetPart], values: Tensor) -> list[tuple[Tensor
     reached = [reached_tiles(part.gaussians, part.rays.tiles) if len(values) else None for part in met]
     capacities = capacities_for([tiles.ends[-1] for tiles in reached if tiles is not None]) or [0] * len(met)
     lists = zip(met, reached, capacities, strict=True)
-    return [
-        ScanCompositing.apply(*part.gaussians, values, part.rays, part.until, tiles, capacity)
-        for part, tiles, capacity in lists
-    ]
+    parts = [Listed(part.rays, part.until, tiles, capacity) for part, tiles, capacity in lists]
+    projected = [field for part in met for field in part.gaussians[:FIELDS]]
+    return _by_part(ScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
 
 
 @triton.jit

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.scanned_gaussians import FIRING_STEPS, MAX_DEVIATIONS, MIN_ALPHA, Revolution
-from drivesplat.kernels.triton.rows import store_quaternion, store_three, three, two, unit
+from drivesplat.kernels.triton.rows import ALIGNED, store_quaternion, store_three, three, two, unit
 from drivesplat.kernels.triton.scan_geometry import (
     at_timestamp,
     determinant_of,
@@ -42,8 +42,6 @@ from drivesplat.kernels.triton.vectors import (
 
 BLOCK = 128
 """Gaussians per program."""
-ALIGNED = 4
-"""Rows of the parts of a revolution are a multiple of this: the address of each is one of 16 bytes."""
 FAINTEST, DEVIATIONS = tl.constexpr(MIN_ALPHA), tl.constexpr(MAX_DEVIATIONS)
 
 
@@ -99,21 +97,30 @@ class ScanProjection(torch.autograd.Function):
         ctx.save_for_backward(*gaussians, offsets)
         by_part = [tuple(values[part, :count] for values in projected) for part in range(parts)]
         ctx.mark_non_differentiable(*(values for found in by_part for values in found[4:]))
+        ctx.set_materialize_grads(False)  # zeros for `range_limits` and `radii`
         return tuple(values for found in by_part for values in found)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *gaussians, offsets = ctx.saved_tensors
         v_gaussians = tuple(torch.empty_like(values) for values in gaussians)
         count, (parts, room), motion = len(gaussians[0]), offsets.shape, ctx.motion
-        first, last = ([values.contiguous() for values in gradients[at : at + 4]] for at in (0, 6 * (parts - 1)))
+        first, last = (_given(ctx, gradients[at : at + 4]) for at in (0, 6 * (parts - 1)))
         if count:
             _project_backward[(triton.cdiv(count, BLOCK),)](
                 *gaussians, offsets, motion.view, motion.velocities, *first, *last, *v_gaussians, *ctx.options, count,
                 room, len(motion.middles) > 0, len(motion.velocities) > 0, parts, BLOCK,
             )  # fmt: skip
         return *v_gaussians, None, None, None, None
+
+
+def _given(ctx: Any, gradients: Sequence[Tensor | None]) -> list[Tensor]:
+    """The gradients of a part's means, ranges, conics and slopes; zeros where there are none."""
+    count, room = len(ctx.saved_tensors[0]), ctx.saved_tensors[3]
+    sizes = ((count, 2), (count,), (count, 3), (count, 2))
+    found = zip(gradients, sizes, strict=True)
+    return [room.new_zeros(size) if values is None else values.contiguous() for values, size in found]
 
 
 @triton.jit(
