@@ -400,6 +400,7 @@ from drivesplat.kernels.triton import scan_tiles
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "empty": "*i1", "index": "*i64",
               "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "exists": "*i1",
+              "places": "*i32", "reached": "*i32",
               "radii": "*i32", "counts": "*i32", "nearest": "*i64", "ends": "*i32", "keys": "*i16"}
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each"), "i32")
@@ -413,7 +414,8 @@ SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.
 
 RAYS = {"numbers": "*i32", "values": FLOATS}
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
-SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS}) | {scan_chunks._copy: RAYS}
+SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
+SCAN[scan_chunks._copy] = RAYS
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
 
@@ -455,6 +457,7 @@ for motion, moving, parts in ((True, True, 2), (True, False, 2), (True, True, 1)
     compiled(scan_projection._project, STEPS=4, **options)
     compiled(scan_projection._project_backward, **options)
 compiled(scan_tiles._count_tiles, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
+compiled(scan_tiles._compact, BLOCK=scan_tiles.BLOCK)
 compiled(scan_tiles._list, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
 compiled(scan_chunks._copy, CHANNELS=2, BLOCK=scan_chunks.BLOCK)
 compiled(scan_sums._pass, GROUP=scan_sums.GROUP)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
 
-from drivesplat.kernels import triton_support
+from drivesplat.kernels import capacity, triton_support
 from drivesplat.rasterization import RayGrid, ScanMotion
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
@@ -110,6 +110,19 @@ def test_any_number_of_channels_agrees(channels):
     scene = random_scan(7, n=30, rays=even_rays(3, 40))
     scene.values = torch.from_numpy(np.random.default_rng(channels).normal(size=(30, channels)))
     assert not disagreements(scene)
+
+
+def test_lists_of_planned_capacity_give_the_same_scan():
+    """Those of a CUDA graph, with room for more Gaussians and entries than there are."""
+    scene = random_scan(6, n=300, rays=uneven_rays(6, 4, 41))
+    with capacity.exact() as needs:
+        expected = by_triton(scene, MOTION)
+    assert len(needs) == 4 and 0 < needs[0] < 300, "Gaussians and entries of either half"
+    with capacity.planned(needs) as lists:
+        found = by_triton(scene, MOTION)
+    assert [int(needed) for needed, _ in lists] == needs
+    for name, values in expected.items():
+        torch.testing.assert_close(found[name], values, rtol=1e-5, atol=1e-6 * float(values.abs().max()), msg=name)
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.9])

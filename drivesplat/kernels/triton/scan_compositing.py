@@ -30,7 +30,7 @@ from drivesplat.kernels.triton.rows import ALIGNED
 from drivesplat.kernels.triton.scan_chunks import RAYS, SIZES, SUMS, rays_of
 from drivesplat.kernels.triton.scan_gradients import remain
 from drivesplat.kernels.triton.scan_sums import CopiedChunks
-from drivesplat.kernels.triton.scan_tiles import ReachedTiles, reached_tiles, scan_lists
+from drivesplat.kernels.triton.scan_tiles import ReachedTiles, count_tiles, reached_tiles, scan_lists
 from drivesplat.kernels.triton.tiles import TileLists
 
 JOINED = 8
@@ -139,12 +139,22 @@ def _chunks_of(gaussians: ScannedGaussians, values: Tensor, lists: TileLists) ->
 
 def composite_parts(met: Sequence[MetPart], values: Tensor) -> list[tuple[Tensor, ...]]:
     """The results of `ScanCompositing` for each part of a scan. The host waits for the device once."""
-    reached = [reached_tiles(part.gaussians, part.rays.tiles) if len(values) else None for part in met]
-    capacities = capacities_for([tiles.ends[-1] for tiles in reached if tiles is not None]) or [0] * len(met)
-    lists = zip(met, reached, capacities, strict=True)
-    parts = [Listed(part.rays, part.until, tiles, capacity) for part, tiles, capacity in lists]
+    parts = [Listed(part.rays, part.until, *lists) for part, lists in zip(met, _reached(met), strict=True)]
     projected = [field for part in met for field in part.gaussians[:FIELDS]]
     return _by_part(ScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
+
+
+def _reached(met: Sequence[MetPart]) -> list[tuple[ReachedTiles | None, int]]:
+    """The tiles that Gaussians reach in each part, and the capacity of their lists."""
+    count = len(met[0].gaussians.ranges)
+    if count == 0:
+        return [(None, 0)] * len(met)
+    counted = [count_tiles(part.gaussians, part.rays.tiles) for part in met]
+    sizes = capacities_for([needed for tiles in counted for needed in tiles.needed])
+    return [
+        (reached_tiles(part.gaussians, tiles, min(room, count)), capacity)
+        for part, tiles, room, capacity in zip(met, counted, sizes[::2], sizes[1::2], strict=True)
+    ]
 
 
 @triton.jit

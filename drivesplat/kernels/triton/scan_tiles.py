@@ -30,27 +30,52 @@ PER_RADIAN, WHOLE = tl.constexpr(BINS / (2.0 * math.pi)), tl.constexpr(math.pi)
 LAST_BIN = tl.constexpr(BINS - 1)
 
 
-class ReachedTiles(NamedTuple):
-    """The number of tiles that each of n Gaussians reaches, the Gaussians from the nearest to the farthest, and the
-    sums of their `counts` in this order."""
+class CountedTiles(NamedTuple):
+    """The number of tiles that each of n Gaussians reaches, at least one of them any, and how many of the Gaussians so
+    far reach some."""
 
     counts: Int[Tensor, " n"]
-    nearest: Int[Tensor, " n"]
-    ends: Int[Tensor, " n"]
+    places: Int[Tensor, " n"]
+
+    @property
+    def needed(self) -> tuple[Int[Tensor, ""], Int[Tensor, ""]]:
+        """The number of Gaussians that reach tiles, and of entries of lists."""
+        return self.places[-1], self.counts.sum(dtype=torch.int32)
+
+
+class ReachedTiles(NamedTuple):
+    """r Gaussians from the nearest to the farthest, the numbers of tiles that they reach, and the sums of these
+    `counts` so far. The last ones may reach none."""
+
+    nearest: Int[Tensor, " r"]
+    counts: Int[Tensor, " r"]
+    ends: Int[Tensor, " r"]
 
 
 @torch.no_grad()
-def reached_tiles(gaussians: ScannedGaussians, table: TileTable) -> ReachedTiles:
-    """The tiles that at least one Gaussian reaches, counted."""
+def count_tiles(gaussians: ScannedGaussians, table: TileTable) -> CountedTiles:
+    """Counts the tiles that at least one Gaussian reaches."""
     count, (rows, columns) = len(gaussians.ranges), table.tiles.shape
     counts = torch.empty(count, dtype=torch.int32, device=gaussians.ranges.device)
-    nearness = torch.empty_like(gaussians.ranges)
     _count_tiles[(triton.cdiv(count, BLOCK),)](
-        *_seen(gaussians), gaussians.ranges.contiguous(), *_arcs(table), counts, nearness, count, rows, columns,
-        rows.bit_length(), BINS, BLOCK,
-    )  # fmt: skip
-    nearest = torch.argsort(nearness, stable=True)
-    return ReachedTiles(counts, nearest, torch.cumsum(counts[nearest], dim=0, dtype=torch.int32))
+        *_seen(gaussians), *_arcs(table), counts, count, rows, columns, rows.bit_length(), BINS, BLOCK
+    )
+    return CountedTiles(counts, torch.cumsum(counts > 0, dim=0, dtype=torch.int32))
+
+
+@torch.no_grad()
+def reached_tiles(gaussians: ScannedGaussians, counted: CountedTiles, room: int) -> ReachedTiles:
+    """The Gaussians that reach tiles, sorted. Most reach none, and need not be sorted: they are left out first. Where
+    more than `room` reach some, the last ones are left out, too."""
+    counts, places = counted
+    ids, reached = torch.zeros(2, room, dtype=torch.int32, device=counts.device)
+    nearness = gaussians.ranges.new_full((room,), torch.inf)
+    _compact[(triton.cdiv(len(counts), BLOCK),)](
+        gaussians.ranges.contiguous(), counts, places, nearness, ids, reached, len(counts), room, BLOCK
+    )
+    order = torch.argsort(nearness, stable=True)
+    reached = reached[order]
+    return ReachedTiles(ids[order], reached, torch.cumsum(reached, dim=0, dtype=torch.int32))
 
 
 @torch.no_grad()
@@ -58,11 +83,12 @@ def scan_lists(gaussians: ScannedGaussians, table: TileTable, reached: ReachedTi
     """The lists of all tiles of a scan: those of a row by ascending azimuth, row after row, as one camera. Where
     `capacity`, the number of their entries, is too small, the farthest Gaussians are left out. None: no Gaussian."""
     (rows, columns), device = table.tiles.shape, gaussians.ranges.device
-    count, tiles = len(gaussians.ranges), rows * columns
+    tiles = rows * columns
     kind = torch.int16 if tiles < torch.iinfo(torch.int16).max else torch.int32
     keys = torch.full((capacity,), tiles, dtype=kind, device=device)
     ids = torch.empty(capacity, dtype=torch.int32, device=device)
-    if reached is not None:
+    count = 0 if reached is None else len(reached.nearest)
+    if reached is not None and count:
         _list[(triton.cdiv(count, BLOCK),)](
             *_seen(gaussians), *_arcs(table), *reached, keys, ids, capacity, count, rows, columns, rows.bit_length(),
             BINS, BLOCK,
@@ -152,10 +178,10 @@ def _reached(
 @triton.jit(do_not_specialize=["count", "rows", "columns", "steps"])
 @no_type_check
 def _count_tiles(
-    means2d, conics, radii, opacities, ranges, first, last, lows, highs, counts, nearness, count, rows, columns,
-    steps, BINS: tl.constexpr, BLOCK: tl.constexpr,
+    means2d, conics, radii, opacities, first, last, lows, highs, counts, count, rows, columns, steps,
+    BINS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The number of tiles that each Gaussian reaches, and its sort key: its range, or infinity for none."""
+    """The number of tiles that each Gaussian reaches."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     x, y, a, b, c, determinant, reach, wide, high, valid = _ellipse(means2d, conics, radii, opacities, i, i < count)
     row, reached = _rows(y, high, valid, lows, highs, rows, steps)
@@ -166,19 +192,31 @@ def _count_tiles(
             row + step, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS
         )[1]
     tl.store(counts + i, found, mask=i < count)
-    tl.store(nearness + i, tl.load(ranges + i, mask=found > 0, other=float("inf")), mask=i < count)
+
+
+@triton.jit(do_not_specialize=["count", "room"])
+@no_type_check
+def _compact(ranges, counts, places, nearness, ids, reached, count, room, BLOCK: tl.constexpr):
+    """Writes the ranges, numbers and counts of Gaussians that reach tiles, in their order."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tiles = tl.load(counts + i, mask=i < count, other=0)
+    place = tl.load(places + i, mask=i < count, other=0) - 1
+    kept = (tiles > 0) & (place < room)
+    tl.store(nearness + place, tl.load(ranges + i, mask=kept, other=0.0), mask=kept)
+    tl.store(ids + place, i, mask=kept)
+    tl.store(reached + place, tiles, mask=kept)
 
 
 @triton.jit(do_not_specialize=["capacity", "count", "rows", "columns", "steps"])
 @no_type_check
 def _list(
-    means2d, conics, radii, opacities, first, last, lows, highs, counts, nearest, ends, keys, ids, capacity, count,
+    means2d, conics, radii, opacities, first, last, lows, highs, nearest, counts, ends, keys, ids, capacity, count,
     rows, columns, steps, BINS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the Gaussians, from the nearest to the farthest, to the entries of all tiles that they reach."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     i = tl.load(nearest + place, mask=place < count, other=0)
-    tiles = tl.load(counts + i, mask=place < count, other=0)
+    tiles = tl.load(counts + place, mask=place < count, other=0)
     end = tl.load(ends + place, mask=place < count, other=0)
     free, end = end - tiles, tl.minimum(end, capacity)
     x, y, a, b, c, determinant, reach, wide, high, valid = _ellipse(means2d, conics, radii, opacities, i, tiles > 0)
@@ -192,5 +230,5 @@ def _list(
             column = (start + ahead + columns) % columns
             fits = (ahead < found) & (free + ahead < end)
             tl.store(keys + free + ahead, (row + step) * columns + column, mask=fits)
-            tl.store(ids + free + ahead, i.to(tl.int32), mask=fits)
+            tl.store(ids + free + ahead, i, mask=fits)
         free += found
