@@ -17,7 +17,7 @@ from drivesplat.settings.train import TrainSettings
 DECAY = 0.01
 """Final learning rate of what decays (positions, cameras, deformations, ...), and of all that is fine-tuned, as a
 fraction of the initial rate."""
-FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.3, 2.0
+FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.5, 6.0
 """Factors of the learning rates at which the fine-tuning of positions, and of all else, begins."""
 
 
