@@ -106,9 +106,9 @@ def _by_part(tensors: Sequence[Tensor], each: int) -> list[Sequence[Tensor]]:
 def _zeros(like: Tensor, count: int, shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
     """Tensors of zeros with so many rows of each shape, filled at once. All addresses are multiples of 16 bytes."""
     sizes = [count * math.prod(shape) for shape in shapes]
-    rooms = [triton.cdiv(size, ALIGNED) * ALIGNED for size in sizes]
-    parts = zip(like.new_zeros(sum(rooms)).split(rooms), sizes, shapes, strict=True)
-    return [room[:size].view(count, *shape) for room, size, shape in parts]
+    padded = [triton.cdiv(size, ALIGNED) * ALIGNED for size in sizes]
+    parts = zip(like.new_zeros(sum(padded)).split(padded), sizes, shapes, strict=True)
+    return [values[:size].view(count, *shape) for values, size, shape in parts]
 
 
 def _composited(
@@ -150,10 +150,10 @@ def _reached(met: Sequence[MetPart]) -> list[tuple[ReachedTiles | None, int]]:
     if count == 0:
         return [(None, 0)] * len(met)
     counted = [count_tiles(part.gaussians, part.rays.tiles) for part in met]
-    sizes = capacities_for([needed for tiles in counted for needed in tiles.needed])
+    capacities = capacities_for([needed for tiles in counted for needed in tiles.needed])
     return [
-        (reached_tiles(part.gaussians, tiles, min(room, count)), capacity)
-        for part, tiles, room, capacity in zip(met, counted, sizes[::2], sizes[1::2], strict=True)
+        (reached_tiles(part.gaussians, tiles, min(reached, count)), entries)
+        for part, tiles, reached, entries in zip(met, counted, capacities[::2], capacities[1::2], strict=True)
     ]
 
 

@@ -64,14 +64,14 @@ def count_tiles(gaussians: ScannedGaussians, table: TileTable) -> CountedTiles:
 
 
 @torch.no_grad()
-def reached_tiles(gaussians: ScannedGaussians, counted: CountedTiles, room: int) -> ReachedTiles:
+def reached_tiles(gaussians: ScannedGaussians, counted: CountedTiles, capacity: int) -> ReachedTiles:
     """The Gaussians that reach tiles, sorted. Most reach none, and need not be sorted: they are left out first. Where
-    more than `room` reach some, the last ones are left out, too."""
+    more than `capacity` reach some, the last ones are left out, too."""
     counts, places = counted
-    ids, reached = torch.zeros(2, room, dtype=torch.int32, device=counts.device)
-    nearness = gaussians.ranges.new_full((room,), torch.inf)
+    ids, reached = torch.zeros(2, capacity, dtype=torch.int32, device=counts.device)
+    nearness = gaussians.ranges.new_full((capacity,), torch.inf)
     _compact[(triton.cdiv(len(counts), BLOCK),)](
-        gaussians.ranges.contiguous(), counts, places, nearness, ids, reached, len(counts), room, BLOCK
+        gaussians.ranges.contiguous(), counts, places, nearness, ids, reached, len(counts), capacity, BLOCK
     )
     order = torch.argsort(nearness, stable=True)
     reached = reached[order]
@@ -194,14 +194,14 @@ def _count_tiles(
     tl.store(counts + i, found, mask=i < count)
 
 
-@triton.jit(do_not_specialize=["count", "room"])
+@triton.jit(do_not_specialize=["count", "capacity"])
 @no_type_check
-def _compact(ranges, counts, places, nearness, ids, reached, count, room, BLOCK: tl.constexpr):
+def _compact(ranges, counts, places, nearness, ids, reached, count, capacity, BLOCK: tl.constexpr):
     """Writes the ranges, numbers and counts of Gaussians that reach tiles, in their order."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     tiles = tl.load(counts + i, mask=i < count, other=0)
     place = tl.load(places + i, mask=i < count, other=0) - 1
-    kept = (tiles > 0) & (place < room)
+    kept = (tiles > 0) & (place < capacity)
     tl.store(nearness + place, tl.load(ranges + i, mask=kept, other=0.0), mask=kept)
     tl.store(ids + place, i, mask=kept)
     tl.store(reached + place, tiles, mask=kept)
