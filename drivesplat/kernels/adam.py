@@ -18,8 +18,9 @@ def adam_step(
     """Updates a parameter by its gradient, as torch.optim.Adam does with its `state`, whose step is already
     incremented. A `rate` that is a tensor is read on the device, without host synchronisation.
 
-    Returns a value that is finite only if the gradient is: its norm, or `broken`, which a gradient that is not finite
-    sets to infinity. A norm would read all gradients once more.
+    Returns a value that is finite only if the gradient and its square are. Triton's kernel, which reads the gradient
+    anyway, sets `broken` to infinity where they are not, and returns `broken`, which stays infinite. Otherwise the
+    value is the gradient's norm.
     """
     if isinstance(rate, Tensor) and triton_support.usable_for(parameter):
         from drivesplat.kernels.triton.adam import adam_step as fused_step

@@ -1,4 +1,5 @@
-"""Capacity of the buffers that hold tiles' lists of Gaussians.
+"""Capacity of buffers whose size is known on the device only: tiles' lists of Gaussians, and the Gaussians that reach
+the tiles of a LiDAR scan. The latter count as a list, too.
 
 An exact capacity needs host synchronisation. Where that is not allowed, as in a CUDA graph, buffers get the number of
 entries that the same lists needed before, plus a margin.

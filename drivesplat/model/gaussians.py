@@ -90,11 +90,14 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 
 def concatenate_shapes(sets: Sequence[Gaussians]) -> Gaussians:
     """Several sets as one, as `concatenate`, without colours and echoes."""
-    fields = zip(*((own.means, own.quats, own.scales, own.opacities) for own in sets), strict=True)
+    shapes = [(own.means, own.quats, own.scales, own.opacities) for own in sets]
+    if len(sets) == 1:
+        return replace(without_colors(*shapes[0], None), velocities=sets[0].velocities)
+    joined = without_colors(*(torch.cat(values) for values in zip(*shapes, strict=True)), None)
+    if all(own.velocities is None for own in sets):
+        return joined
     velocities = [torch.zeros_like(own.means) if own.velocities is None else own.velocities for own in sets]
-    moving = any(own.velocities is not None for own in sets)
-    joined = without_colors(*(torch.cat(values) for values in fields), None)
-    return replace(joined, velocities=torch.cat(velocities)) if moving else joined
+    return replace(joined, velocities=torch.cat(velocities))
 
 
 def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, echoes: Tensor | None) -> Gaussians:

@@ -210,7 +210,8 @@ class SplatModel(nn.Module):
     ) -> Picture:
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
-        `gaussians`, a set or several, replace `sets_in(view)`.
+        `gaussians`, a set or several, replace `sets_in(view)`. Of a picture with other sets than one of each part,
+        neither `objects_alpha` nor the terms of static parts can be computed.
         """
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
         shown = concatenate(sets)

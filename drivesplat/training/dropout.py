@@ -28,6 +28,8 @@ def with_dropout(sets: Sequence[Gaussians], model: SplatModel, share: float) -> 
     """
     found = []
     for part, own in zip(model.parts, sets, strict=True):
-        kept = 1.0 if part.moves else torch.rand_like(own.opacities) >= share
-        found.append(own if part.moves else replace(own, opacities=own.opacities * kept))
+        if not part.moves:
+            kept = torch.rand_like(own.opacities) >= share
+            own = replace(own, opacities=own.opacities * kept)
+        found.append(own)
     return found

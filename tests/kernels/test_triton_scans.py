@@ -14,6 +14,8 @@ from drivesplat.rasterization import RayGrid, ScanMotion
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
 from drivesplat.kernels.cuda import scans as cuda_scans
+from drivesplat.kernels.scanned_gaussians import ScannedGaussians
+from drivesplat.kernels.triton import scan_tiles
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 ON_GPU = [pytest.mark.gpu, pytest.mark.skipif(DEVICE.type == "cpu", reason="no GPU")]
@@ -123,6 +125,33 @@ def test_lists_of_planned_capacity_give_the_same_scan():
     assert [int(needed) for needed, _ in lists] == needs
     for name, values in expected.items():
         torch.testing.assert_close(found[name], values, rtol=1e-5, atol=1e-6 * float(values.abs().max()), msg=name)
+
+
+def test_lists_that_overflow_give_a_part_of_the_scan_and_say_what_they_need(monkeypatch):
+    monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
+    monkeypatch.setattr(capacity, "MARGIN", 1.0)
+    scene = random_scan(6, n=300, rays=uneven_rays(6, 4, 41))
+    with capacity.exact() as needs:
+        expected = by_triton(scene, MOTION)["alpha"]
+    for planned in ([need // 2 for need in needs], [0, 0, 0, 0]):
+        with capacity.planned(planned) as lists:
+            found = by_triton(scene, MOTION)
+        assert [int(needed) for needed, _ in lists] == needs and [planned for _, planned in lists] == planned
+        assert all(values.isfinite().all() for values in found.values())
+        assert found["alpha"].sum() < 0.95 * expected.sum() and (found["alpha"] > 0).any() == any(planned)
+
+
+def test_the_last_rows_of_gaussians_are_left_out_where_they_do_not_fit():
+    ranges = torch.tensor([50.0, 40.0, 30.0, 20.0, 10.0, 1.0], device=DEVICE)
+    counts = torch.tensor([2, 0, 1, 3, 1, 1], dtype=torch.int32, device=DEVICE)
+    counted = scan_tiles.CountedTiles(counts, torch.cumsum(counts > 0, dim=0, dtype=torch.int32))
+    gaussians = ScannedGaussians(*(ranges for _ in ScannedGaussians._fields))
+    found = [scan_tiles.reached_tiles(gaussians, counted, capacity) for capacity in (5, 3, 0)]
+    assert [lists.nearest.tolist() for lists in found] == [[5, 4, 3, 2, 0], [3, 2, 0], []]
+    assert [lists.ends.tolist() for lists in found] == [[1, 2, 5, 6, 8], [3, 4, 6], []]
+    more = scan_tiles.reached_tiles(gaussians, counted, 8)
+    assert more.nearest[:5].tolist() == [5, 4, 3, 2, 0] and more.counts.tolist() == [1, 1, 3, 1, 2, 0, 0, 0]
+    assert [int(needed) for needed in counted.needed] == [5, 8]
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.9])

@@ -12,6 +12,7 @@ from torch import nn
 from drivesplat.errors import ResultError
 from drivesplat.kernels import torch_private
 from drivesplat.model.gaussians import concatenate
+from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanView, group_met, scan_picture, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rasterization.scans import RayGrid
@@ -116,12 +117,19 @@ def test_the_echoes_of_an_actor_turn_with_it():
     torch.testing.assert_close(after[:, 1:, 1], torch.tensor([0.0, 3.0, 0.0]).expand(4, 3), atol=1e-5, rtol=0)
 
 
-def test_gaussians_follow_the_time_states_copied_into_the_tensors():
-    """With what they echo and how fast they move then, without colours."""
+@pytest.mark.parametrize("with_offsets", [False, True])
+def test_gaussians_follow_the_time_states_copied_into_the_tensors(with_offsets):
+    """With what they echo, how fast they move then and where only the LiDAR sees them, without colours."""
     motion = motion_through([0.0, 2.0, 4.0], [[10.0, 0.0, 1.0], [14.0, 0.0, 1.0], [26.0, 3.0, 1.0]], [0.0, 0.5, 1.0])
     actors = actors_of(track_of(motion), count=4)
     actors.params["echoes"] = nn.Parameter(torch.randn(4, 4, 2, generator=torch.Generator().manual_seed(0)))
-    model = SplatModel([*walls().parts, actors], None)
+    (still,) = walls().parts
+    if with_offsets:
+        for name, offset in OFFSETS.items():
+            shaken = torch.linspace(-0.2, 0.3, still.params[name].numel()).view_as(still.params[name])
+            still.params[offset] = nn.Parameter(shaken)
+    model = SplatModel([still, actors], None)
+    assert torch.equal(model.gaussians_at(0.5, with_echoes=True).means, model.gaussians_at(0.5).means) != with_offsets
     early, late = model.scan_states(0.5), model.scan_states(3.2)
     inputs = early.copied()
     for time, states in ((0.5, early), (3.2, late)):

@@ -279,9 +279,9 @@ def test_the_rates_of_fine_tuning_decay():
         return group[name].param_groups[0]["lr"] / rates[name]
 
     assert [share_of_rate(step, "means") for step in (0, 40)] == pytest.approx([1.0, 0.1]), "ends with the images"
-    assert [share_of_rate(step, "echoes") for step in (79, 80, 90)] == pytest.approx([1.0, 2.0, 0.2])
-    assert [share_of_rate(step, "lidar_scales") for step in (80, 90)] == pytest.approx([2.0, 0.2])
-    assert [share_of_rate(step, "lidar_means") for step in (80, 90)] == pytest.approx([0.3, 0.03])
+    assert [share_of_rate(step, "echoes") for step in (79, 80, 90)] == pytest.approx([1.0, 6.0, 0.6])
+    assert [share_of_rate(step, "lidar_scales") for step in (80, 90)] == pytest.approx([6.0, 0.6])
+    assert [share_of_rate(step, "lidar_means") for step in (80, 90)] == pytest.approx([0.5, 0.05])
 
 
 def test_fine_tuning_renders_scans_better_and_images_as_before():

@@ -46,10 +46,10 @@ def _step(
     size = (tl.load(rate) / (1.0 - tl.exp(done * log_beta1))).to(tl.float32)
     spread = tl.sqrt(1.0 - tl.exp(done * log_beta2)).to(tl.float32)
     gradient = tl.load(gradients + i, mask=inside, other=0.0)
-    infinite = tl.full((BLOCK,), float("inf"), tl.float32)
-    tl.store(broken + tl.zeros((BLOCK,), tl.int32), infinite, mask=inside & ~(tl.abs(gradient) < infinite))
     average = beta1 * tl.load(averages + i, mask=inside, other=0.0) + rest1 * gradient
     square = beta2 * tl.load(squares + i, mask=inside, other=0.0) + rest2 * gradient * gradient
+    infinite = tl.full((BLOCK,), float("inf"), tl.float32)
+    tl.store(broken + tl.zeros((BLOCK,), tl.int32), infinite, mask=inside & ~(square < infinite))
     value = tl.load(values + i, mask=inside, other=0.0)
     tl.store(averages + i, average, mask=inside)
     tl.store(squares + i, square, mask=inside)

@@ -6,7 +6,8 @@ import triton
 import triton.language as tl
 
 ALIGNED = 4
-"""Values in 16 bytes: the addresses of arrays that follow each other in memory are multiples of as much."""
+"""Values of 32 bits in 16 bytes. Arrays that share memory begin at multiples of it: for other addresses Triton compiles
+another kernel."""
 
 
 @triton.jit

@@ -99,7 +99,7 @@ SHAPES: tuple[tuple[int, ...], ...] = ((2,), (), (3,), (2,))
 
 
 def _by_part(tensors: Sequence[Tensor], each: int) -> list[Sequence[Tensor]]:
-    """The tensors of each part, of which there are so many."""
+    """The tensors of each part; `each` is the number of those of a part."""
     return [tensors[at : at + each] for at in range(0, len(tensors), each)]
 
 
@@ -139,12 +139,12 @@ def _chunks_of(gaussians: ScannedGaussians, values: Tensor, lists: TileLists) ->
 
 def composite_parts(met: Sequence[MetPart], values: Tensor) -> list[tuple[Tensor, ...]]:
     """The results of `ScanCompositing` for each part of a scan. The host waits for the device once."""
-    parts = [Listed(part.rays, part.until, *lists) for part, lists in zip(met, _reached(met), strict=True)]
+    parts = [Listed(part.rays, part.until, *lists) for part, lists in zip(met, _lists_of(met), strict=True)]
     projected = [field for part in met for field in part.gaussians[:FIELDS]]
     return _by_part(ScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
 
 
-def _reached(met: Sequence[MetPart]) -> list[tuple[ReachedTiles | None, int]]:
+def _lists_of(met: Sequence[MetPart]) -> list[tuple[ReachedTiles | None, int]]:
     """The tiles that Gaussians reach in each part, and the capacity of their lists."""
     count = len(met[0].gaussians.ranges)
     if count == 0:

@@ -117,8 +117,7 @@ class ScanProjection(torch.autograd.Function):
 
 def _given(ctx: Any, gradients: Sequence[Tensor | None]) -> list[Tensor]:
     """The gradients of a part's means, ranges, conics and slopes; zeros where there are none."""
-    means = ctx.saved_tensors[0]
-    count = len(means)
+    means, count = ctx.saved_tensors[0], len(ctx.saved_tensors[0])
     sizes = ((count, 2), (count,), (count, 3), (count, 2))
     found = zip(gradients, sizes, strict=True)
     return [means.new_zeros(size) if values is None else values.contiguous() for values, size in found]

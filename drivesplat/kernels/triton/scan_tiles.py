@@ -31,8 +31,8 @@ LAST_BIN = tl.constexpr(BINS - 1)
 
 
 class CountedTiles(NamedTuple):
-    """The number of tiles that each of n Gaussians reaches, at least one of them any, and how many of the Gaussians so
-    far reach some."""
+    """The number of tiles that each of n Gaussians reaches, n being at least 1; and how many of the Gaussians up to and
+    with each reach a tile."""
 
     counts: Int[Tensor, " n"]
     places: Int[Tensor, " n"]
@@ -66,9 +66,9 @@ def count_tiles(gaussians: ScannedGaussians, table: TileTable) -> CountedTiles:
 @torch.no_grad()
 def reached_tiles(gaussians: ScannedGaussians, counted: CountedTiles, capacity: int) -> ReachedTiles:
     """The Gaussians that reach tiles, sorted. Most reach none, and need not be sorted: they are left out first. Where
-    more than `capacity` reach some, the last ones are left out, too."""
+    `capacity` is too small for the others, the last of their rows are left out, whatever their ranges."""
     counts, places = counted
-    ids, reached = torch.zeros(2, capacity, dtype=torch.int32, device=counts.device)
+    ids, reached = (torch.zeros(capacity, dtype=torch.int32, device=counts.device) for _ in range(2))
     nearness = gaussians.ranges.new_full((capacity,), torch.inf)
     _compact[(triton.cdiv(len(counts), BLOCK),)](
         gaussians.ranges.contiguous(), counts, places, nearness, ids, reached, len(counts), capacity, BLOCK
@@ -81,7 +81,8 @@ def reached_tiles(gaussians: ScannedGaussians, counted: CountedTiles, capacity: 
 @torch.no_grad()
 def scan_lists(gaussians: ScannedGaussians, table: TileTable, reached: ReachedTiles | None, capacity: int) -> TileLists:
     """The lists of all tiles of a scan: those of a row by ascending azimuth, row after row, as one camera. Where
-    `capacity`, the number of their entries, is too small, the farthest Gaussians are left out. None: no Gaussian."""
+    `capacity`, the number of their entries, is too small, the farthest of the Gaussians that `reached` holds are left
+    out. None: no Gaussian."""
     (rows, columns), device = table.tiles.shape, gaussians.ranges.device
     tiles = rows * columns
     kind = torch.int16 if tiles < torch.iinfo(torch.int16).max else torch.int32
