@@ -40,6 +40,10 @@ class ScannedGaussians(NamedTuple):
     opacities: Float[Tensor, " n"]
 
 
+PROJECTED = ((2,), (), (3,), (2,), (), (2,))
+"""The shapes of the fields of a Gaussian that its projection gives: all but its opacity."""
+
+
 class FiringTimes(NamedTuple):
     """When each azimuth fires: the azimuths `between` neighbouring firings of revolution after revolution (radians,
     ascending), a + 1 of them, and the `offsets_s` of the a + 2 firings around them."""

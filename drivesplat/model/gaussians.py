@@ -76,8 +76,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         return sets[0]
     degree = max(s.sh_degree for s in sets)
     sets = [with_sh_degree(s, degree) for s in sets]
-    if any(s.velocities is not None for s in sets):
-        sets = [replace(s, velocities=torch.zeros_like(s.means)) if s.velocities is None else s for s in sets]
+    sets = _alike_in_velocities(sets)
     shared = [name for name in sets[0].tensors if all(name in s.tensors for s in sets)]
     return Gaussians(**{name: torch.cat([s.tensors[name] for s in sets]) for name in shared})
 
@@ -90,14 +89,18 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 
 def concatenate_shapes(sets: Sequence[Gaussians]) -> Gaussians:
     """Several sets as one, as `concatenate`, without colours and echoes."""
-    shapes = [(own.means, own.quats, own.scales, own.opacities) for own in sets]
-    if len(sets) == 1:
-        return replace(without_colors(*shapes[0], None), velocities=sets[0].velocities)
-    joined = without_colors(*(torch.cat(values) for values in zip(*shapes, strict=True)), None)
+    tensors = [own.tensors for own in _alike_in_velocities(sets)]
+    names = [name for name in ("means", "quats", "scales", "opacities", "velocities") if name in tensors[0]]
+    joined = {n: torch.cat([own[n] for own in tensors]) if len(sets) > 1 else tensors[0][n] for n in names}
+    velocities = joined.pop("velocities", None)
+    return replace(without_colors(**joined, echoes=None), velocities=velocities)
+
+
+def _alike_in_velocities(sets: Sequence[Gaussians]) -> Sequence[Gaussians]:
+    """The same sets, with velocities of 0 where others have some."""
     if all(own.velocities is None for own in sets):
-        return joined
-    velocities = [torch.zeros_like(own.means) if own.velocities is None else own.velocities for own in sets]
-    return replace(joined, velocities=torch.cat(velocities))
+        return sets
+    return [replace(own, velocities=torch.zeros_like(own.means)) if own.velocities is None else own for own in sets]
 
 
 def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, echoes: Tensor | None) -> Gaussians:

@@ -42,9 +42,9 @@ class RayGrid:
         """The rays of the first and of the second half of a revolution, by time; without an empty half."""
         times = self.offsets_s.median(dim=0).values
         order = times.argsort(stable=True)
-        firings = [half for half in order.tensor_split(2) if len(half)]
+        firings = (half for half in order.tensor_split(2) if len(half))
         parts = [ScanPart(*(values[:, half] for values in self.rays)) for half in firings]
-        return Halves(parts, order, firings, None if bool((times.diff() >= 0).all()) else order.argsort())
+        return Halves(parts, order, None if bool((times.diff() >= 0).all()) else order.argsort())
 
     @property
     def rays(self) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"], Float[Tensor, "b a"]]:
@@ -59,19 +59,23 @@ class RayGrid:
 
 @dataclass(frozen=True)
 class Halves:
-    """The halves of a revolution as `parts`, the firings of the scan in the `order` of their times, those that each
-    half has, and the places of all firings of the scan in this order, unless the scan has it."""
+    """The halves of a revolution as `parts`, the firings of the scan in the `order` of their times, and the places of
+    all firings of the scan in this order, unless the scan has it."""
 
     parts: list[ScanPart]
     order: Int[Tensor, " a"]
-    firings: list[Int[Tensor, " _"]]
     places: Int[Tensor, " a"] | None
+
+    @property
+    def firings(self) -> Sequence[Int[Tensor, " _"]]:
+        """The firings that each half has in the scan."""
+        return self.order.split([part.azimuths.shape[1] for part in self.parts])
 
     @property
     def tensors(self) -> list[Tensor]:
         """All tensors, in a fixed order."""
         places = [] if self.places is None else [self.places]
-        return [*(values for part in self.parts for values in part.tensors), self.order, *self.firings, *places]
+        return [*(values for part in self.parts for values in part.tensors), self.order, *places]
 
     def revolutions(self, motion: "ScanMotion") -> list[Revolution]:
         """The motion during each half."""

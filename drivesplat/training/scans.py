@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from drivesplat.kernels.alpha_entropy import CERTAIN
 from drivesplat.lidar.sweeps import thin
 from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
 from drivesplat.model.splat_model import SplatModel
@@ -21,8 +22,6 @@ from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training.losses import IGNORED_DEPTHS, regularization
 from drivesplat.training.views import view_index
 
-CERTAIN = 1e-4
-"""Distance of probabilities from 0 and 1, for finite logarithms."""
 SCANS_SEED = 7919
 """Added to the training's random seed: the order of scans is another one than that of images."""
 SPACING, NEAR_SEEDS = 0.2, 0.5

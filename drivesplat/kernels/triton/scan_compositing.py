@@ -25,7 +25,7 @@ from drivesplat.kernels.capacity import capacities_for
 from drivesplat.kernels.cuda import scans as cuda_scans
 from drivesplat.kernels.scan_chunks import RaySums, ScanChunks, ScanGradients, TileRays
 from drivesplat.kernels.scan_part import MetPart, ScanPart
-from drivesplat.kernels.scanned_gaussians import ScannedGaussians
+from drivesplat.kernels.scanned_gaussians import PROJECTED, ScannedGaussians
 from drivesplat.kernels.triton.rows import ALIGNED
 from drivesplat.kernels.triton.scan_chunks import RAYS, SIZES, SUMS, rays_of
 from drivesplat.kernels.triton.scan_gradients import remain
@@ -35,10 +35,8 @@ from drivesplat.kernels.triton.tiles import TileLists
 
 JOINED = 8
 """Chunks of a tile that are joined at a time."""
-
-
-FIELDS = len(ScannedGaussians._fields) - 1
-"""Fields of the projected Gaussians of a part: all but their opacities."""
+LEARNED = PROJECTED[:4]
+"""The shapes of the projected fields that gradients reach: means, ranges, conics and slopes."""
 
 
 class Listed(NamedTuple):
@@ -55,8 +53,8 @@ class ScanCompositing(torch.autograd.Function):
     """Sums of ranges, alpha, alpha before `until` and values along the rays of each part of a scan, and the median
     range without gradient, in the order of `drivesplat.kernels.scan_compositing.CompositedScan`, part after part.
 
-    `projected` are the FIELDS of the Gaussians of each part. Gradients reach neither rays nor `range_limits`. Those of
-    opacities and values are added for all parts in one place.
+    `projected` are the fields of the Gaussians of each part but their opacities. Gradients reach neither rays nor
+    `range_limits`. Those of opacities and values are added for all parts in one place.
     """
 
     @staticmethod
@@ -64,7 +62,7 @@ class ScanCompositing(torch.autograd.Function):
         ctx: Any, opacities: Tensor, values: Tensor, parts: Sequence[Listed], *projected: Tensor
     ) -> tuple[Tensor, ...]:
         ctx.chunks, ctx.shape, saved, found = [], values.shape, [opacities, values], []
-        for listed, fields in zip(parts, _by_part(projected, FIELDS), strict=True):
+        for listed, fields in zip(parts, _by_part(projected, len(PROJECTED)), strict=True):
             chunks, kept, seen = _composited(ScannedGaussians(*fields, opacities), values, listed)
             ctx.chunks.append(chunks)
             # `chunks` may read these again: saved here, so that torch notices if they have changed by then
@@ -80,9 +78,9 @@ class ScanCompositing(torch.autograd.Function):
         opacities, _, *saved = ctx.saved_tensors
         count, channels = ctx.shape
         by_part = _by_part(saved, len(saved) // len(ctx.chunks)), _by_part(gradients, 5)
-        v_opacities, v_values, *zeros = _zeros(opacities, count, ((), (channels,), *len(ctx.chunks) * SHAPES))
+        v_opacities, v_values, *zeros = _zeros(opacities, count, ((), (channels,), *len(ctx.chunks) * LEARNED))
         of_fields: list[Tensor | None] = []
-        for chunks, kept, given, own in zip(ctx.chunks, *by_part, _by_part(zeros, len(SHAPES)), strict=True):
+        for chunks, kept, given, own in zip(ctx.chunks, *by_part, _by_part(zeros, len(LEARNED)), strict=True):
             rays, passes, sums, rendered = TileRays(*kept[:4]), kept[4], kept[5], RaySums(*kept[6:10])
             given = RaySums(*(gradient.contiguous() for gradient in given[:4]))
             rest = torch.empty_like(passes)
@@ -92,10 +90,6 @@ class ScanCompositing(torch.autograd.Function):
             chunks.add_gradients(rays, passes, rest, given, ScanGradients(*own, v_opacities, v_values))
             of_fields += [*own, None, None]
         return v_opacities, v_values, None, *of_fields
-
-
-SHAPES: tuple[tuple[int, ...], ...] = ((2,), (), (3,), (2,))
-"""The shapes of a Gaussian's means, range, conic and slopes."""
 
 
 def _by_part(tensors: Sequence[Tensor], each: int) -> list[Sequence[Tensor]]:
@@ -140,7 +134,7 @@ def _chunks_of(gaussians: ScannedGaussians, values: Tensor, lists: TileLists) ->
 def composite_parts(met: Sequence[MetPart], values: Tensor) -> list[tuple[Tensor, ...]]:
     """The results of `ScanCompositing` for each part of a scan. The host waits for the device once."""
     parts = [Listed(part.rays, part.until, *lists) for part, lists in zip(met, _lists_of(met), strict=True)]
-    projected = [field for part in met for field in part.gaussians[:FIELDS]]
+    projected = [field for part in met for field in part.gaussians[: len(PROJECTED)]]
     return _by_part(ScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
 
 

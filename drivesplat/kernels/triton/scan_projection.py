@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.scanned_gaussians import FIRING_STEPS, MAX_DEVIATIONS, MIN_ALPHA, Revolution
+from drivesplat.kernels.scanned_gaussians import FIRING_STEPS, MAX_DEVIATIONS, MIN_ALPHA, PROJECTED, Revolution
 from drivesplat.kernels.triton.rows import ALIGNED, store_quaternion, store_three, three, two, unit
 from drivesplat.kernels.triton.scan_geometry import (
     at_timestamp,
@@ -83,7 +83,7 @@ class ScanProjection(torch.autograd.Function):
         beam_spread: tuple[float, float], max_range: float,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         gaussians = tuple(values.contiguous() for values in (means, quats, scales))
-        count, parts, sizes = len(means), len(motion.counts), ((2,), (), (3,), (2,), (), (2,), ())
+        count, parts, sizes = len(means), len(motion.counts), (*PROJECTED, ())
         room = triton.cdiv(count, ALIGNED) * ALIGNED
         *projected, offsets = (means.new_empty(parts, room, *size) for size in sizes)
         ctx.options = (*beam_spread, max_range)
@@ -117,10 +117,9 @@ class ScanProjection(torch.autograd.Function):
 
 def _given(ctx: Any, gradients: Sequence[Tensor | None]) -> list[Tensor]:
     """The gradients of a part's means, ranges, conics and slopes; zeros where there are none."""
-    means, count = ctx.saved_tensors[0], len(ctx.saved_tensors[0])
-    sizes = ((count, 2), (count,), (count, 3), (count, 2))
-    found = zip(gradients, sizes, strict=True)
-    return [means.new_zeros(size) if values is None else values.contiguous() for values, size in found]
+    means, *_ = ctx.saved_tensors
+    found = zip(gradients, PROJECTED[:4], strict=True)
+    return [means.new_zeros(len(means), *size) if values is None else values.contiguous() for values, size in found]
 
 
 @triton.jit(

@@ -88,8 +88,8 @@ def scan_lists(gaussians: ScannedGaussians, table: TileTable, reached: ReachedTi
     kind = torch.int16 if tiles < torch.iinfo(torch.int16).max else torch.int32
     keys = torch.full((capacity,), tiles, dtype=kind, device=device)
     ids = torch.empty(capacity, dtype=torch.int32, device=device)
-    count = 0 if reached is None else len(reached.nearest)
-    if reached is not None and count:
+    if reached is not None and len(reached.nearest):
+        count = len(reached.nearest)
         _list[(triton.cdiv(count, BLOCK),)](
             *_seen(gaussians), *_arcs(table), *reached, keys, ids, capacity, count, rows, columns, rows.bit_length(),
             BINS, BLOCK,
