@@ -589,6 +589,16 @@ def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, cap
     assert beside.fine_tune or mine[-2] < mine[0], "images, with which scans take turns unless they fine-tune"
 
 
+def test_a_replayed_graph_reports_gradients_that_are_not_finite():
+    trainer, _ = trained_with(True, iterations_done=10)
+    assert trainer.graphs._graphs
+    trainer.model.parts[0].params["opacities"].data[0] = torch.nan
+    with capture_stream(GPU):
+        continued(trainer)
+    with pytest.raises(TrainingError, match=r"iteration 11: .*gradient of background opacities"):
+        trainer.guard.check("nowhere")
+
+
 def test_captured_velocities_are_those_of_the_actors_that_own_the_gaussians_at_a_replay():
     actors = untrained_street(TrainSettings()).parts[1].to(GPU)
     with capture_stream(GPU):

@@ -18,7 +18,7 @@ class GaitSettings(Settings):
     strides: dict[ObjectClassName, Stride] = STRIDES
     """Initial length of a cycle by class, in heights of the box: two steps of a person (0.413 to 0.415 heights each, as
     pedometers take them), a turn of a bicycle's crank. Classes that are not named have that of a pedestrian."""
-    harmonics: int = Field(3, ge=1, le=8)
+    harmonics: int = Field(2, ge=1, le=8)
     """Number of multiples of the phase that deform the object, a cosine and a sine each."""
     lr_stride: float = Field(5e-4, gt=0)
     """Learning rate of the logarithm of a cycle's length."""

@@ -62,6 +62,7 @@ def reduced(view: TrainingView, factor: int) -> TrainingView:
         view=camera,
         pixels=colors.round().to(torch.uint8).permute(1, 2, 0).contiguous(),
         sky=None if view.sky is None else _coverage(view.sky, factor) > 0.5,
+        not_sky=None if view.not_sky is None else _coverage(view.not_sky, factor) == 1.0,
         moving=None if view.moving is None else _coverage(view.moving, factor) > 0.5,
         ego_mask=None if view.ego_mask is None else _coverage(view.ego_mask, factor) > 0.0,
         lidar=None if view.lidar is None else _within(view.lidar, view.view.width, camera, factor),

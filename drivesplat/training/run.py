@@ -21,6 +21,7 @@ from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.actor_record import ActorRecord, read_actors
+from drivesplat.scene.horizon import below_horizon
 from drivesplat.scene.masks import NO_MASKS, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
 from drivesplat.scene.scan_record import RecordedScan, read_scans
@@ -61,6 +62,7 @@ class TrainingInputs:
         """The guides of the training images that `job` uses."""
         images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
+        not_sky_wanted = self.masks is not None and not self.sky_known and job.train.sky_bce_weight
         moving_wanted = self.actors and job.train.dynamic_weight
         return Guides(
             sky=_of_each(images, lambda i: read_sky_mask(*self._image(i))) if sky_wanted else {},
@@ -68,6 +70,7 @@ class TrainingInputs:
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
             classes=_of_each(images, lambda i: read_classes(*self._image(i))) if self.semantic_classes(job) else {},
             ego_mask=_of_each(self.with_ego(images), self.ego_mask),
+            not_sky=_of_each(images, self._below_horizon) if not_sky_wanted else {},
         )
 
     def with_ego(self, images: Sequence[int]) -> list[int]:
@@ -92,6 +95,9 @@ class TrainingInputs:
     def _moving(self, index: int) -> np.ndarray:
         labels = read_labels(*self._image(index))
         return region_mask(labels, "moving_vehicle") | region_mask(labels, "moving_human")
+
+    def _below_horizon(self, index: int) -> np.ndarray:
+        return below_horizon(self.record.Ks[index], self.record.camtoworlds[index], self.record.image_size(index))
 
     def _image(self, index: int) -> tuple[Path, str, int, tuple[int, int]]:
         """What the masks of an image are read by."""

@@ -29,12 +29,14 @@ class LidarDepth:
 @dataclass(frozen=True)
 class TrainingView:
     """A camera and its recorded image, with masks of `sky` and of `moving` objects, `lidar` depth, semantic `classes`
-    (UNLABELLED: none) and the `ego_mask`; each None where it is unknown or not wanted. Pixels of the ego vehicle are in
-    no other mask, have no class and no depth, and do not supervise the training."""
+    (UNLABELLED: none) and the `ego_mask`; each None where it is unknown or not wanted. Without `sky`, `not_sky` has the
+    pixels that certainly do not show the sky. Pixels of the ego vehicle are in no other mask, have no class and no
+    depth, and do not supervise the training."""
 
     view: View
     pixels: UInt8[Tensor, "h w 3"]
     sky: Bool[Tensor, "h w"] | None = None
+    not_sky: Bool[Tensor, "h w"] | None = None
     moving: Bool[Tensor, "h w"] | None = None
     lidar: LidarDepth | None = None
     classes: UInt8[Tensor, "h w"] | None = None
@@ -47,15 +49,16 @@ class TrainingView:
 
 @dataclass(frozen=True)
 class Guides:
-    """Data of training images beside their pixels, by image number: masks (h, w) bool of `sky`, `moving` objects and
-    the ego vehicle (`ego_mask`), `classes` (h, w) uint8, and records of `lidar` (rows, columns, depth). Mappings of
-    unused guides are empty."""
+    """Data of training images beside their pixels, by image number: masks (h, w) bool of `sky`, of what is certainly
+    `not_sky`, of `moving` objects and of the ego vehicle (`ego_mask`), `classes` (h, w) uint8, and records of `lidar`
+    (rows, columns, depth). Mappings of unused guides are empty."""
 
     sky: Mapping[int, np.ndarray]
     moving: Mapping[int, np.ndarray]
     lidar: Mapping[int, PixelDepths]
     classes: Mapping[int, np.ndarray] = field(default_factory=dict)
     ego_mask: Mapping[int, np.ndarray] = field(default_factory=dict)
+    not_sky: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 def load_views(
@@ -70,14 +73,15 @@ def load_views(
     for index, image in zip(images, recorded, strict=True):
         size = record.image_size(index)
         pixels = torch.from_numpy(image.copy()).to(device)
-        sky, moving, classes = (
+        sky, not_sky, moving, classes = (
             torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
-            for masks in (guides.sky, guides.moving, guides.classes)
+            for masks in (guides.sky, guides.not_sky, guides.moving, guides.classes)
         )
         body = guides.ego_mask.get(index)
         lidar = _lidar_depth(guides.lidar[index], size[0], body, device) if index in guides.lidar else None
         ego_mask = _shared(body, known_masks, device) if body is not None and body.any() else None
-        views.append(TrainingView(view_of(record, index, device), pixels, sky, moving, lidar, classes, ego_mask))
+        view = view_of(record, index, device)
+        views.append(TrainingView(view, pixels, sky, not_sky, moving, lidar, classes, ego_mask))
     return views
 
 

@@ -31,7 +31,7 @@ def test_colours_are_means_over_blocks_and_what_fills_none_is_left_out():
     assert small.pixels.dtype == torch.uint8 and small.pixels.shape == (2, 3, 3)
     assert np.abs(small.pixels.numpy() - blocks).max() <= 0.5
     assert (small.view.width, small.view.height, small.view.time, small.view.camera) == (3, 2, 1.5, "CAM_FRONT")
-    assert all(getattr(small, guide) is None for guide in ("sky", "moving", "ego_mask", "lidar", "classes"))
+    assert all(getattr(small, guide) is None for guide in ("sky", "not_sky", "moving", "ego_mask", "lidar", "classes"))
 
 
 @pytest.mark.parametrize("factor", [2, 4])
@@ -56,10 +56,11 @@ def test_blocks_take_masks_by_majority_and_the_ego_mask_by_any_pixel():
     for i, count in enumerate(share.values()):
         block = mask[:, 4 * i : 4 * i + 4]
         block.copy_((torch.arange(16) < count).reshape(4, 4))
-    view = dataclasses.replace(a_view(16, 4), sky=mask, moving=mask, ego_mask=mask)
+    view = dataclasses.replace(a_view(16, 4), sky=mask, not_sky=~mask, moving=mask, ego_mask=mask)
     small = reduced(view, 4)
     assert small.sky.tolist() == small.moving.tolist() == [[False, False, False, True]]
     assert small.ego_mask.tolist() == [[False, True, True, True]]
+    assert small.not_sky.tolist() == [[True, False, False, False]], "the whole block"
 
 
 def test_lidar_keeps_its_depths_at_the_blocks_they_fall_into():

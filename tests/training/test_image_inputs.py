@@ -32,12 +32,19 @@ def inputs_for(views: list[TrainingView], by_camera: bool = False) -> SharedImag
     return SharedImageInputs(TrainingImages(views, settings_of(), 0), by_camera)
 
 
-@pytest.mark.parametrize("drifting", [False, True])
-def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_image(drifting):
+def without_sky_masks(views: list[TrainingView]) -> list[TrainingView]:
+    """The views as of a drive by night: only the lower rows, fewer in each, are certainly no sky."""
+    rows = torch.arange(views[0].view.height)[:, None].expand(-1, views[0].view.width)
+    return [dataclasses.replace(view, sky=None, not_sky=rows > 5 + i) for i, view in enumerate(views)]
+
+
+@pytest.mark.parametrize(("drifting", "night"), [(False, False), (True, False), (False, True)])
+def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_image(drifting, night):
     """One after the other, in inputs of the same addresses, with different amounts of LiDAR depth."""
     settings = settings_of(**ALL_TERMS)
     model = untrained_drifting(settings) if drifting else untrained_street(settings)
     views = [with_depths(view, count) for view, count in zip(guided_views(), (150, 3, 200, 90, 1), strict=False)]
+    views = without_sky_masks(views) if night else views
     shared, addresses = inputs_for(views), set()
     for view in views:
         assert can_share(model, view)

@@ -173,6 +173,23 @@ def test_gaussians_are_kept_out_of_a_masked_sky_of_one_colour_alone(sky, sky_kno
         torch.testing.assert_close(terms["sky_alpha"], wanted)
 
 
+@pytest.mark.parametrize("weight", [0.0, 0.3])
+def test_without_a_sky_mask_alpha_is_raised_where_there_is_certainly_no_sky_and_nowhere_else(weight):
+    model = a_model()
+    picture, view = a_case(model, sky_known=False)
+    not_sky = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    not_sky[HEIGHT // 2 :] = True
+    alpha = picture.alpha.clone().requires_grad_()
+    seen = dataclasses.replace(picture, alpha=alpha)
+    terms = loss_terms(seen, dataclasses.replace(view, not_sky=not_sky), model, TrainSettings(sky_bce_weight=weight))
+    assert ("sky_bce" in terms) is (weight > 0)
+    if weight:
+        expected = -weight * (torch.log(picture.alpha) * not_sky).mean()
+        torch.testing.assert_close(terms["sky_bce"], expected, atol=1e-4 * weight, rtol=0.0)
+        (pull,) = torch.autograd.grad(terms["sky_bce"], alpha)
+        assert (pull[not_sky] < 0).all() and not pull[~not_sky].any()
+
+
 def test_sky_term_is_the_cross_entropy_on_sky_pixels():
     alpha = torch.tensor([[0.2, 0.5, 0.9], [0.99, 0.3, 0.0]])
     sky = torch.tensor([[True, False, True], [False, False, True]])

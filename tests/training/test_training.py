@@ -57,6 +57,7 @@ from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
+from drivesplat.scene.horizon import below_horizon
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train import (
@@ -862,13 +863,22 @@ def test_a_sky_that_is_modelled_is_read(tmp_path):
     assert inputs_in(tmp_path, actors=True).guides(job_of(sky="cubemap")).sky
 
 
-def test_masks_that_know_no_sky_hold_no_pixel_to_be_none(tmp_path):
-    """By night the heuristic finds none: the cross entropy would fill the dark sky with Gaussians."""
+def test_where_no_sky_is_known_only_what_is_below_the_horizon_is_certainly_none(tmp_path):
+    """By night the heuristic finds none: with empty masks the cross entropy would fill the dark sky with Gaussians."""
     inputs = dataclasses.replace(inputs_in(tmp_path, actors=True), sky_known=False)
-    guides = inputs.guides(job_of(("background", "actors"), sky="cubemap", sky_bce_weight=0.1, dynamic_weight=0.1))
-    assert not guides.sky and guides.moving
-    views = load_views(inputs.record, guides, CPU)
-    assert all(view.sky is None for view in views)
+    job = job_of(("background", "actors"), sky="cubemap", sky_bce_weight=0.1, dynamic_weight=0.1)
+    guides = inputs.guides(job)
+    assert not guides.sky and guides.moving and list(guides.not_sky) == [0, 1, 3, 4]
+    for view, i in zip(load_views(inputs.record, guides, CPU), guides.not_sky, strict=True):
+        below = below_horizon(inputs.record.Ks[i], inputs.record.camtoworlds[i], (WIDTH, HEIGHT))
+        assert view.sky is None
+        np.testing.assert_array_equal(view.not_sky.numpy(), below)
+
+
+@pytest.mark.parametrize(("sky_known", "weight"), [(True, 0.1), (False, 0.0)])
+def test_the_horizon_is_not_asked_for_where_the_sky_is_known_or_nothing_uses_it(tmp_path, sky_known, weight):
+    inputs = dataclasses.replace(inputs_in(tmp_path, actors=True), sky_known=sky_known)
+    assert not inputs.guides(job_of(sky="cubemap", sky_bce_weight=weight)).not_sky
 
 
 def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):

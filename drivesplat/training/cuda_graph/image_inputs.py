@@ -16,6 +16,9 @@ from drivesplat.model.splat_model import SplatModel, TimeStates
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.views import LidarDepth, TrainingView
 
+MASKS = ("sky", "not_sky", "moving", "ego_mask")
+"""The masks of an image (`TrainingView`)."""
+
 
 @dataclass(frozen=True)
 class ImageInputs:
@@ -57,7 +60,7 @@ class SharedImageInputs:
     def _copied(self, image: TrainingView, states: TimeStates) -> ImageInputs:
         """New inputs, with the shape of an image and its time states."""
         view = replace(image.view, K=image.view.K.clone(), camera_to_world=image.view.camera_to_world.clone())
-        masks = {name: getattr(image, name) for name in ("sky", "moving", "ego_mask")}
+        masks = {name: getattr(image, name) for name in MASKS}
         copies = {name: mask.clone() for name, mask in masks.items() if mask is not None}
         lidar = None if image.lidar is None else self._room_for(image.lidar)
         own = replace(image, view=view, pixels=image.pixels.clone(), lidar=lidar, **copies)
@@ -79,7 +82,7 @@ def can_share(model: SplatModel, image: TrainingView) -> bool:
 
 def _tensors(image: TrainingView, states: TimeStates) -> list[Tensor]:
     """All tensors of an image but LiDAR depth, and those of time states, in a fixed order."""
-    masks = [mask for mask in (image.sky, image.moving, image.ego_mask) if mask is not None]
+    masks = [mask for mask in (getattr(image, name) for name in MASKS) if mask is not None]
     return [image.view.K, image.view.camera_to_world, image.pixels, *masks, *(v for state in states for v in state)]
 
 
