@@ -224,7 +224,7 @@ class TrainSettings(Settings):
     """Loss weight of -log(1 - alpha) in sky pixels, with `sky: mask` only."""
     sky_bce_weight: float = Field(0.0, ge=0)
     """Loss weight of the binary cross entropy between alpha and the inverse sky mask, for every kind of sky. Where
-    masks know no sky (by night), of that between alpha and 1 below the horizon."""
+    masks know no sky (by night), between alpha and 1 below the horizon and at LiDAR returns."""
     depth_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean absolute difference from LiDAR depth (metres), without the worst 5 % of pixels."""
     smoothness_weight: float = Field(0.0, ge=0)
