@@ -30,6 +30,7 @@ from helpers.trainings import (
     untrained,
     untrained_drifting,
     untrained_street,
+    without_sky_masks,
 )
 from scipy.spatial.transform import Rotation
 
@@ -495,10 +496,11 @@ def rolling(view: View) -> View:
 
 def trained_with(
     capture: bool, iterations: int = 30, iterations_done: int | None = None, shutters: bool = False,
-    recorded: Sequence[RecordedScan] = (), people: bool = False, drifting: bool = False, **settings,
+    recorded: Sequence[RecordedScan] = (), people: bool = False, drifting: bool = False, night: bool = False,
+    **settings,
 ) -> tuple[Trainer, list[float]]:  # fmt: skip
     """A training of background and cars, people or drifting Gaussians, by every loss term, with or without CUDA graphs,
-    rolling shutters, scans."""
+    rolling shutters, scans, by day or by night."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
     echo = initial_echo(recorded) if recorded else None
     model = untrained_drifting(chosen) if drifting else untrained_street(chosen, echo, people)
@@ -506,7 +508,7 @@ def trained_with(
         part.params["scales"].data += 0.5 * torch.randn(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
         )
-    views = guided_views(GPU)
+    views = without_sky_masks(guided_views(GPU)) if night else guided_views(GPU)
     if shutters:
         model.sky = CubemapSky(8, torch.full((3,), 0.5), 1e-2)
         views = [replace(view, view=rolling(view.view)) for view in views]
@@ -533,12 +535,12 @@ def continued(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
     return terms
 
 
-@pytest.mark.parametrize("shutters", [False, True])
-def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, caplog):
+@pytest.mark.parametrize(("shutters", "night"), [(False, False), (True, False), (False, True)])
+def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, night, caplog):
     """Also parameters that learn late: colours depend on direction after images have been captured. Images with rolling
     shutters have a graph each, others one together."""
-    captured, mine = trained_with(True, shutters=shutters, sh_every=0.5)
-    eager, theirs = trained_with(False, shutters=shutters, sh_every=0.5)
+    captured, mine = trained_with(True, shutters=shutters, night=night, sh_every=0.5)
+    eager, theirs = trained_with(False, shutters=shutters, night=night, sh_every=0.5)
     assert not caplog.records, "nothing was refused"
     graphs = len(captured.images.views) if shutters else 1
     assert len(captured.graphs._graphs) == graphs and not eager.graphs._graphs

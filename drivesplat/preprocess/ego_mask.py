@@ -152,7 +152,7 @@ def find_outlines(drive: ComparedImages) -> tuple[tuple[Outline, ...], str | Non
     hits = lidar_images(drive)
     if len(hits) < MIN_IMAGES:
         return (), f"{len(hits)} images have LiDAR; {MIN_IMAGES} are needed to tell the body from an even road"
-    unreached = touching_edge(below_horizon(drive) & (np.sum(hits, axis=0) < 2))
+    unreached = touching_edge(below_ego_horizon(drive) & (np.sum(hits, axis=0) < 2))
     if not unreached.any():
         return (), "LiDAR has returns all along the edge of the images"
     varies, median = variation(drive.images)
@@ -161,7 +161,7 @@ def find_outlines(drive: ComparedImages) -> tuple[tuple[Outline, ...], str | Non
         return (), f"half of the pixels vary by {whole:.0f} grey levels or less: too little to detect constant ones"
     varies, _ = variation(equal_brightness(drive.images, unreached & _rim(unreached.shape, drive.pixels(RING))))
     constant = (
-        (varies < MAX_BODY_VARIATION * whole) & (median > LEVELS[0]) & (median < LEVELS[1]) & below_horizon(drive)
+        (varies < MAX_BODY_VARIATION * whole) & (median > LEVELS[0]) & (median < LEVELS[1]) & below_ego_horizon(drive)
     )
     candidates = components(constant & dilated(unreached, drive.pixels(REACH)), drive)
     bodies = [piece for piece in candidates if contrasts(piece, varies, drive)]
@@ -195,7 +195,7 @@ def variation(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (high - low).max(axis=-1), middle.mean(axis=-1)
 
 
-def below_horizon(drive: ComparedImages) -> np.ndarray:
+def below_ego_horizon(drive: ComparedImages) -> np.ndarray:
     """The pixels (h, w) bool whose rays point downwards in the ego frame."""
     frame = drive.frames[0]
     camera_to_ego = inverse(frame.ego_to_world) @ frame.camera_to_world

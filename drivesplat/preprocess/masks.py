@@ -48,8 +48,8 @@ LIDAR_REACH = 12
 MIN_SKY = 0.005
 """Minimum share of sky over all images. Below it the heuristic, which looks for bright pixels, has found no sky."""
 NO_SKY = (
-    "scene %s: no sky was found, as is usual at night or in a tunnel: the sky loss uses only pixels below the "
-    "horizon and with LiDAR depth; set masks.sky_folder to use your own masks"
+    "scene %s: no sky was found, as is usual at night or in a tunnel: sky losses are disabled; "
+    "set masks.sky_folder to use your own masks"
 )
 
 

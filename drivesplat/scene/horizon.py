@@ -5,8 +5,10 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
+from drivesplat.scene.images import pixel_rays
+
 MARGIN = math.radians(1.0)
-"""Angle by which a ray counts as below the horizon at least: recorded poses pitch, and are not exact."""
+"""Minimum angle in radians of a ray below the horizontal plane. Allows for errors of recorded poses."""
 
 
 def below_horizon(
@@ -21,8 +23,4 @@ def below_horizon(
     >>> below_horizon(K, level, (1, 6))[:, 0].tolist()  # pixels of 0.57 degrees
     [False, False, False, False, True, True]
     """
-    width, height = size
-    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=2)
-    of_pixel = np.linalg.inv(K)
-    rays = pixels @ of_pixel[:, :2].T + of_pixel[:, 2]
-    return rays @ camera_to_world[2, :3] < -math.sin(MARGIN) * np.linalg.norm(rays, axis=2)
+    return pixel_rays(size, K, camera_to_world)[..., 2] < -math.sin(MARGIN)

@@ -223,8 +223,9 @@ class TrainSettings(Settings):
     sky_alpha_weight: float = Field(0.05, ge=0)
     """Loss weight of -log(1 - alpha) in sky pixels, with `sky: mask` only."""
     sky_bce_weight: float = Field(0.0, ge=0)
-    """Loss weight of the binary cross entropy between alpha and the inverse sky mask, for every kind of sky. Where
-    masks know no sky (by night), between alpha and 1 below the horizon and at LiDAR returns."""
+    """Loss weight of the binary cross entropy between alpha and the inverse sky mask, for every kind of sky."""
+    horizon_weight: float = Field(0.0, ge=0)
+    """Loss weight of -ln(alpha) in pixels below the horizon where masks know no sky. docs/real_logs.md"""
     depth_weight: float = Field(0.0, ge=0)
     """Loss weight of the mean absolute difference from LiDAR depth (metres), without the worst 5 % of pixels."""
     smoothness_weight: float = Field(0.0, ge=0)

@@ -50,8 +50,9 @@ class TrainingImages:
 
 def reduced(view: TrainingView, factor: int) -> TrainingView:
     """A view at 1 / `factor` of its width and height. Colours are averaged over blocks of pixels; a block is sky or
-    moving where most of its pixels are, and ego vehicle where any is. All LiDAR returns are kept; the class of a block
-    is that of its centre. Incomplete blocks at the right and lower edge are dropped."""
+    moving where most of its pixels are, ego vehicle where any is, and cannot be sky where none of them can. All LiDAR
+    returns are kept; the class of a block is that of its centre. Incomplete blocks at the right and lower edge are
+    dropped."""
     width, height = view.view.width // factor, view.view.height // factor
     K = view.view.K.clone()
     K[:2] /= factor

@@ -44,9 +44,9 @@ def loss_terms(
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
         terms["sky_bce"] = settings.sky_bce_weight * mean_cross_entropy(alpha, view.sky)
-    if view.not_sky is not None and settings.sky_bce_weight:
+    if view.not_sky is not None and settings.horizon_weight:
         certain = alpha.masked_fill(~view.not_sky, 1.0)
-        terms["sky_bce"] = settings.sky_bce_weight * mean_cross_entropy(certain, torch.zeros_like(view.not_sky))
+        terms["horizon"] = settings.horizon_weight * mean_cross_entropy(certain, torch.zeros_like(view.not_sky))
     if view.lidar is not None and picture.depth is not None:
         terms["depth"] = settings.depth_weight * depth_loss(picture.depth, view.lidar)
     if picture.depth is not None and settings.smoothness_weight:

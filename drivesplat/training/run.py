@@ -62,7 +62,7 @@ class TrainingInputs:
         """The guides of the training images that `job` uses."""
         images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
-        not_sky_wanted = self.masks is not None and not self.sky_known and job.train.sky_bce_weight
+        not_sky_wanted = self.masks is not None and not self.sky_known and job.train.horizon_weight
         moving_wanted = self.actors and job.train.dynamic_weight
         return Guides(
             sky=_of_each(images, lambda i: read_sky_mask(*self._image(i))) if sky_wanted else {},
@@ -70,7 +70,7 @@ class TrainingInputs:
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
             classes=_of_each(images, lambda i: read_classes(*self._image(i))) if self.semantic_classes(job) else {},
             ego_mask=_of_each(self.with_ego(images), self.ego_mask),
-            not_sky=_of_each(images, self._not_sky) if not_sky_wanted else {},
+            not_sky=_of_each(images, self._below_horizon) if not_sky_wanted else {},
         )
 
     def with_ego(self, images: Sequence[int]) -> list[int]:
@@ -96,14 +96,8 @@ class TrainingInputs:
         labels = read_labels(*self._image(index))
         return region_mask(labels, "moving_vehicle") | region_mask(labels, "moving_human")
 
-    def _not_sky(self, index: int) -> np.ndarray:
-        """The pixels (h, w) of an image that certainly do not show the sky: below the horizon, or with LiDAR depth."""
-        record = self.record
-        found = below_horizon(record.Ks[index], record.camtoworlds[index], record.image_size(index))
-        if self.lidar_depth:
-            depth = self.lidar_depth[index]
-            found[depth.rows, depth.columns] = True
-        return found
+    def _below_horizon(self, index: int) -> np.ndarray:
+        return below_horizon(self.record.Ks[index], self.record.camtoworlds[index], self.record.image_size(index))
 
     def _image(self, index: int) -> tuple[Path, str, int, tuple[int, int]]:
         """What the masks of an image are read by."""

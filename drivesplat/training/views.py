@@ -29,9 +29,9 @@ class LidarDepth:
 @dataclass(frozen=True)
 class TrainingView:
     """A camera and its recorded image, with masks of `sky` and of `moving` objects, `lidar` depth, semantic `classes`
-    (UNLABELLED: none) and the `ego_mask`; each None where it is unknown or not wanted. Without `sky`, `not_sky` has the
-    pixels that certainly do not show the sky. Pixels of the ego vehicle are in no other mask, have no class and no
-    depth, and do not supervise the training."""
+    (UNLABELLED: none) and the `ego_mask`; each None where it is unknown or not wanted. `not_sky` marks pixels that
+    cannot show the sky; it is set only where `sky` is unknown. Pixels of the ego vehicle are in no other mask, have no
+    class and no depth, and do not supervise the training."""
 
     view: View
     pixels: UInt8[Tensor, "h w 3"]
@@ -49,8 +49,8 @@ class TrainingView:
 
 @dataclass(frozen=True)
 class Guides:
-    """Data of training images beside their pixels, by image number: masks (h, w) bool of `sky`, of what is certainly
-    `not_sky`, of `moving` objects and of the ego vehicle (`ego_mask`), `classes` (h, w) uint8, and records of `lidar`
+    """Data of training images beside their pixels, by image number: masks (h, w) bool of `sky`, of what cannot be sky
+    (`not_sky`), of `moving` objects and of the ego vehicle (`ego_mask`), `classes` (h, w) uint8, and records of `lidar`
     (rows, columns, depth). Mappings of unused guides are empty."""
 
     sky: Mapping[int, np.ndarray]
@@ -80,6 +80,8 @@ def load_views(
         body = guides.ego_mask.get(index)
         lidar = _lidar_depth(guides.lidar[index], size[0], body, device) if index in guides.lidar else None
         ego_mask = _shared(body, known_masks, device) if body is not None and body.any() else None
+        if not_sky is not None and ego_mask is not None:
+            not_sky &= ~ego_mask
         view = view_of(record, index, device)
         views.append(TrainingView(view, pixels, sky, not_sky, moving, lidar, classes, ego_mask))
     return views

@@ -158,8 +158,15 @@ def guided_views(device: torch.device = CPU) -> list[TrainingView]:
     return views
 
 
+def without_sky_masks(views: list[TrainingView]) -> list[TrainingView]:
+    """The views as of a drive by night: no sky is known, and the lower rows, fewer in each, cannot show it."""
+    rows = torch.arange(HEIGHT, device=views[0].pixels.device)[:, None].expand(HEIGHT, WIDTH)
+    return [dataclasses.replace(view, sky=None, not_sky=rows > 5 + i) for i, view in enumerate(views)]
+
+
 ALL_TERMS = {
     "sky_bce_weight": 0.05,
+    "horizon_weight": 0.05,
     "depth_weight": 0.01,
     "smoothness_weight": 0.1,
     "entropy_weight": 0.1,

@@ -245,7 +245,7 @@ def test_a_placement_that_stands_has_no_velocity_and_one_that_walks_on_the_spot_
 
 
 def test_penalties_grow_with_displacements_and_their_order():
-    part = people_of(walker(), fourier=5)
+    part = people_of(walker(), fourier=5, gait=GaitSettings(harmonics=3))
     squared_orders = [1, 1, 4, 4, 9, 9, 1, 4, 9, 16]
     assert part.shared["lattice"].shape[1] == len(squared_orders)
     sizes = []
@@ -262,7 +262,7 @@ def test_penalties_grow_with_displacements_and_their_order():
 def test_leaving_the_box_is_penalised_where_the_object_is_present():
     """By the mean distance, over the axes, beyond the box and its margin; of two objects, one is absent early."""
     late = track_of(motion_through(TIMES[4:], [[t, 5.0, 0.9] for t in TIMES[4:]], 0.0 * TIMES[4:]), "late", SIZE)
-    part = people_of(walker(), late, out_of_box_weight=2.0)
+    part = people_of(walker(), late, out_of_box_weight=2.0, gait=GaitSettings(harmonics=3))
     for time, rows in ((0.5, slice(0, 40)), (3.0, slice(0, 80))):
         places = in_box(part, time)[rows].abs().numpy()
         beyond = np.clip(places - (0.5 * np.array(SIZE) + part._settings.box_margin), 0.0, None).sum(axis=1)

@@ -6,7 +6,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from helpers.trainings import ALL_TERMS, guided_views, settings_of, untrained_drifting, untrained_street
+from helpers.trainings import (
+    ALL_TERMS,
+    guided_views,
+    settings_of,
+    untrained_drifting,
+    untrained_street,
+    without_sky_masks,
+)
 
 from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.model.camera_poses import CameraPoses
@@ -32,12 +39,6 @@ def inputs_for(views: list[TrainingView], by_camera: bool = False) -> SharedImag
     return SharedImageInputs(TrainingImages(views, settings_of(), 0), by_camera)
 
 
-def without_sky_masks(views: list[TrainingView]) -> list[TrainingView]:
-    """The views as of a drive by night: only the lower rows, fewer in each, are certainly no sky."""
-    rows = torch.arange(views[0].view.height)[:, None].expand(-1, views[0].view.width)
-    return [dataclasses.replace(view, sky=None, not_sky=rows > 5 + i) for i, view in enumerate(views)]
-
-
 @pytest.mark.parametrize(("drifting", "night"), [(False, False), (True, False), (False, True)])
 def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_image(drifting, night):
     """One after the other, in inputs of the same addresses, with different amounts of LiDAR depth."""
@@ -54,7 +55,7 @@ def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_i
         sets = model.sets_at_time_states(inputs.states)
         together = model.render(inputs.view.view, gaussians=sets, with_depth=True)
         expected, found = loss_terms(alone, view, model, settings), loss_terms(together, inputs.view, model, settings)
-        assert found.keys() == expected.keys() and {"depth", "sky_bce"} <= found.keys()
+        assert found.keys() == expected.keys() and {"depth", "horizon" if night else "sky_bce"} <= found.keys()
         torch.testing.assert_close(found, expected)
         pulls = [
             torch.autograd.grad(sum(terms.values()), [part.params["means"] for part in model.parts])
@@ -73,11 +74,12 @@ def test_images_of_other_shapes_have_inputs_of_their_own_and_those_of_other_came
         views[0],
         reduced(views[0], 2),
         dataclasses.replace(views[0], sky=None),
+        dataclasses.replace(views[0], sky=None, not_sky=views[0].sky),
         dataclasses.replace(views[0], lidar=None),
         dataclasses.replace(views[0], view=dataclasses.replace(views[0].view, camera="CAM_BACK")),
     ]
     shared = inputs_for(views, by_camera)
-    assert [shared.load(view, states).number for view in (*others, *others)] == [0, 1, 2, 3, 4 * by_camera] * 2
+    assert [shared.load(view, states).number for view in (*others, *others)] == [0, 1, 2, 3, 4, 5 * by_camera] * 2
 
 
 def test_inputs_do_not_change_the_image_that_they_were_made_of():

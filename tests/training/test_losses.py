@@ -181,12 +181,12 @@ def test_without_a_sky_mask_alpha_is_raised_where_there_is_certainly_no_sky_and_
     not_sky[HEIGHT // 2 :] = True
     alpha = picture.alpha.clone().requires_grad_()
     seen = dataclasses.replace(picture, alpha=alpha)
-    terms = loss_terms(seen, dataclasses.replace(view, not_sky=not_sky), model, TrainSettings(sky_bce_weight=weight))
-    assert ("sky_bce" in terms) is (weight > 0)
+    terms = loss_terms(seen, dataclasses.replace(view, not_sky=not_sky), model, TrainSettings(horizon_weight=weight))
+    assert ("horizon" in terms) is (weight > 0)
     if weight:
         expected = -weight * (torch.log(picture.alpha) * not_sky).mean()
-        torch.testing.assert_close(terms["sky_bce"], expected, atol=1e-4 * weight, rtol=0.0)
-        (pull,) = torch.autograd.grad(terms["sky_bce"], alpha)
+        torch.testing.assert_close(terms["horizon"], expected, atol=1e-4 * weight, rtol=0.0)
+        (pull,) = torch.autograd.grad(terms["horizon"], alpha)
         assert (pull[not_sky] < 0).all() and not pull[~not_sky].any()
 
 
@@ -543,8 +543,18 @@ def beneath(seen: TrainingView) -> TrainingView:
     )
 
 
+def by_night(seen: TrainingView) -> TrainingView:
+    """The view without sky mask, and with pixels below the horizon, of which the ego vehicle hides some."""
+    below = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    below[6:] = True
+    return dataclasses.replace(seen, sky=None, not_sky=below)
+
+
 EVERYTHING = TrainSettings(
-    **dict.fromkeys(WEIGHTS.values(), 0.3), semantic_weight=0.3, gaussians=GaussianSettings(init_opacity=0.6)
+    **dict.fromkeys(WEIGHTS.values(), 0.3),
+    horizon_weight=0.3,
+    semantic_weight=0.3,
+    gaussians=GaussianSettings(init_opacity=0.6),
 )
 
 
@@ -554,14 +564,16 @@ def image_terms(picture: Picture, view: TrainingView, model: SplatModel) -> dict
     return {name: term for name, term in terms.items() if not name.endswith("_reg") and not name.startswith("track")}
 
 
-def test_no_term_has_a_gradient_behind_the_ego_mask():
+@pytest.mark.parametrize("night", [False, True])
+def test_no_term_has_a_gradient_behind_the_ego_mask(night):
     """Colours, opacities and depths of its pixels get no gradient; those of all others get that of the picture with
     the recorded body in its place."""
     model, picture, seen = street()
-    view = beneath(seen)
+    view = by_night(beneath(seen)) if night else beneath(seen)
     leaves = {name: getattr(picture, name).detach().clone().requires_grad_() for name in ("image", "alpha", "depth")}
     terms = image_terms(dataclasses.replace(picture, **leaves), view, model)
-    assert terms.keys() == {"l1", "ssim", "sky_alpha", "sky_bce", "depth", "entropy", "dynamic"}
+    of_sky = {"horizon"} if night else {"sky_alpha", "sky_bce"}
+    assert terms.keys() == of_sky | {"l1", "ssim", "depth", "entropy", "dynamic"}
     sum(term for name, term in terms.items() if name != "entropy").backward()
     for name, leaf in leaves.items():
         assert leaf.grad.abs().sum() > 0.0, name
@@ -571,9 +583,10 @@ def test_no_term_has_a_gradient_behind_the_ego_mask():
     assert leaves["image"].grad[beside].abs().min() > 0.0, "what is seen beside the body still counts"
 
 
-def test_pixels_of_the_ego_mask_change_no_term():
+@pytest.mark.parametrize("night", [False, True])
+def test_pixels_of_the_ego_mask_change_no_term(night):
     model, picture, seen = street()
-    view = beneath(seen)
+    view = by_night(beneath(seen)) if night else beneath(seen)
     hidden = dataclasses.replace(
         picture,
         image=torch.where(view.ego_mask[..., None], 0.1, picture.image),

@@ -48,7 +48,8 @@ class SharedImageInputs:
         """The inputs of this shape, which hold an image and its time states from now on."""
         given = _tensors(image, states)
         camera = image.view.camera if self.by_camera else None
-        shape = (camera, image.lidar is None, *((values.shape, values.dtype) for values in given))
+        masks = tuple(name for name in MASKS if getattr(image, name) is not None)
+        shape = (camera, image.lidar is None, masks, *((values.shape, values.dtype) for values in given))
         own = self._by_shape.get(shape)
         if own is None:
             own = self._by_shape[shape] = self._copied(image, states)
