@@ -42,6 +42,8 @@ class ScannedGaussians(NamedTuple):
 
 PROJECTED = ((2,), (), (3,), (2,), (), (2,))
 """The shapes of the fields of a Gaussian that its projection gives: all but its opacity."""
+LEARNED = PROJECTED[:4]
+"""The shapes of those that gradients reach: means, ranges, conics and slopes."""
 
 
 class FiringTimes(NamedTuple):

@@ -25,7 +25,7 @@ from drivesplat.kernels.capacity import capacities_for
 from drivesplat.kernels.cuda import scans as cuda_scans
 from drivesplat.kernels.scan_chunks import RaySums, ScanChunks, ScanGradients, TileRays
 from drivesplat.kernels.scan_part import MetPart, ScanPart
-from drivesplat.kernels.scanned_gaussians import PROJECTED, ScannedGaussians
+from drivesplat.kernels.scanned_gaussians import LEARNED, PROJECTED, ScannedGaussians
 from drivesplat.kernels.triton.rows import ALIGNED
 from drivesplat.kernels.triton.scan_chunks import RAYS, SIZES, SUMS, rays_of
 from drivesplat.kernels.triton.scan_gradients import remain
@@ -35,8 +35,6 @@ from drivesplat.kernels.triton.tiles import TileLists
 
 JOINED = 8
 """Chunks of a tile that are joined at a time."""
-LEARNED = PROJECTED[:4]
-"""The shapes of the projected fields that gradients reach: means, ranges, conics and slopes."""
 
 
 class Listed(NamedTuple):

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.scanned_gaussians import FIRING_STEPS, MAX_DEVIATIONS, MIN_ALPHA, PROJECTED, Revolution
+from drivesplat.kernels.scanned_gaussians import FIRING_STEPS, LEARNED, MAX_DEVIATIONS, MIN_ALPHA, PROJECTED, Revolution
 from drivesplat.kernels.triton.rows import ALIGNED, store_quaternion, store_three, three, two, unit
 from drivesplat.kernels.triton.scan_geometry import (
     at_timestamp,
@@ -118,7 +118,7 @@ class ScanProjection(torch.autograd.Function):
 def _given(ctx: Any, gradients: Sequence[Tensor | None]) -> list[Tensor]:
     """The gradients of a part's means, ranges, conics and slopes; zeros where there are none."""
     means, *_ = ctx.saved_tensors
-    found = zip(gradients, PROJECTED[:4], strict=True)
+    found = zip(gradients, LEARNED, strict=True)
     return [means.new_zeros(len(means), *size) if values is None else values.contiguous() for values, size in found]
 
 

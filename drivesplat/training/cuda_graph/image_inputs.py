@@ -16,9 +16,6 @@ from drivesplat.model.splat_model import SplatModel, TimeStates
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.views import LidarDepth, TrainingView
 
-MASKS = ("sky", "not_sky", "moving", "ego_mask")
-"""The masks of an image (`TrainingView`)."""
-
 
 @dataclass(frozen=True)
 class ImageInputs:
@@ -48,8 +45,7 @@ class SharedImageInputs:
         """The inputs of this shape, which hold an image and its time states from now on."""
         given = _tensors(image, states)
         camera = image.view.camera if self.by_camera else None
-        masks = tuple(name for name in MASKS if getattr(image, name) is not None)
-        shape = (camera, image.lidar is None, masks, *((values.shape, values.dtype) for values in given))
+        shape = (camera, image.lidar is None, *_masks(image), *((values.shape, values.dtype) for values in given))
         own = self._by_shape.get(shape)
         if own is None:
             own = self._by_shape[shape] = self._copied(image, states)
@@ -61,8 +57,7 @@ class SharedImageInputs:
     def _copied(self, image: TrainingView, states: TimeStates) -> ImageInputs:
         """New inputs, with the shape of an image and its time states."""
         view = replace(image.view, K=image.view.K.clone(), camera_to_world=image.view.camera_to_world.clone())
-        masks = {name: getattr(image, name) for name in MASKS}
-        copies = {name: mask.clone() for name, mask in masks.items() if mask is not None}
+        copies = {name: mask.clone() for name, mask in _masks(image).items()}
         lidar = None if image.lidar is None else self._room_for(image.lidar)
         own = replace(image, view=view, pixels=image.pixels.clone(), lidar=lidar, **copies)
         return ImageInputs(len(self._by_shape), own, [[values.clone() for values in state] for state in states])
@@ -83,8 +78,14 @@ def can_share(model: SplatModel, image: TrainingView) -> bool:
 
 def _tensors(image: TrainingView, states: TimeStates) -> list[Tensor]:
     """All tensors of an image but LiDAR depth, and those of time states, in a fixed order."""
-    masks = [mask for mask in (getattr(image, name) for name in MASKS) if mask is not None]
+    masks = _masks(image).values()
     return [image.view.K, image.view.camera_to_world, image.pixels, *masks, *(v for state in states for v in state)]
+
+
+def _masks(image: TrainingView) -> dict[str, Tensor]:
+    """The masks that an image has, by name."""
+    masks = {"sky": image.sky, "not_sky": image.not_sky, "moving": image.moving, "ego_mask": image.ego_mask}
+    return {name: mask for name, mask in masks.items() if mask is not None}
 
 
 def _load_depths(own: LidarDepth, given: LidarDepth) -> None:
