@@ -473,7 +473,7 @@ compiled(placement._place, BLOCK=placement.BLOCK)
 compiled(placement._place_backward, BLOCK=placement.BLOCK)
 for kernel in (time_varying_colors._colors, time_varying_colors._colors_backward):
     for k in (1, 4, 16):
-        compiled(kernel, TERMS=5, K=k, PADDED=k, BLOCK=time_varying_colors.COEFFICIENTS // k)
+        compiled(kernel, TERMS=5, K=k, PADDED=k, BLOCK=time_varying_colors.PRODUCTS // (4 * k**2))
 compiled(color_difference._window_along_rows, TAPS=11, BLOCK=color_difference.BLOCK)
 compiled(color_difference._means_along_rows, HIDDEN=True, TAPS=11, BLOCK=color_difference.BLOCK)
 compiled(color_difference._means_along_rows, HIDDEN=False, hidden=None, TAPS=11, BLOCK=color_difference.BLOCK)

@@ -8,8 +8,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-COEFFICIENTS = 512
-"""Harmonics per program."""
+PRODUCTS = 2048
+"""Products of a coefficient and a rotation's entry per program."""
 
 
 class ColorsInWorld(torch.autograd.Function):
@@ -40,8 +40,12 @@ def _launch(kernel: Any, *arguments: Any) -> None:
     coefficients."""
     *_, count, _, coefficients = arguments
     padded = triton.next_power_of_2(coefficients)
-    block = COEFFICIENTS // padded
+    block = PRODUCTS // (4 * padded**2)
     kernel[(triton.cdiv(count, block),)](*arguments, padded, block)
+
+
+# Neighbouring threads have neighbouring color channels, padded from 3 to 4, then neighbouring coefficients: they read and
+# write whole rows of memory.
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -50,17 +54,14 @@ def _colors(
     sh0, shN, series, rotations, owner, colors, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i, k, valid, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
-    for channel in tl.static_range(3):
-        own = tl.zeros((BLOCK, PADDED), tl.float32)
-        for term in tl.static_range(TERMS):
-            weight = tl.load(series + object_ * TERMS + term, mask=valid, other=0.0)[:, None]
-            row = (i * TERMS + term)[:, None]
-            of_first = tl.load(sh0 + row * 3 + channel + 0 * k[None, :], mask=first, other=0.0)
-            of_others = tl.load(shN + (row * (K - 1) + k[None, :] - 1) * 3 + channel, mask=others, other=0.0)
-            own += weight * (of_first + of_others)
-        rotated = tl.sum(rotation * own[:, None, :], axis=2)
-        tl.store(colors + (i[:, None] * K + k[None, :]) * 3 + channel, rotated, mask=first | others)
+    i, k, channel, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
+    own = tl.zeros((BLOCK, PADDED, 4), tl.float32)
+    for term in tl.static_range(TERMS):
+        weight = tl.load(series + object_ * TERMS + term, mask=i < count, other=0.0)[:, None, None]
+        of_first, of_others = _places(sh0, shN, i * TERMS + term, k, channel, K)
+        own += weight * (tl.load(of_first, mask=first, other=0.0) + tl.load(of_others, mask=others, other=0.0))
+    rotated = tl.sum(rotation * own[:, None, :, :], axis=2)
+    tl.store(_place(colors, i, k, channel, K), rotated, mask=first | others)
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -69,28 +70,40 @@ def _colors_backward(
     v_colors, series, rotations, owner, v_sh0, v_shN, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i, k, valid, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
-    for channel in tl.static_range(3):
-        given = tl.load(v_colors + (i[:, None] * K + k[None, :]) * 3 + channel, mask=first | others, other=0.0)
-        own = tl.sum(rotation * given[:, :, None], axis=1)
-        for term in tl.static_range(TERMS):
-            value = tl.load(series + object_ * TERMS + term, mask=valid, other=0.0)[:, None] * own
-            row = (i * TERMS + term)[:, None]
-            tl.store(v_sh0 + row * 3 + channel + 0 * k[None, :], value, mask=first)
-            tl.store(v_shN + (row * (K - 1) + k[None, :] - 1) * 3 + channel, value, mask=others)
+    i, k, channel, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
+    given = tl.load(_place(v_colors, i, k, channel, K), mask=first | others, other=0.0)
+    own = tl.sum(rotation * given[:, :, None, :], axis=1)
+    for term in tl.static_range(TERMS):
+        value = tl.load(series + object_ * TERMS + term, mask=i < count, other=0.0)[:, None, None] * own
+        of_first, of_others = _places(v_sh0, v_shN, i * TERMS + term, k, channel, K)
+        tl.store(of_first, value, mask=first)
+        tl.store(of_others, value, mask=others)
 
 
 @triton.jit
 @no_type_check
 def _harmonics(rotations, owner, count, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr):
-    """The Gaussians i and coefficients k of a program; which i exist, and their objects; the masks over i and k of the
-    first and of the other coefficients; and the rotation matrices of the objects' harmonics."""
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    k = tl.arange(0, PADDED)
-    valid = i < count
-    object_ = tl.load(owner + i, mask=valid, other=0)
-    first = valid[:, None] & (k == 0)[None, :]
-    others = valid[:, None] & ((k > 0) & (k < K))[None, :]
+    """The Gaussians i, coefficients k and color channels of a program; the Gaussians' objects; the masks over i, k and
+    channels of the first and of the other coefficients; and the rotation matrices of the objects' harmonics, with a
+    last axis of length 1."""
+    i, k, channel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, PADDED), tl.arange(0, 4)
+    object_ = tl.load(owner + i, mask=i < count, other=0)
+    known = (i < count)[:, None, None] & (k < K)[None, :, None]
+    exists, is_first = known & (channel < 3)[None, None, :], (k == 0)[None, :, None]
     at = (object_[:, None, None] * K + k[None, :, None]) * K + k[None, None, :]
-    known = valid[:, None, None] & (k < K)[None, :, None] & (k < K)[None, None, :]
-    return i, k, valid, object_, first, others, tl.load(rotations + at, mask=known, other=0.0)
+    rotation = tl.load(rotations + at, mask=known & (k < K)[None, None, :], other=0.0)
+    return i, k, channel, object_, exists & is_first, exists & ~is_first, rotation[:, :, :, None]
+
+
+@triton.jit
+@no_type_check
+def _place(colors, row, k, channel, K: tl.constexpr):
+    """Where coefficients k, of K, of rows stand."""
+    return colors + (row[:, None, None] * K + k[None, :, None]) * 3 + channel[None, None, :]
+
+
+@triton.jit
+@no_type_check
+def _places(sh0, shN, row, k, channel, K: tl.constexpr):
+    """Where the first and the other coefficients of rows stand."""
+    return _place(sh0, row, 0 * k, channel, 1), _place(shN, row, k - 1, channel, K - 1)

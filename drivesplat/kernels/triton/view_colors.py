@@ -9,12 +9,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.spherical_harmonics import SH_C0
-from drivesplat.kernels.triton.rows import store_three, three
 
-BLOCK = 256
+BLOCK = 64
 """Gaussians per program."""
 CONSTANT, LINEAR = tl.constexpr(SH_C0), tl.constexpr(0.4886025119029199)
-"""The factors of the functions of degree 0 and 1, in the order and with the signs of 3D Gaussian Splatting."""
+"""The factors of the functions of degree 0 and 1. Those of degree 1 are -y, z and -x of the direction, in this order,
+as in 3D Gaussian Splatting."""
 
 
 class ViewColors(torch.autograd.Function):
@@ -46,29 +46,49 @@ class ViewColors(torch.autograd.Function):
         return v_means, v_sh0, v_shN, None, None
 
 
+# Index k is that of a function of degree 1, channel that of a color; both are padded from 3 to 4. Neighbouring threads
+# have neighbouring channels, then neighbouring k: they read and write whole rows of memory.
+
+
 @triton.jit
 @no_type_check
-def _direction(means, camera, i, valid):
-    """Unit vectors from the camera to the means, and their distances."""
-    x, y, z = three(means, i, valid)
-    x, y, z = x - tl.load(camera + 3), y - tl.load(camera + 7), z - tl.load(camera + 11)
-    length = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
-    return x / length, y / length, z / length, length
+def _directions(means, camera, i, k, valid):
+    """Coordinates of the unit vectors from the camera to the means in the order of the functions of degree 1, y, z and
+    x; where they stand in rows of `means`, which of them exist, and the distances to the camera."""
+    at = 3 * i[:, None] + ((k + 1) % 3)[None, :]
+    exists = valid[:, None] & (k < 3)[None, :]
+    eye = tl.load(camera + 4 * ((k + 1) % 3) + 3)[None, :]
+    offset = tl.where(exists, tl.load(means + at, mask=exists, other=0.0) - eye, 0.0)
+    length = tl.maximum(tl.sqrt(tl.sum(offset * offset, 1)), 1e-12)
+    return offset / length[:, None], at, exists, length
+
+
+@triton.jit
+@no_type_check
+def _signed(k):
+    """The factors of y, z and x in the functions of degree 1."""
+    return tl.where(k == 1, LINEAR, -LINEAR)[None, :]
+
+
+@triton.jit
+@no_type_check
+def _indices(i, k, channel, valid, OTHERS: tl.constexpr):
+    """Where the colors of Gaussians i, and their coefficients of degree 1, stand in memory, and which of them exist."""
+    color, known = 3 * i[:, None] + channel[None, :], valid[:, None] & (channel < 3)[None, :]
+    linear = 3 * OTHERS * i[:, None, None] + 3 * k[None, :, None] + channel[None, None, :]
+    return color, known, linear, known[:, None, :] & (k < 3)[None, :, None]
 
 
 @triton.jit(do_not_specialize=["count"])
 @no_type_check
 def _colors(means, sh0, shN, camera, colors, count, OTHERS: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr):
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    valid = i < count
-    x, y, z, _ = _direction(means, camera, i, valid)
-    for channel in tl.static_range(3):
-        color = CONSTANT * tl.load(sh0 + 3 * i + channel, mask=valid, other=0.0) + 0.5
-        if DEGREE == 1:
-            own = shN + 3 * OTHERS * i + channel
-            by_y, by_z = tl.load(own, mask=valid, other=0.0), tl.load(own + 3, mask=valid, other=0.0)
-            color += LINEAR * (z * by_z - y * by_y - x * tl.load(own + 6, mask=valid, other=0.0))
-        tl.store(colors + 3 * i + channel, tl.maximum(color, 0.0), mask=valid)
+    i, k, channel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4), tl.arange(0, 4)
+    color, known, linear, exists = _indices(i, k, channel, i < count, OTHERS)
+    shown = CONSTANT * tl.load(sh0 + color, mask=known, other=0.0) + 0.5
+    if DEGREE == 1:
+        functions = _signed(k) * _directions(means, camera, i, k, i < count)[0]
+        shown += tl.sum(functions[:, :, None] * tl.load(shN + linear, mask=exists, other=0.0), 1)
+    tl.store(colors + color, tl.maximum(shown, 0.0), mask=known)
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -77,23 +97,15 @@ def _colors_backward(
     means, shN, camera, colors, v_colors, v_means, v_sh0, v_shN, count,
     OTHERS: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    valid = i < count
-    x, y, z, length = _direction(means, camera, i, valid)
-    along_x = tl.zeros((BLOCK,), tl.float32)
-    along_y, along_z = along_x, along_x
-    for channel in tl.static_range(3):
-        v_color = tl.load(v_colors + 3 * i + channel, mask=valid, other=0.0)
-        v_color = tl.where(tl.load(colors + 3 * i + channel, mask=valid, other=0.0) > 0.0, v_color, 0.0)
-        tl.store(v_sh0 + 3 * i + channel, CONSTANT * v_color, mask=valid)
-        if DEGREE == 1:
-            own, v_linear = 3 * OTHERS * i + channel, LINEAR * v_color
-            tl.store(v_shN + own, -y * v_linear, mask=valid)
-            tl.store(v_shN + own + 3, z * v_linear, mask=valid)
-            tl.store(v_shN + own + 6, -x * v_linear, mask=valid)
-            along_x -= v_linear * tl.load(shN + own + 6, mask=valid, other=0.0)
-            along_y -= v_linear * tl.load(shN + own, mask=valid, other=0.0)
-            along_z += v_linear * tl.load(shN + own + 3, mask=valid, other=0.0)
-    radial = along_x * x + along_y * y + along_z * z
-    across_x, across_y, across_z = along_x - radial * x, along_y - radial * y, along_z - radial * z
-    store_three(v_means, i, across_x / length, across_y / length, across_z / length, valid)
+    i, k, channel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4), tl.arange(0, 4)
+    color, known, linear, exists = _indices(i, k, channel, i < count, OTHERS)
+    v_color = tl.load(v_colors + color, mask=known, other=0.0)
+    v_color = tl.where(tl.load(colors + color, mask=known, other=0.0) > 0.0, v_color, 0.0)
+    tl.store(v_sh0 + color, CONSTANT * v_color, mask=known)
+    direction, at, inside, length = _directions(means, camera, i, k, i < count)
+    along = tl.zeros((BLOCK, 4), tl.float32)
+    if DEGREE == 1:
+        tl.store(v_shN + linear, (_signed(k) * direction)[:, :, None] * v_color[:, None, :], mask=exists)
+        along = _signed(k) * tl.sum(v_color[:, None, :] * tl.load(shN + linear, mask=exists, other=0.0), 2)
+    across = along - tl.sum(along * direction, 1)[:, None] * direction
+    tl.store(v_means + at, across / length[:, None], mask=inside)
