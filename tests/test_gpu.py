@@ -194,6 +194,8 @@ def test_actors_agree_with_the_cpu():
             torch.testing.assert_close(values.cpu(), expected.tensors[name], rtol=1e-4, atol=1e-5)
     alone = model.objects_alpha(model.render(on_gpu), on_gpu).detach().cpu()
     assert float(alone.max()) > 0.1 and float((alone - alone_on_cpu).abs().quantile(0.99)) < 1e-3
+    beside = model.render(on_gpu, with_objects=True).objects_alpha.detach().cpu()
+    assert float((beside - alone).abs().quantile(0.99)) < 1e-3
 
 
 def test_a_rolling_shutter_agrees_with_the_cpu():

@@ -1,6 +1,7 @@
 """Alpha compositing of projected Gaussians, front to back (Kerbl et al. 2023)."""
 
 import math
+from typing import NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,21 +13,36 @@ TILE = 16
 """Edge of gsplat's tiles in pixels."""
 
 
+class Composited(NamedTuple):
+    """Images of values, premultiplied by alpha, and alpha. `objects_alpha` is that of some of the Gaussians alone, None
+    where it was not computed beside the image."""
+
+    image: Float[Tensor, "c h w v"]
+    alpha: Float[Tensor, "c h w 1"]
+    objects_alpha: Float[Tensor, "c h w 1"] | None = None
+
+
 def composite(
-    gaussians: ProjectedGaussians, values: Float[Tensor, "c n v"], width: int, height: int, absgrad: bool
-) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
-    """Images of the Gaussians' `values`, premultiplied by alpha, and alpha.
+    gaussians: ProjectedGaussians,
+    values: Float[Tensor, "c n v"],
+    width: int,
+    height: int,
+    absgrad: bool,
+    objects: slice | None = None,
+) -> Composited:
+    """Images of the Gaussians' `values` and alpha.
 
     With `absgrad` the backward pass leaves the sums over pixels of the absolute gradients of `means2d` in
     `means2d.absgrad`. Runs gsplat on a GPU, numba elsewhere. Where Triton compiles, long lists of Gaussians are cut
     into chunks, so that no tile waits for the longest one; where torch compiles CUDA C++, too, kernels of this package
-    composite the chunks.
+    composite the chunks. For one camera these also give the alpha of the Gaussians `objects` alone, but for what is
+    hidden (`drivesplat.kernels.cuda.compositing.composite_with_objects`).
     """
     means2d, depths, conics, radii, opacities = gaussians
     if not means2d.is_cuda:
         from drivesplat.kernels.numba.compositing import Compositing
 
-        return Compositing.apply(*gaussians, values, width, height, absgrad)
+        return Composited(*Compositing.apply(*gaussians, values, width, height, absgrad))
     from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
     if not absgrad and triton_support.usable_for(means2d):
@@ -36,12 +52,16 @@ def composite(
         if values.shape[-1] <= chunks.MAX_VALUES:
             footprints = tiles.Footprints(means2d, conics, values, opacities)
             lists = tiles.tile_lists(footprints, radii, depths, width, height)
+            one_camera = objects is not None and len(radii) == 1
+            if one_camera and compiled.usable_for(values, compiled.IMAGES_WITH_OBJECTS):
+                return Composited(*compositing.composite_with_objects(footprints, lists, width, height, objects))
             if compiled.usable_for(values, compiled.IMAGES):
-                return compositing.composite(footprints, lists, width, height)
-            return chunks.composite(footprints, lists, width, height, rasterize_to_pixels)
+                return Composited(*compositing.composite(footprints, lists, width, height))
+            return Composited(*chunks.composite(footprints, lists, width, height, rasterize_to_pixels))
     cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)
     _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, across, down, n_images=cameras)
     offsets = isect_offset_encode(isect_ids, cameras, across, down).reshape(cameras, down, across)
-    return rasterize_to_pixels(
+    image, alpha = rasterize_to_pixels(
         means2d, conics, values, opacities, width, height, TILE, offsets, flatten_ids, absgrad=absgrad
     )
+    return Composited(image, alpha)

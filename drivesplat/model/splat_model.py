@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
-from typing import Any, NamedTuple
+from itertools import accumulate, pairwise
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,16 +16,17 @@ from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
+from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.model.view import View, depth_at_lines, where_seen
 from drivesplat.rasterization import Rendering, rasterize
-from drivesplat.scene.motion import HALF_STEP
 
 
 @dataclass(frozen=True)
 class Picture:
     """A rendering of `gaussians`, which are `sets` one after the other: `image` with sky and the exposure of the view's
     camera; `splats` without sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or
-    None."""
+    None; `objects_alpha`, the alpha of the parts with objects alone, None where it was not rendered beside the image.
+    """
 
     gaussians: Gaussians
     sets: Sequence[Gaussians]
@@ -34,32 +35,7 @@ class Picture:
     alpha: Float[Tensor, "h w"]
     depth: Float[Tensor, "h w"] | None
     info: dict[str, Any]
-
-
-TimeStates = Sequence[Sequence[Tensor]]
-"""The time state of each part of a model."""
-
-
-class ScanTimeStates(NamedTuple):
-    """The time states of all parts `now`, and HALF_STEP seconds `before` and `after`: what a scan depends on."""
-
-    now: TimeStates
-    before: TimeStates
-    after: TimeStates
-
-    @property
-    def tensors(self) -> list[Tensor]:
-        """All tensors, in a fixed order."""
-        return [values for states in self for state in states for values in state]
-
-    def copied(self) -> "ScanTimeStates":
-        """A copy in memory of its own."""
-        return ScanTimeStates(*([[values.clone() for values in state] for state in states] for states in self))
-
-    @staticmethod
-    def times(time: float) -> tuple[float, float, float]:
-        """The times of the three states for a scan at a time, in seconds since the first image."""
-        return time, time - HALF_STEP, time + HALF_STEP
+    objects_alpha: Float[Tensor, "h w"] | None = None
 
 
 class SplatModel(nn.Module):
@@ -207,11 +183,13 @@ class SplatModel(nn.Module):
         gaussians: Gaussians | Sequence[Gaussians] | None = None,
         absgrad: bool = False,
         with_depth: bool = False,
+        with_objects: bool = False,
     ) -> Picture:
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
         `gaussians`, a set or several, replace `sets_in(view)`. Of a picture with other sets than one of each part,
-        neither `objects_alpha` nor the terms of static parts can be computed.
+        neither `objects_alpha` nor the terms of static parts can be computed. `with_objects` computes the former beside
+        the image, where that takes no second rendering.
         """
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
         shown = concatenate(sets)
@@ -222,6 +200,7 @@ class SplatModel(nn.Module):
             means, shown.quats, scales, shown.opacities, colors,
             seen_from.viewmat[None], view.K[None], view.width, view.height, sh_degree=degree,
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
+            objects=self._rows_of_objects(sets) if with_objects else None,
         )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
         image = splats
@@ -230,7 +209,8 @@ class SplatModel(nn.Module):
         if self.exposure is not None:
             image = self.exposure.applied(image, view.camera)
         depth = None if rendering.depth is None else depth_at_lines(rendering.depth.squeeze((0, 3)), seen_from)
-        return Picture(shown, sets, image, splats, alpha.squeeze(2), depth, rendering.info)
+        alone = None if rendering.objects_alpha is None else rendering.objects_alpha.squeeze((0, 3))
+        return Picture(shown, sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone)
 
     def scan(
         self,
@@ -264,12 +244,26 @@ class SplatModel(nn.Module):
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
         """The alpha of the parts with objects rendered alone, for a picture with a set of each part; None without such
-        parts."""
+        parts. Renders them where the picture was not rendered `with_objects`."""
+        if picture.objects_alpha is not None:
+            return picture.objects_alpha
         objects = [own for part, own in zip(self.parts, picture.sets, strict=True) if part.has_objects]
         if not objects:
             return None
         alone = concatenate(objects)
         return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha.squeeze((0, 3))
+
+    def _rows_of_objects(self, sets: Sequence[Gaussians]) -> slice | None:
+        """The rows of parts with objects in a concatenated set of each part; None without such rows, or where others
+        lie between them."""
+        ends = [*accumulate(len(own) for own in sets)]
+        found = [
+            (start, end)
+            for part, start, end in zip(self.parts, [0, *ends], ends, strict=False)
+            if part.has_objects and end > start
+        ]
+        between = any(end != start for (_, end), (start, _) in pairwise(found))
+        return slice(found[0][0], found[-1][1]) if found and not between else None
 
     def class_logits(self, picture: Picture, view: View) -> Float[Tensor, "h w c"] | None:
         """The rendered class logits of a picture of this model; None for a model without semantic classes."""

@@ -1,6 +1,6 @@
 """The rasterization call, with the meaning of gsplat's, on GPU and CPU, and its result."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -18,13 +18,15 @@ class Rendering:
 
     `image` is premultiplied by `alpha`: nothing is composited behind it. `depth` is the expected depth in metres along
     the camera axis, or None. `info` holds what gsplat's strategies read: `means2d`, `radii`, `depths`, `conics`,
-    `opacities`, `width`, `height`, `n_cameras` and `gaussian_ids`.
+    `opacities`, `width`, `height`, `n_cameras` and `gaussian_ids`. `objects_alpha` is the alpha of some of the
+    Gaussians alone, None where it was not asked for or cannot be had beside the image.
     """
 
     image: Float[Tensor, "c h w channels"]
     alpha: Float[Tensor, "c h w 1"]
     depth: Float[Tensor, "c h w 1"] | None
     info: dict[str, Any]
+    objects_alpha: Float[Tensor, "c h w 1"] | None = None
 
 
 def rasterize(
@@ -42,6 +44,7 @@ def rasterize(
     antialiased: bool = False,
     absgrad: bool = False,
     with_depth: bool = False,
+    objects: slice | None = None,
 ) -> Rendering:
     """Renders n 3D Gaussians in c pinhole cameras.
 
@@ -63,10 +66,11 @@ def rasterize(
         antialiased: Scale opacities by the area that the 2D filter adds (Yu et al. 2024).
         absgrad: Let the backward pass write `info["means2d"].absgrad` (c, n, 2), as gsplat's strategies need it.
         with_depth: Also render the expected depth.
+        objects: Rows of Gaussians whose alpha alone is wanted, too, where it costs no second rendering.
 
     Returns:
         A `Rendering`: image (c, h, w, channels), premultiplied by alpha; alpha (c, h, w, 1); depth (c, h, w, 1) in
-        metres or None; info for gsplat's strategies.
+        metres or None; info for gsplat's strategies; the alpha of `objects` (c, h, w, 1) or None.
 
     Raises:
         ValueError: On a CPU, for an `sh_degree` above 3 or too few coefficients.
@@ -102,8 +106,8 @@ def rasterize(
         values = colors[None] if cameras == 1 else colors.expand(cameras, -1, -1)
     if with_depth:
         values = torch.cat([values, gaussians.depths[..., None]], dim=-1)
-    image, alpha = composite(gaussians, values, width, height, absgrad)
-    return assembled(image, alpha, with_depth, **gaussians._asdict())
+    image, alpha, alone = composite(gaussians, values, width, height, absgrad, objects)
+    return replace(assembled(image, alpha, with_depth, **gaussians._asdict()), objects_alpha=alone)
 
 
 def assembled(

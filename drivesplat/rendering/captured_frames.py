@@ -16,7 +16,8 @@ from torch import Tensor
 from drivesplat.kernels import capacity, triton_support
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool, retry_without_graphs
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.splat_model import SplatModel, TimeStates
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.time_states import TimeStates
 from drivesplat.model.view import View
 from drivesplat.rendering.color_bytes import to_uint8
 

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.model.splat_model import Picture, ScanTimeStates, SplatModel, TimeStates
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
@@ -188,6 +189,7 @@ class Trainer:
                 gaussians=sets,
                 absgrad=by_gradient and self.settings.default.absgrad,
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
+                with_objects=self._has_entropy and self.settings.entropy_weight > 0,
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self._image_settings())

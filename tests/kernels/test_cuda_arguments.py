@@ -59,6 +59,10 @@ def test_kernels_of_images(launched):
     image, alpha = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT)
     torch.autograd.grad(image.sum() + alpha.sum(), given)
     check(launched, compiled.IMAGES)
+    launched.clear()
+    *_, alone = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, slice(3, 9))
+    torch.autograd.grad(alone.sum(), given)
+    check(launched, compiled.IMAGES_WITH_OBJECTS)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="on a GPU the kernels themselves are compared")

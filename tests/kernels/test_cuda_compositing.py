@@ -7,7 +7,8 @@ import pytest
 import torch
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
-from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses, gradients, lists_of_all_lengths
+from helpers.cuda_on_cpu import COMPILER, kernels_on_cpu
+from helpers.tile_lists import DEVICE, HEIGHT, TILE, WIDTH, ellipses, gradients, lists_of_all_lengths, rasterized
 
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.cuda import compiled, compositing, scans
@@ -22,6 +23,7 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
     ("program", "channels"),
     [
         *((compiled.IMAGES, count) for count in (1, 3, 4, chunks.MAX_VALUES)),
+        *((compiled.IMAGES_WITH_OBJECTS, count) for count in (3, 4)),
         *((compiled.SCANS, count) for count in (0, 2, 4, scans.MAX_VALUES)),
     ],
 )
@@ -105,6 +107,45 @@ def test_chunks_and_their_gradients_equal_those_of_torch(cameras, channels, leng
     for theirs, mine in zip(*gradients(given, expected, found), strict=True):
         assert theirs.any()
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+
+
+def check_alpha_of_objects(channels: int, compared: slice, length: int) -> None:
+    """Images, alpha, alpha of objects alone, and the gradients of the `compared` ones of these equal those of torch."""
+    given, lists, (image, alpha) = lists_of_all_lengths(1, channels, 1.0 / 255.0)
+    objects = slice(8, 21)
+    *others, opacities = given
+    within = torch.zeros_like(opacities)
+    within[:, objects] = 1.0
+    alone = rasterized(
+        *others, opacities * within, WIDTH, HEIGHT, TILE, lists.offsets[:-1].reshape(lists.tiles),
+        lists.ids[lists.order[: int(lists.offsets[-1])]], least=1.0 / 255.0,
+    )[1]  # fmt: skip
+    assert float(alone.detach().max()) > 0.1 and float((alpha - alone).detach().max()) > 0.1
+    found = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, objects, length)
+    expected = (image, alpha, alone)
+    for mine, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+    for theirs, mine in zip(*gradients(given, expected[compared], found[compared]), strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+
+
+WITH_IMAGE, ALONE = slice(0, 3), slice(2, 3)
+
+
+@gpu
+@needs_gpu
+@pytest.mark.parametrize(("channels", "compared"), [(3, WITH_IMAGE), (4, WITH_IMAGE), (3, ALONE)])
+@pytest.mark.parametrize("length", [4, 256])
+def test_the_alpha_of_objects_alone_and_its_gradient_equal_those_of_torch(channels, compared, length):
+    check_alpha_of_objects(channels, compared, length)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="on a GPU the kernels themselves are compared")
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
+@pytest.mark.parametrize("compared", [WITH_IMAGE, ALONE])
+def test_the_same_source_compiled_for_a_processor(compared, monkeypatch, tmp_path):
+    monkeypatch.setattr(compositing, "kernels", lambda *key: kernels_on_cpu(*key[:3], tmp_path))
+    check_alpha_of_objects(3, compared, 4)
 
 
 @gpu

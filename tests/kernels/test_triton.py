@@ -394,6 +394,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
 from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
+from drivesplat.kernels.triton import chunk_alpha
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
 
@@ -452,6 +453,8 @@ for kernel in (chunks._split, chunks._sum_copies):
     compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
 for kernel in (chunks._composite, chunks._composite_backward):
     compiled(kernel, CHANNELS=3, WIDTH=4)
+for kernel in (chunk_alpha._alpha, chunk_alpha._alpha_backward):
+    compiled(kernel)
 for motion, moving, parts in ((True, True, 2), (True, False, 2), (True, True, 1), (False, False, 1)):
     options = {"WITH_MOTION": motion, "MOVING": moving, "PARTS": parts, "BLOCK": scan_projection.BLOCK}
     compiled(scan_projection._project, STEPS=4, **options)

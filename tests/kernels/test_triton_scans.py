@@ -1,12 +1,14 @@
 """LiDAR scans by Triton's kernels, and on a GPU by CUDA C++ kernels, against the reference. Without a GPU Triton's run
-in its interpreter, see conftest.py."""
+in its interpreter, see conftest.py, and those in CUDA C++ are compiled for a processor once."""
 
 from dataclasses import replace
+from functools import cache
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch
+from helpers.cuda_on_cpu import COMPILER, kernels_on_cpu
 from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
 
 from drivesplat.kernels import capacity, triton_support
@@ -81,6 +83,21 @@ def disagreements(scene: ScanScene, motion: ScanMotion | None = None) -> dict[st
 def test_every_size_of_scan_agrees(beams, firings):
     scene = random_scan(0, n=60, rays=even_rays(beams, firings))
     assert not disagreements(scene)
+
+
+@pytest.mark.skipif(DEVICE.type != "cpu", reason="on a GPU all tests compare the kernels themselves")
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
+def test_the_cuda_source_compiled_for_a_processor_agrees(monkeypatch, tmp_path):
+    ran = []
+
+    def kernels(program, channels, length, device):
+        ran.append(program.name)
+        return kernels_on_cpu(program, channels, length, tmp_path)
+
+    monkeypatch.setattr(cuda_scans, "can_composite", lambda values: True)
+    monkeypatch.setattr(cuda_scans, "kernels", cache(kernels))
+    assert not disagreements(random_scan(0, n=60, rays=even_rays(5, 7)))
+    assert ran == ["scans"]
 
 
 @pytest.mark.parametrize("firings", [41, 3, 1])

@@ -14,6 +14,7 @@ from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses, gradients, lists
 
 from drivesplat.kernels import capacity
 from drivesplat.kernels.triton import chunks
+from drivesplat.kernels.triton.chunk_alpha import alpha_of_chunks
 from drivesplat.kernels.triton.tiles import Footprints, TileLists, tile_lists
 
 TILE = 16
@@ -114,6 +115,27 @@ def test_composited_chunks_equal_whole_lists(cameras, channels, monkeypatch):
     for theirs, mine in zip(*gradients(given, expected, found), strict=True):
         assert theirs.any()
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_the_alpha_of_chunks_and_its_gradient_equal_those_of_torch(cameras):
+    """For tiles with no entries, one chunk, and several chunks, some of which let nothing through."""
+    _, lists, _ = lists_of_all_lengths(cameras, 1)
+    made = chunks.Chunks.of(lists, 4)
+    remains = torch.rand(made.count, 256, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    remains[::3, :100] = 0.0
+    remains.requires_grad_()
+    found = alpha_of_chunks(remains, made, lists, WIDTH, HEIGHT)
+    firsts = made.firsts.tolist()
+    tiles = [1.0 - remains[start:end].prod(dim=0) for start, end in pairwise(firsts)]
+    down, across = lists.tiles[1:]
+    whole = torch.stack(tiles).reshape(cameras, down, across, 16, 16).transpose(2, 3).flatten(3, 4).flatten(1, 2)
+    expected = whole[:, :HEIGHT, :WIDTH, None]
+    torch.testing.assert_close(found, expected)
+    weights = torch.rand(found.shape, generator=torch.Generator().manual_seed(1)).to(DEVICE)
+    mine, theirs = (torch.autograd.grad((weights * alpha).sum(), remains)[0] for alpha in (found, expected))
+    torch.testing.assert_close(mine[: firsts[-1]], theirs[: firsts[-1]])
+    assert theirs.any()
 
 
 @pytest.mark.parametrize("length", [1, 3, 100])

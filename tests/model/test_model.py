@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.errors import ResultError
+from drivesplat.model import splat_model
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.build import ModelInit, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
@@ -21,6 +22,7 @@ from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
+from drivesplat.rasterization import rasterize
 from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.images import pixel_rays
 from drivesplat.scene.training_record import TrainingRecord
@@ -303,6 +305,33 @@ def test_the_alpha_of_dynamic_parts_equals_their_own_rendering(antialiased):
     alone = SplatModel([model.parts[1]], None, antialiased).render(a_view()).alpha
     torch.testing.assert_close(found, alone)
     assert float(found.detach().max()) > 0.05 and float((picture.alpha - found).detach().abs().max()) > 0.1
+
+
+def test_the_alpha_of_dynamic_parts_is_asked_for_beside_the_image_where_they_are_neighbours(monkeypatch):
+    """And rendered by itself where it is not among what the image comes with."""
+    asked = []
+
+    def rasterized(*arguments, objects=None, **options):
+        asked.append(objects)
+        rendering = rasterize(*arguments, **options)
+        return dataclasses.replace(rendering, objects_alpha=0.5 * rendering.alpha) if objects else rendering
+
+    monkeypatch.setattr(splat_model, "rasterize", rasterized)
+    still, moves = Background.from_points(*seed_points(12), GaussianSettings(), 1.0), actors_of(a_track(), count=4)
+    others = actors_of(a_track("later", 1.0), count=3)
+    for parts, rows in (
+        ([still, moves], slice(12, 16)), ([moves, others, still], slice(0, 7)), ([moves, still, others], None),
+        ([still], None),
+    ):  # fmt: skip
+        model = SplatModel(parts, None)
+        picture = model.render(a_view(), with_objects=True)
+        assert asked[-1] == rows
+        if rows is None:
+            assert picture.objects_alpha is None
+        else:
+            assert torch.equal(model.objects_alpha(picture, a_view()), 0.5 * picture.alpha)
+    model.render(a_view())
+    assert asked[-1] is None
 
 
 def test_a_static_model_has_no_alpha_of_dynamic_parts():

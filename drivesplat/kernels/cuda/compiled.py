@@ -30,6 +30,7 @@ class Program(NamedTuple):
 
 
 IMAGES = Program("images", source.SOURCE, source.KERNELS)
+IMAGES_WITH_OBJECTS = Program("images-with-objects", "#define OBJECTS 1\n" + source.SOURCE, source.KERNELS)
 SCANS = Program("scans", scan_source.SOURCE, scan_source.KERNELS)
 
 

@@ -1,8 +1,9 @@
 """Alpha compositing of tiles' lists in chunks by CUDA C++ kernels, and its gradient.
 
-They differ from gsplat's, which give the same images, in three ways. A warp skips Gaussians whose ellipse does not
+They differ from gsplat's, which give the same images, in four ways. A warp skips Gaussians whose ellipse does not
 reach its pixels. A thread has two pixels and adds their gradients. All gradients of a Gaussian are summed over a warp
-together, in 16 shuffles, in place of five for each.
+together, in 16 shuffles, in place of five for each. The alpha of some of the Gaussians alone can be had beside the
+image.
 """
 
 from typing import Any
@@ -12,8 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.cuda.compiled import IMAGES, LENGTH, kernels
+from drivesplat.kernels.cuda.compiled import IMAGES, IMAGES_WITH_OBJECTS, LENGTH, kernels
 from drivesplat.kernels.cuda.source import PIXELS
+from drivesplat.kernels.triton.chunk_alpha import alpha_of_chunks
 from drivesplat.kernels.triton.chunks import Chunks, join
 from drivesplat.kernels.triton.tiles import TILE, Footprints, TileLists
 
@@ -26,39 +28,56 @@ def composite(
     """Images of values, premultiplied by alpha, and alpha, as `drivesplat.kernels.triton.chunks.composite`, in chunks
     of at most `length` Gaussians."""
     chunks = Chunks.of(lists, length)
-    values, alpha = _ChunkImages.apply(*gaussians, lists, chunks)
+    values, alpha, _ = _ChunkImages.apply(*gaussians, lists, chunks, None)
     return join(values, alpha, chunks, lists, width, height)
+
+
+def composite_with_objects(
+    gaussians: Footprints, lists: TileLists, width: int, height: int, objects: slice, length: int = LENGTH
+) -> tuple[Float[Tensor, "1 h w v"], Float[Tensor, "1 h w 1"], Float[Tensor, "1 h w 1"]]:
+    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone. Of these it leaves out what the
+    image of all leaves out: a ray ends within a chunk where the transmittance of all its Gaussians falls below 1e-4."""
+    chunks = Chunks.of(lists, length)
+    values, alpha, remains = _ChunkImages.apply(*gaussians, lists, chunks, objects)
+    image, whole = join(values, alpha, chunks, lists, width, height)
+    return image, whole, alpha_of_chunks(remains, chunks, lists, width, height)
 
 
 class _ChunkImages(torch.autograd.Function):
     """The values (m, 256, v), premultiplied by alpha, and alpha (m, 256) of each of m chunks by itself, at the pixels
-    of its tile, row by row."""
+    of its tile, row by row; and the transmittance (m, 256) of the Gaussians `objects` alone, empty without them."""
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, conics: Tensor, values: Tensor, opacities: Tensor, lists: TileLists, chunks: Chunks
-    ) -> tuple[Float[Tensor, "m 256 v"], Float[Tensor, "m 256"]]:
+        ctx: Any, means: Tensor, conics: Tensor, values: Tensor, opacities: Tensor, lists: TileLists, chunks: Chunks,
+        objects: slice | None,
+    ) -> tuple[Float[Tensor, "m 256 v"], Float[Tensor, "m 256"], Float[Tensor, "m pixels"]]:  # fmt: skip
         given = [tensor.contiguous() for tensor in (means, conics, values, opacities)]
         pixels, (_, down, across) = (chunks.count, TILE.value**2), lists.tiles
         images, alphas = means.new_empty(*pixels, values.shape[-1]), means.new_empty(pixels)
         transmittances, lasts = means.new_empty(pixels), chunks.firsts.new_empty(pixels)
+        remains = means.new_empty(chunks.count, 0 if objects is None else TILE.value**2)
         read = (*given, lists.ids, lists.order, lists.offsets, chunks.firsts, chunks.tile_of)
-        ctx.chunks, ctx.sizes = chunks, (len(chunks.firsts) - 1, down * across, across)
-        _launch("composite_chunks", chunks, values, *read, images, alphas, transmittances, lasts, *ctx.sizes)
-        ctx.save_for_backward(*read, transmittances, lasts)
-        return images, alphas
+        own = (0, 0) if objects is None else (objects.start, objects.stop)
+        ctx.chunks, ctx.sizes = chunks, (len(chunks.firsts) - 1, down * across, across, *own)
+        written = (images, alphas, transmittances, lasts, remains)
+        _launch("composite_chunks", chunks, values, *read, *written, *ctx.sizes)
+        ctx.save_for_backward(*read, transmittances, lasts, remains)
+        return images, alphas, remains
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_images: Tensor, v_alphas: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         saved, values = ctx.saved_tensors, ctx.saved_tensors[2]
         summed = [torch.zeros_like(given) for given in saved[:4]]
-        above = (v_images.contiguous(), v_alphas.contiguous())
+        above = [gradient.contiguous() for gradient in gradients]
         _launch("composite_chunks_backward", ctx.chunks, values, *saved, *above, *summed, *ctx.sizes)
-        return *summed, None, None
+        return *summed, None, None, None
 
 
 def _launch(kernel: str, chunks: Chunks, values: Tensor, *arguments: Tensor | int) -> None:
-    """Runs a kernel for the chunks of Gaussians with `values` (c, n, v), which have to be on the current device."""
-    run = kernels(IMAGES, values.shape[-1], chunks.length, values.device.index)[kernel]
+    """Runs a kernel for the chunks of Gaussians with `values` (c, n, v), which have to be on the current device. The
+    last two arguments are the first object and the end of them."""
+    program = IMAGES if arguments[-2] == arguments[-1] else IMAGES_WITH_OBJECTS
+    run = kernels(program, values.shape[-1], chunks.length, values.device.index)[kernel]
     run(chunks.count, THREADS, arguments)

@@ -1,7 +1,8 @@
 """The CUDA C++ source of the kernels that composite chunks of tiles' lists (`drivesplat.kernels.cuda.compositing`).
 
 CHANNELS, the number of values of a Gaussian, and LENGTH, the maximum number of entries of a chunk, are defined when it
-is compiled. Rays end and contributions are skipped as in gsplat's kernels.
+is compiled. Rays end and contributions are skipped as in gsplat's kernels. With OBJECTS, Gaussians first_object to
+end_object - 1 are also composited alone, to a transmittance: `remains`.
 """
 
 from drivesplat.kernels.cuda.warps import WARPS
@@ -13,6 +14,9 @@ PIXELS = 2
 
 SOURCE = (
     f"""
+#ifndef OBJECTS
+#define OBJECTS 0
+#endif
 #define PIXELS {PIXELS}
 #define GRADIENTS (CHANNELS + 6)            // of a Gaussian: values, mean, conic, opacity
 {WARPS}"""
@@ -104,12 +108,18 @@ __device__ __forceinline__ float alpha_at(const Batch& batch, int j, float dx, f
     return sigma < 0.0f || alpha < MIN_ALPHA ? 0.0f : alpha;
 }
 
+// Whether Gaussian j of a batch belongs to an object.
+__device__ __forceinline__ bool of_object(const Batch& batch, int j, int first_object, int end_object) {
+    return OBJECTS && batch.id[j] >= first_object && batch.id[j] < end_object;
+}
+
 // Composites each chunk by itself: premultiplied values (m, 256, CHANNELS), alpha and transmittance (m, 256) by pixel,
-// and the last entry of the chunk that a pixel shows (-1: none).
+// the last entry of the chunk that a pixel shows (-1: none), and the transmittance of objects alone (m, 256).
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, float* images, float* alphas,
-    float* transmittances, int* lasts, int tiles, int per_camera, int across
+    float* transmittances, int* lasts, float* remains, int tiles, int per_camera, int across, int first_object,
+    int end_object
 ) {
     if ((int)blockIdx.x >= firsts[tiles]) return;
     __shared__ Batch batch;
@@ -118,13 +128,13 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     Chunk chunk(lists, blockIdx.x);
     int thread = threadIdx.x;
     float x = column_of(thread) + 0.5f;
-    float y[PIXELS], passes[PIXELS], total[PIXELS][CHANNELS] = {};
+    float y[PIXELS], passes[PIXELS], alone[PIXELS], total[PIXELS][CHANNELS] = {};
     int last[PIXELS];
     bool ended[PIXELS], all_ended = false;
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
         y[p] = row_of(thread, p) + 0.5f;
-        passes[p] = 1.0f;
+        passes[p] = alone[p] = 1.0f;
         last[p] = -1;
         ended[p] = false;
     }
@@ -136,6 +146,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
             for (unsigned lanes = reaching(batch, first); lanes; lanes &= lanes - 1) {
                 if (__all_sync(EVERY_LANE, all_ended)) break;
                 int j = first + __ffs(lanes) - 1;
+                bool is_object = of_object(batch, j, first_object, end_object);
                 float dx = batch.x[j] - x;
                 #pragma unroll
                 for (int p = 0; p < PIXELS; ++p) {
@@ -149,6 +160,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
                     #pragma unroll
                     for (int k = 0; k < CHANNELS; ++k) total[p][k] += batch.values[j][k] * alpha * passes[p];
                     passes[p] = behind;
+                    if (is_object) alone[p] *= 1.0f - alpha;
                     last[p] = begin - chunk.start + j;
                 }
                 all_ended = true;
@@ -164,16 +176,18 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
         for (int k = 0; k < CHANNELS; ++k) images[at * CHANNELS + k] = total[p][k];
         alphas[at] = 1.0f - passes[p];
         transmittances[at] = passes[p];
+        if (OBJECTS) remains[at] = alone[p];
         lasts[at] = last[p];
     }
 }
 
-// Adds the gradients of all Gaussians, given those of each chunk's values and alpha.
+// Adds the gradients of all Gaussians, given those of each chunk's values, alpha and transmittance of objects alone.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, const float* transmittances,
-    const int* lasts, const float* v_images, const float* v_alphas, float* v_means,
-    float* v_conics, float* v_values, float* v_opacities, int tiles, int per_camera, int across
+    const int* lasts, const float* remains, const float* v_images, const float* v_alphas, const float* v_remains,
+    float* v_means, float* v_conics, float* v_values, float* v_opacities, int tiles, int per_camera, int across,
+    int first_object, int end_object
 ) {
     if ((int)blockIdx.x >= firsts[tiles]) return;
     __shared__ Batch batch;
@@ -184,8 +198,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     int thread = threadIdx.x, lane = thread % WARP;
     float x = column_of(thread) + 0.5f;
     // by pixel: transmittance, gradient of the values; `behind`, the gradient by all that the pixel shows behind the
-    // Gaussian at hand
-    float y[PIXELS], passes[PIXELS], behind[PIXELS], v_pixel[PIXELS][CHANNELS];
+    // Gaussian at hand; `alone`, the gradient of the transmittance of objects times that transmittance
+    float y[PIXELS], passes[PIXELS], behind[PIXELS], alone[PIXELS], v_pixel[PIXELS][CHANNELS];
     int last[PIXELS], last_of_warp = -1;
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
@@ -193,7 +207,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
         y[p] = row_of(thread, p) + 0.5f;
         passes[p] = transmittances[at];
         behind[p] = -passes[p] * v_alphas[at];
-        bool matters = v_alphas[at] != 0.0f;
+        alone[p] = OBJECTS ? v_remains[at] * remains[at] : 0.0f;
+        bool matters = v_alphas[at] != 0.0f || alone[p] != 0.0f;
         #pragma unroll
         for (int k = 0; k < CHANNELS; ++k) {
             v_pixel[p][k] = v_images[at * CHANNELS + k];
@@ -236,6 +251,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
                     shown |= alpha[p] != 0.0f;
                 }
                 if (!__any_sync(EVERY_LANE, shown)) continue;
+                bool is_object = of_object(batch, j, first_object, end_object);
                 float sums[WIDTH] = {}, along_x = 0.0f, along_y = 0.0f;
                 #pragma unroll
                 for (int p = 0; p < PIXELS; ++p) {
@@ -248,6 +264,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
                         by_values += batch.values[j][k] * v_pixel[p][k];
                     }
                     float v_alpha = passes[p] * by_values - left * behind[p];
+                    if (is_object) v_alpha -= left * alone[p];
                     behind[p] += weight * by_values;
                     bool free = alpha[p] > 0.0f && batch.opacity[j] * falloff[p] <= MAX_ALPHA;
                     float v_opacity = free ? falloff[p] * v_alpha : 0.0f;

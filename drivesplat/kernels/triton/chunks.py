@@ -242,7 +242,7 @@ def _sum_copies(
 
 @triton.jit
 @no_type_check
-def _pixels(tile, width, height, across, per_camera):
+def tile_pixels(tile, width, height, across, per_camera):
     """The indices of a tile's pixels among those of all cameras, and which of them are in the image."""
     pixel = tl.arange(0, TILE * TILE)
     camera, within = tile // per_camera, tile % per_camera
@@ -258,7 +258,7 @@ def _composite(
 ):  # fmt: skip
     """Composites a tile of the image; writes to `before` the transmittance in front of each of its chunks."""
     tile = tl.program_id(0)
-    at, inside = _pixels(tile, width, height, across, per_camera)
+    at, inside = tile_pixels(tile, width, height, across, per_camera)
     pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
     passes = tl.full((TILE * TILE,), 1.0, tl.float32)
     total = tl.zeros((TILE * TILE, WIDTH), tl.float32)
@@ -280,7 +280,7 @@ def _composite_backward(
 ):  # fmt: skip
     """Writes the gradients of a tile's chunks, from the last to the first."""
     tile = tl.program_id(0)
-    at, inside = _pixels(tile, width, height, across, per_camera)
+    at, inside = tile_pixels(tile, width, height, across, per_camera)
     pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
     valid = (channel < CHANNELS)[None, :]
     v_pixel = tl.load(v_image + at[:, None] * CHANNELS + channel, mask=inside[:, None] & valid, other=0.0)

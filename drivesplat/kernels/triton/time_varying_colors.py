@@ -44,8 +44,8 @@ def _launch(kernel: Any, *arguments: Any) -> None:
     kernel[(triton.cdiv(count, block),)](*arguments, padded, block)
 
 
-# Neighbouring threads have neighbouring color channels, padded from 3 to 4, then neighbouring coefficients: they read and
-# write whole rows of memory.
+# Neighbouring threads have neighbouring color channels, padded from 3 to 4, then neighbouring coefficients: they read
+# and write whole rows of memory.
 
 
 @triton.jit(do_not_specialize=["count"])

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.splat_model import SplatModel, TimeStates
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.time_states import TimeStates
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.views import LidarDepth, TrainingView
 

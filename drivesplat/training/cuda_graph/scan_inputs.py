@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.splat_model import ScanTimeStates
+from drivesplat.model.time_states import ScanTimeStates
 from drivesplat.training.scans import TrainingScan
 
 Shape = tuple[tuple[torch.Size, torch.dtype], ...]
