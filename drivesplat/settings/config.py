@@ -47,7 +47,17 @@ METHOD_OVERRIDES = ("sky", "train", "random_seed")
 
 
 def _default_methods() -> dict[str, MethodSettings]:
-    held = {"train": {"sky_bce_weight": 0.05, "horizon_weight": 0.05, "depth_weight": 0.01, "semantic_weight": 0.1}}
+    held = {
+        "train": {
+            "sky_bce_weight": 0.05,
+            "horizon_weight": 0.05,
+            "depth_weight": 0.01,
+            "semantic_weight": 0.1,
+            "road_weight": 1.0,
+            "road": {"surface": "lidar"},
+            "dropout": 0.2,
+        }
+    }
     return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=held)}
 
 

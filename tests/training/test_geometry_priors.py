@@ -221,6 +221,17 @@ def test_by_lidar_seed_points_of_other_sources_do_not_count():
     torch.testing.assert_close(road.offsets, alone.offsets, rtol=0.0, atol=0.0)
 
 
+def test_by_lidar_patches_of_ground_far_apart_have_no_cells_between_them():
+    """A loop of a hundred square kilometres needs no more memory than the ground beside its road."""
+    here = ground_points()
+    there = here + np.float32([10_000.0, -10_000.0, 0.0])
+    one, both = lidar_road(here, BY_LIDAR), lidar_road(np.concatenate([here, there]), BY_LIDAR)
+    assert np.prod(both.cells.shape) > 1e9
+    assert len(both.cells.keys) == 2 * len(one.cells.keys) and (both.cells.keys.diff() > 0).all()
+    places = torch.tensor([[3.1, 2.2], [10_003.1, -9_997.8], [5_000.0, -5_000.0]])
+    assert both.cells.lookup(places)[1].tolist() == [True, True, False]
+
+
 def test_without_lidar_points_the_road_by_lidar_has_no_effect_and_this_is_logged(caplog):
     record = with_points(np.ones((50, 3), np.float32), SeedInfo(far=50))
     road = road_of(record, BY_LIDAR)
