@@ -35,6 +35,8 @@ def _default_variants() -> dict[str, VariantSettings | None]:
         "sky": VariantSettings(overrides={"sky": "none", "train": {"sky_bce_weight": 0.0}}),
         "sky_loss": trained(sky_bce_weight=0.0),
         "depth": trained(depth_weight=0.0),
+        "ground": trained(road_weight=0.0),
+        "dropout": trained(dropout=0.0),
         "entropy": trained(entropy_weight=0.0),
         "colours_in_time": trained(actors={"fourier": 1}),
         "dynamic_loss": trained(dynamic_weight=0.0),

@@ -21,7 +21,8 @@ from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import METHOD_STAGES, SCENE_STAGES, TRAINING_INPUTS, stage_settings, training_inputs
 
 VARIANTS = (
-    "actors", "track_correction", "sky", "sky_loss", "depth", "entropy", "colours_in_time", "dynamic_loss",
+    "actors", "track_correction", "sky", "sky_loss", "depth", "ground", "dropout", "entropy", "colours_in_time",
+    "dynamic_loss",
 )  # fmt: skip
 NOTHING = {"ablation": {"of": "nobody"}}
 """No ablation, whatever the methods."""
@@ -48,7 +49,7 @@ def training(config: Config, method: str) -> dict[str, Any]:
 
 def test_the_full_method_and_every_variant_become_methods_with_every_seed():
     config = load({})
-    assert list(config.ablated) == names() and len(config.ablated) == 27
+    assert list(config.ablated) == names() and len(config.ablated) == 33
     assert list(config.all_methods) == ["vanilla", "street", *names()]
     assert list(config.methods) == ["vanilla", "street"]
 
@@ -59,6 +60,8 @@ LACKING = {
     "sky": {"sky": "none", "train.sky_bce_weight": 0.0},
     "sky_loss": {"train.sky_bce_weight": 0.0},
     "depth": {"train.depth_weight": 0.0},
+    "ground": {"train.road_weight": 0.0},
+    "dropout": {"train.dropout": 0.0},
     "entropy": {"train.entropy_weight": 0.0},
     "colours_in_time": {"train.actors.fourier": 1},
     "dynamic_loss": {"train.dynamic_weight": 0.0},
@@ -469,7 +472,7 @@ def test_the_target_plans_one_training_per_variant_and_seed(copy):
     once = dict.fromkeys(
         ("extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "ablation"), 1
     )
-    assert plain == {**once, "train": 27, "evaluate": 27}
+    assert plain == {**once, "train": 33, "evaluate": 33}
     assert sorted(compared[""]) == sorted(f"results/0001/{name}/eval.json" for name in names())
     assert sorted(metrics) == ["street", "vanilla"]
 
