@@ -35,8 +35,8 @@ def composite(
     With `absgrad` the backward pass leaves the sums over pixels of the absolute gradients of `means2d` in
     `means2d.absgrad`. Runs gsplat on a GPU, numba elsewhere. Where Triton compiles, long lists of Gaussians are cut
     into chunks, so that no tile waits for the longest one; where torch compiles CUDA C++, too, kernels of this package
-    composite the chunks. For one camera these also give the alpha of the Gaussians `objects` alone, but for what is
-    hidden (`drivesplat.kernels.cuda.compositing.composite_with_objects`).
+    composite the chunks. For one camera these also compute the alpha of the Gaussians `objects` alone, without those
+    behind the end of a ray (`drivesplat.kernels.cuda.compositing.composite_with_objects`).
     """
     means2d, depths, conics, radii, opacities = gaussians
     if not means2d.is_cuda:

@@ -25,7 +25,8 @@ from drivesplat.rasterization import Rendering, rasterize
 class Picture:
     """A rendering of `gaussians`, which are `sets` one after the other: `image` with sky and the exposure of the view's
     camera; `splats` without sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or
-    None; `objects_alpha`, the alpha of the parts with objects alone, None where it was not rendered beside the image.
+    None; `objects_alpha`, the alpha of the parts with objects alone, None where it needs a second rendering. What is
+    opaque may hide objects behind it in `objects_alpha`.
     """
 
     gaussians: Gaussians
@@ -188,8 +189,8 @@ class SplatModel(nn.Module):
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
         `gaussians`, a set or several, replace `sets_in(view)`. Of a picture with other sets than one of each part,
-        neither `objects_alpha` nor the terms of static parts can be computed. `with_objects` computes the former beside
-        the image, where that takes no second rendering.
+        neither `objects_alpha` nor the terms of static parts can be computed. `with_objects` computes the former, too,
+        where this needs no second rendering.
         """
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
         shown = concatenate(sets)
@@ -200,7 +201,7 @@ class SplatModel(nn.Module):
             means, shown.quats, scales, shown.opacities, colors,
             seen_from.viewmat[None], view.K[None], view.width, view.height, sh_degree=degree,
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
-            objects=self._rows_of_objects(sets) if with_objects else None,
+            objects=self._rows_of_objects() if with_objects else None,
         )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
         image = splats
@@ -243,8 +244,8 @@ class SplatModel(nn.Module):
         return shown if self.camera_poses is None else self.camera_poses.corrected(shown)
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
-        """The alpha of the parts with objects rendered alone, for a picture with a set of each part; None without such
-        parts. Renders them where the picture was not rendered `with_objects`."""
+        """The alpha of the parts with objects alone, for a picture with a set of each part; None without such parts.
+        That of the picture where it has one; otherwise they are rendered."""
         if picture.objects_alpha is not None:
             return picture.objects_alpha
         objects = [own for part, own in zip(self.parts, picture.sets, strict=True) if part.has_objects]
@@ -253,17 +254,12 @@ class SplatModel(nn.Module):
         alone = concatenate(objects)
         return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha.squeeze((0, 3))
 
-    def _rows_of_objects(self, sets: Sequence[Gaussians]) -> slice | None:
-        """The rows of parts with objects in a concatenated set of each part; None without such rows, or where others
-        lie between them."""
-        ends = [*accumulate(len(own) for own in sets)]
-        found = [
-            (start, end)
-            for part, start, end in zip(self.parts, [0, *ends], ends, strict=False)
-            if part.has_objects and end > start
-        ]
-        between = any(end != start for (_, end), (start, _) in pairwise(found))
-        return slice(found[0][0], found[-1][1]) if found and not between else None
+    def _rows_of_objects(self) -> slice | None:
+        """The rows of the parts with objects; None without any, or where rows of other parts lie between them."""
+        of_parts = zip(self.parts, self.rows, strict=True)
+        rows = [own for part, own in of_parts if part.has_objects and own.stop > own.start]
+        together = all(before.stop == after.start for before, after in pairwise(rows))
+        return slice(rows[0].start, rows[-1].stop) if rows and together else None
 
     def class_logits(self, picture: Picture, view: View) -> Float[Tensor, "h w c"] | None:
         """The rendered class logits of a picture of this model; None for a model without semantic classes."""

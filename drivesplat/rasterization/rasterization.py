@@ -18,8 +18,8 @@ class Rendering:
 
     `image` is premultiplied by `alpha`: nothing is composited behind it. `depth` is the expected depth in metres along
     the camera axis, or None. `info` holds what gsplat's strategies read: `means2d`, `radii`, `depths`, `conics`,
-    `opacities`, `width`, `height`, `n_cameras` and `gaussian_ids`. `objects_alpha` is the alpha of some of the
-    Gaussians alone, None where it was not asked for or cannot be had beside the image.
+    `opacities`, `width`, `height`, `n_cameras` and `gaussian_ids`. `objects_alpha` is the alpha of the
+    Gaussians `objects` alone, None where it needs a second rendering. Opaque Gaussians before an object may hide it.
     """
 
     image: Float[Tensor, "c h w channels"]
@@ -66,7 +66,7 @@ def rasterize(
         antialiased: Scale opacities by the area that the 2D filter adds (Yu et al. 2024).
         absgrad: Let the backward pass write `info["means2d"].absgrad` (c, n, 2), as gsplat's strategies need it.
         with_depth: Also render the expected depth.
-        objects: Rows of Gaussians whose alpha alone is wanted, too, where it costs no second rendering.
+        objects: Rows of Gaussians. Their alpha alone is computed, too, where this needs no second rendering.
 
     Returns:
         A `Rendering`: image (c, h, w, channels), premultiplied by alpha; alpha (c, h, w, 1); depth (c, h, w, 1) in

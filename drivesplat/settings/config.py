@@ -47,7 +47,7 @@ METHOD_OVERRIDES = ("sky", "train", "random_seed")
 
 
 def _default_methods() -> dict[str, MethodSettings]:
-    held = {
+    overrides = {
         "train": {
             "sky_bce_weight": 0.05,
             "horizon_weight": 0.05,
@@ -58,7 +58,7 @@ def _default_methods() -> dict[str, MethodSettings]:
             "dropout": 0.2,
         }
     }
-    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=held)}
+    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=overrides)}
 
 
 KEPT_NAMES = {"parts": "a method's parts", "lidar": "LiDAR scans", "truth": "views beside the truth"}

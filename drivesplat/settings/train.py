@@ -235,8 +235,8 @@ class TrainSettings(Settings):
     """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
     consist of objects."""
     entropy_every: int = Field(1, ge=1)
-    """Iterations with an image from one that has this term to the next, which is weighted by their number: objects are
-    rendered alone for it, which takes time."""
+    """Iterations with an image from one that has this term to the next, which is weighted by their number. Without CUDA
+    kernels objects are rendered alone for it, which takes time."""
     dynamic_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute colour difference over the pixels of moving objects. Only with parts that
     consist of objects."""

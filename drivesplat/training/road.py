@@ -64,7 +64,7 @@ def lidar_road(points: Float[np.ndarray, "n 3"], settings: RoadSettings) -> Road
     cell, which is logged."""
     planes = GroundMap(points).planes()
     if not len(planes.places):
-        log.warning("no LiDAR point shows the ground: train.road_weight has no effect with train.road.surface: lidar")
+        log.info("no LiDAR point shows the ground: train.road_weight has no effect with train.road.surface: lidar")
         nothing = SparseGrid.from_numpy(np.zeros(2), LIDAR_CELL, np.ones(2, dtype=np.int64), np.zeros(0, np.int64))
         return Road(nothing, torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), settings.reach)
     lower = np.floor((planes.places.min(axis=0) - NEAR_PLANE) / LIDAR_CELL) * LIDAR_CELL
@@ -81,8 +81,8 @@ def lidar_road(points: Float[np.ndarray, "n 3"], settings: RoadSettings) -> Road
 
 
 def _cells_around(cells: Int[np.ndarray, "n 2"], shape: Int[np.ndarray, "2"]) -> Int[np.ndarray, "m 2"]:
-    """The `cells` of a grid of a shape and those within NEAR_PLANE along both axes of one of them, in row-major
-    order."""
+    """The `cells` of a grid of a shape, and all others whose row and column are within NEAR_PLANE of those of one of
+    them, in row-major order."""
     reach = int(NEAR_PLANE / LIDAR_CELL + 0.5)
     steps = np.arange(-reach, reach + 1)
     for axis, count in enumerate(shape):

@@ -189,7 +189,7 @@ class Trainer:
                 gaussians=sets,
                 absgrad=by_gradient and self.settings.default.absgrad,
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
-                with_objects=self._has_entropy and self.settings.entropy_weight > 0,
+                with_objects=self._has_entropy and self.settings.entropy_weight > 0 and not by_gradient,
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self._image_settings())

@@ -74,14 +74,11 @@ static void run_block(int threads) {
 static Barrier& own_warp() { return barriers[1 + threadIdx.x / 32]; }
 static void __syncthreads() { wait_at(barriers[0]); }
 static void __syncwarp() { wait_at(own_warp()); }
-static int every(int begin, int count, bool all) {
-    int found = all;
-    for (int i = begin; i < begin + count; ++i) found = all ? found && integers[i] : found || integers[i];
-    return found;
-}
 static int __syncthreads_and(int value) {
     integers[threadIdx.x] = value; __syncthreads();
-    int found = every(0, barriers[0].threads, true); __syncthreads();
+    int found = 1;
+    for (int given : integers) found = found && given;
+    __syncthreads();
     return found;
 }
 static unsigned __ballot_sync(unsigned, int value) {

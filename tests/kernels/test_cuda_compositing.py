@@ -1,6 +1,7 @@
 """The CUDA kernels that composite chunks, compared with torch and gsplat, and their compilation, which needs no GPU."""
 
 import ctypes
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +14,7 @@ from helpers.tile_lists import DEVICE, HEIGHT, TILE, WIDTH, ellipses, gradients,
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.cuda import compiled, compositing, scans
 from drivesplat.kernels.triton import chunks
-from drivesplat.kernels.triton.tiles import Footprints, tile_lists
+from drivesplat.kernels.triton.tiles import Footprints, TileLists, tile_lists
 
 gpu = pytest.mark.gpu
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -140,12 +141,81 @@ def test_the_alpha_of_objects_alone_and_its_gradient_equal_those_of_torch(channe
     check_alpha_of_objects(channels, compared, length)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="on a GPU the kernels themselves are compared")
-@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
+def one_after_the_other(given: list[torch.Tensor], objects: slice) -> tuple[torch.Tensor, ...]:
+    """The image of one tile, its alpha and that of `objects` alone, in torch, with rays that end as in the kernels."""
+    means, conics, values, opacities = (tensor[0] for tensor in given)
+    at = torch.arange(TILE, device=DEVICE) + 0.5
+    passes, past_objects = torch.ones(2, TILE, TILE, device=DEVICE)
+    lives, image = torch.ones(TILE, TILE, dtype=torch.bool, device=DEVICE), torch.zeros(TILE, TILE, 3, device=DEVICE)
+    for i in range(len(means)):
+        over_x, over_y = at[None, :] - means[i, 0], at[:, None] - means[i, 1]
+        a, b, c = conics[i]
+        falls = 0.5 * (a * over_x**2 + c * over_y**2) + b * over_x * over_y
+        alpha = (opacities[i] * torch.exp(-falls)).clamp(max=0.999)
+        alpha = torch.where(lives & (alpha >= 1.0 / 255.0), alpha, 0.0)
+        lives = lives & (passes * (1.0 - alpha) > 1e-4)
+        alpha = torch.where(lives, alpha, 0.0)
+        image = image + (passes * alpha)[..., None] * values[i]
+        passes = passes * (1.0 - alpha)
+        past_objects = past_objects * (1.0 - alpha) if objects.start <= i < objects.stop else past_objects
+    assert 0.2 < lives.float().mean() < 0.8
+    return image[None], 1.0 - passes[None, ..., None], 1.0 - past_objects[None, ..., None]
+
+
+def check_ends_of_rays() -> None:
+    """Of 200 Gaussians, which are two batches of a block, in front of and behind which rays end."""
+    generator, count, objects = torch.Generator().manual_seed(0), 200, slice(60, 150)
+    given = [
+        torch.rand(1, count, 2, generator=generator) * 24.0 - 4.0,
+        torch.tensor([0.05, 0.01, 0.08]) * (0.5 + torch.rand(1, count, 1, generator=generator)),
+        torch.rand(1, count, 3, generator=generator),
+        0.05 + 0.4 * torch.rand(1, count, generator=generator),
+    ]
+    given = [values.to(DEVICE).requires_grad_() for values in given]
+    ids, ends = torch.arange(count, device=DEVICE), torch.tensor([0, count], dtype=torch.int32, device=DEVICE)
+    lists = TileLists(ids.int(), ids, ends, (1, 1, 1))
+    expected = one_after_the_other(given, objects)
+    for found in (
+        compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects),
+        compositing.composite(Footprints(*given), lists, TILE, TILE),
+    ):
+        for mine, theirs in zip(found, expected, strict=False):
+            torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-4)
+        retained = [values.detach().requires_grad_() for values in given]
+        both = one_after_the_other(retained, objects)[: len(found)]
+        weights = [torch.rand(image.shape, generator=generator).to(DEVICE) for image in found]
+        mine, theirs = (
+            torch.autograd.grad(sum((w * image).sum() for w, image in zip(weights, images, strict=True)), inputs)
+            for images, inputs in ((found, given), (both, retained))
+        )
+        for one, other in zip(mine, theirs, strict=True):
+            torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
+
+
+@gpu
+@needs_gpu
+def test_rays_end_before_the_last_gaussian():
+    check_ends_of_rays()
+
+
+@pytest.fixture
+def on_the_processor(monkeypatch, tmp_path):
+    """The source compiled for a processor in place of the kernels."""
+    if torch.cuda.is_available():
+        pytest.skip("on a GPU the kernels themselves are compared")
+    if COMPILER is None:
+        pytest.skip("no C++ compiler")
+    compile_once = cache(lambda program, channels, length, device: kernels_on_cpu(program, channels, length, tmp_path))
+    monkeypatch.setattr(compositing, "kernels", compile_once)
+
+
 @pytest.mark.parametrize("compared", [WITH_IMAGE, ALONE])
-def test_the_same_source_compiled_for_a_processor(compared, monkeypatch, tmp_path):
-    monkeypatch.setattr(compositing, "kernels", lambda *key: kernels_on_cpu(*key[:3], tmp_path))
+def test_the_alpha_of_objects_by_the_source_compiled_for_a_processor(compared, on_the_processor):
     check_alpha_of_objects(3, compared, 4)
+
+
+def test_ends_of_rays_by_the_source_compiled_for_a_processor(on_the_processor):
+    check_ends_of_rays()
 
 
 @gpu

@@ -1,6 +1,7 @@
 """Surfaces are flat, and the road is where the car drove: the terms, what they pull on, and what they leave alone."""
 
 import dataclasses
+import logging
 
 import numpy as np
 import pytest
@@ -234,7 +235,8 @@ def test_by_lidar_patches_of_ground_far_apart_have_no_cells_between_them():
 
 def test_without_lidar_points_the_road_by_lidar_has_no_effect_and_this_is_logged(caplog):
     record = with_points(np.ones((50, 3), np.float32), SeedInfo(far=50))
-    road = road_of(record, BY_LIDAR)
+    with caplog.at_level(logging.INFO):
+        road = road_of(record, BY_LIDAR)
     assert "train.road_weight has no effect" in caplog.text
     assert float(road_loss(round_at(torch.ones(4, 3)), road)) == 0.0
 

@@ -35,12 +35,14 @@ def composite(
 def composite_with_objects(
     gaussians: Footprints, lists: TileLists, width: int, height: int, objects: slice, length: int = LENGTH
 ) -> tuple[Float[Tensor, "1 h w v"], Float[Tensor, "1 h w 1"], Float[Tensor, "1 h w 1"]]:
-    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone. Of these it leaves out what the
-    image of all leaves out: a ray ends within a chunk where the transmittance of all its Gaussians falls below 1e-4."""
+    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone.
+
+    Objects do not count where the ray has ended before them: it ends within a chunk where the transmittance of all
+    Gaussians of the chunk falls below 1e-4."""
     chunks = Chunks.of(lists, length)
-    values, alpha, remains = _ChunkImages.apply(*gaussians, lists, chunks, objects)
+    values, alpha, past_objects = _ChunkImages.apply(*gaussians, lists, chunks, objects)
     image, whole = join(values, alpha, chunks, lists, width, height)
-    return image, whole, alpha_of_chunks(remains, chunks, lists, width, height)
+    return image, whole, alpha_of_chunks(past_objects, chunks, lists, width, height)
 
 
 class _ChunkImages(torch.autograd.Function):
@@ -56,14 +58,15 @@ class _ChunkImages(torch.autograd.Function):
         pixels, (_, down, across) = (chunks.count, TILE.value**2), lists.tiles
         images, alphas = means.new_empty(*pixels, values.shape[-1]), means.new_empty(pixels)
         transmittances, lasts = means.new_empty(pixels), chunks.firsts.new_empty(pixels)
-        remains = means.new_empty(chunks.count, 0 if objects is None else TILE.value**2)
+        past_objects = means.new_empty(chunks.count, 0 if objects is None else TILE.value**2)
         read = (*given, lists.ids, lists.order, lists.offsets, chunks.firsts, chunks.tile_of)
         own = (0, 0) if objects is None else (objects.start, objects.stop)
         ctx.chunks, ctx.sizes = chunks, (len(chunks.firsts) - 1, down * across, across, *own)
-        written = (images, alphas, transmittances, lasts, remains)
-        _launch("composite_chunks", chunks, values, *read, *written, *ctx.sizes)
-        ctx.save_for_backward(*read, transmittances, lasts, remains)
-        return images, alphas, remains
+        ctx.program = IMAGES if objects is None else IMAGES_WITH_OBJECTS
+        written = (images, alphas, transmittances, lasts, past_objects)
+        _launch(ctx, "composite_chunks", values, *read, *written, *ctx.sizes)
+        ctx.save_for_backward(*read, transmittances, lasts, past_objects)
+        return images, alphas, past_objects
 
     @staticmethod
     @once_differentiable
@@ -71,13 +74,12 @@ class _ChunkImages(torch.autograd.Function):
         saved, values = ctx.saved_tensors, ctx.saved_tensors[2]
         summed = [torch.zeros_like(given) for given in saved[:4]]
         above = [gradient.contiguous() for gradient in gradients]
-        _launch("composite_chunks_backward", ctx.chunks, values, *saved, *above, *summed, *ctx.sizes)
+        _launch(ctx, "composite_chunks_backward", values, *saved, *above, *summed, *ctx.sizes)
         return *summed, None, None, None
 
 
-def _launch(kernel: str, chunks: Chunks, values: Tensor, *arguments: Tensor | int) -> None:
-    """Runs a kernel for the chunks of Gaussians with `values` (c, n, v), which have to be on the current device. The
-    last two arguments are the first object and the end of them."""
-    program = IMAGES if arguments[-2] == arguments[-1] else IMAGES_WITH_OBJECTS
-    run = kernels(program, values.shape[-1], chunks.length, values.device.index)[kernel]
-    run(chunks.count, THREADS, arguments)
+def _launch(ctx: Any, kernel: str, values: Tensor, *arguments: Tensor | int) -> None:
+    """Runs a kernel of `ctx.program` for `ctx.chunks` of Gaussians with `values` (c, n, v), which have to be on the
+    current device."""
+    run = kernels(ctx.program, values.shape[-1], ctx.chunks.length, values.device.index)[kernel]
+    run(ctx.chunks.count, THREADS, arguments)

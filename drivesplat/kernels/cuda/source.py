@@ -2,7 +2,7 @@
 
 CHANNELS, the number of values of a Gaussian, and LENGTH, the maximum number of entries of a chunk, are defined when it
 is compiled. Rays end and contributions are skipped as in gsplat's kernels. With OBJECTS, Gaussians first_object to
-end_object - 1 are also composited alone, to a transmittance: `remains`.
+end_object - 1 are also composited alone, to a transmittance: `object_transmittances`.
 """
 
 from drivesplat.kernels.cuda.warps import WARPS
@@ -118,8 +118,8 @@ __device__ __forceinline__ bool of_object(const Batch& batch, int j, int first_o
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, float* images, float* alphas,
-    float* transmittances, int* lasts, float* remains, int tiles, int per_camera, int across, int first_object,
-    int end_object
+    float* transmittances, int* lasts, float* object_transmittances, int tiles, int per_camera, int across,
+    int first_object, int end_object
 ) {
     if ((int)blockIdx.x >= firsts[tiles]) return;
     __shared__ Batch batch;
@@ -128,13 +128,13 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     Chunk chunk(lists, blockIdx.x);
     int thread = threadIdx.x;
     float x = column_of(thread) + 0.5f;
-    float y[PIXELS], passes[PIXELS], alone[PIXELS], total[PIXELS][CHANNELS] = {};
+    float y[PIXELS], passes[PIXELS], past_objects[PIXELS], total[PIXELS][CHANNELS] = {};
     int last[PIXELS];
     bool ended[PIXELS], all_ended = false;
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
         y[p] = row_of(thread, p) + 0.5f;
-        passes[p] = alone[p] = 1.0f;
+        passes[p] = past_objects[p] = 1.0f;
         last[p] = -1;
         ended[p] = false;
     }
@@ -160,7 +160,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
                     #pragma unroll
                     for (int k = 0; k < CHANNELS; ++k) total[p][k] += batch.values[j][k] * alpha * passes[p];
                     passes[p] = behind;
-                    if (is_object) alone[p] *= 1.0f - alpha;
+                    if (is_object) past_objects[p] *= 1.0f - alpha;
                     last[p] = begin - chunk.start + j;
                 }
                 all_ended = true;
@@ -176,7 +176,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
         for (int k = 0; k < CHANNELS; ++k) images[at * CHANNELS + k] = total[p][k];
         alphas[at] = 1.0f - passes[p];
         transmittances[at] = passes[p];
-        if (OBJECTS) remains[at] = alone[p];
+        if (OBJECTS) object_transmittances[at] = past_objects[p];
         lasts[at] = last[p];
     }
 }
@@ -185,7 +185,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, const float* transmittances,
-    const int* lasts, const float* remains, const float* v_images, const float* v_alphas, const float* v_remains,
+    const int* lasts, const float* object_transmittances, const float* v_images, const float* v_alphas,
+    const float* v_object_transmittances,
     float* v_means, float* v_conics, float* v_values, float* v_opacities, int tiles, int per_camera, int across,
     int first_object, int end_object
 ) {
@@ -198,8 +199,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     int thread = threadIdx.x, lane = thread % WARP;
     float x = column_of(thread) + 0.5f;
     // by pixel: transmittance, gradient of the values; `behind`, the gradient by all that the pixel shows behind the
-    // Gaussian at hand; `alone`, the gradient of the transmittance of objects times that transmittance
-    float y[PIXELS], passes[PIXELS], behind[PIXELS], alone[PIXELS], v_pixel[PIXELS][CHANNELS];
+    // Gaussian at hand; `by_objects`, the gradient of the transmittance of objects times that transmittance
+    float y[PIXELS], passes[PIXELS], behind[PIXELS], by_objects[PIXELS], v_pixel[PIXELS][CHANNELS];
     int last[PIXELS], last_of_warp = -1;
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
@@ -207,8 +208,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
         y[p] = row_of(thread, p) + 0.5f;
         passes[p] = transmittances[at];
         behind[p] = -passes[p] * v_alphas[at];
-        alone[p] = OBJECTS ? v_remains[at] * remains[at] : 0.0f;
-        bool matters = v_alphas[at] != 0.0f || alone[p] != 0.0f;
+        by_objects[p] = OBJECTS ? v_object_transmittances[at] * object_transmittances[at] : 0.0f;
+        bool matters = v_alphas[at] != 0.0f || by_objects[p] != 0.0f;
         #pragma unroll
         for (int k = 0; k < CHANNELS; ++k) {
             v_pixel[p][k] = v_images[at * CHANNELS + k];
@@ -264,7 +265,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
                         by_values += batch.values[j][k] * v_pixel[p][k];
                     }
                     float v_alpha = passes[p] * by_values - left * behind[p];
-                    if (is_object) v_alpha -= left * alone[p];
+                    if (is_object) v_alpha -= left * by_objects[p];
                     behind[p] += weight * by_values;
                     bool free = alpha[p] > 0.0f && batch.opacity[j] * falloff[p] <= MAX_ALPHA;
                     float v_opacity = free ? falloff[p] * v_alpha : 0.0f;
