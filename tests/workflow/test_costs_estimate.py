@@ -8,6 +8,7 @@ from helpers import REPOSITORY
 from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.settings.config import load, merged
+from drivesplat.settings.train import TrainSettings
 from drivesplat.workflow.costs.estimate import (
     Expectations,
     Machine,
@@ -28,7 +29,7 @@ def expectations(*costs: Cost, **config) -> Expectations:
     return Expectations(load(merged(DEFAULTS, config)), costs)
 
 
-def training(scene: str, method: str, seconds: float, iterations: int = 15000) -> Cost:
+def training(scene: str, method: str, seconds: float, iterations: int = TrainSettings().iterations) -> Cost:
     return Cost(JobId("train", scene, method), seconds, "benchmark", iterations=iterations)
 
 

@@ -21,7 +21,7 @@ MASKS, TRAIN, FILM = (
     JobId("train", "0103", "street"),
     JobId("film", "0103", "street", "original"),
 )
-COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=15000), Cost(FILM, 100.0, "")]
+COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=CONFIG.train.iterations), Cost(FILM, 100.0, "")]
 BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
 ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.workflow.job: street/train 0103 ends\n"
 LOGGED = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
