@@ -23,8 +23,8 @@ def with_dropout(sets: Sequence[Gaussians], model: SplatModel, share: float) -> 
     """The sets of Gaussians of a model's parts, with a random `share` of static ones left out: their opacity is 0.
 
     As DropGaussian (Park et al., CVPR 2025), but with a constant share and without raising the opacity of the others.
-    Loss terms that ignore Gaussians of opacity 0 (opacity, scale, road) ignore these, too, and pictures of the training
-    lack them. Uses torch's global random generator. No host synchronisation.
+    Loss terms that ignore Gaussians of opacity 0 (opacity, scale, road) ignore these, too. Uses torch's global random
+    generator. No host synchronisation.
     """
     found = []
     for part, own in zip(model.parts, sets, strict=True):

@@ -218,13 +218,21 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
                 run.check()
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
             if with_picture and picture is not None and view is not None:
-                monitor.image(trainer.step, view, picture)
+                monitor.image(trainer.step, view, _without_dropout(picture, view, trainer))
             monitor.psnrs(trainer.step, run.psnrs())
             run.visit()
             if run.save_due:
                 run.save()
     run.check()
     trainer.end()
+
+
+def _without_dropout(picture: Picture, view: TrainingView, trainer: Trainer) -> Picture:
+    """The picture of an iteration, or another one of its view where dropout left out some of its Gaussians."""
+    if not trainer.settings.dropout:
+        return picture
+    with torch.no_grad():
+        return trainer.graphs.retry_without_graphs(lambda: trainer.model.render(view.view, trainer.sh_degree()))
 
 
 def _due(step: int, every: int, iterations: int) -> bool:

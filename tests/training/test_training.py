@@ -70,7 +70,7 @@ from drivesplat.settings.train import (
 from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.training import resume_state
 from drivesplat.training.geometry_priors import GeometryPriors
-from drivesplat.training.monitor import NEVER, FiniteGuard
+from drivesplat.training.monitor import NEVER, FiniteGuard, Monitor
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.road import driven_road
 from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
@@ -775,6 +775,14 @@ def test_tensorboard_holds_every_loss_and_pictures(tmp_path):
     np.testing.assert_allclose(losses["loss/total"], np.sum(parts, axis=0), rtol=1e-5)
     assert [event.step for event in board.Images("recorded_and_rendered")] == [30, 60]
     assert {(event.width, event.height) for event in board.Images("recorded_and_rendered")} == {(2 * WIDTH, HEIGHT)}
+
+
+def test_tensorboards_pictures_show_all_gaussians_also_with_dropout(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(Monitor, "image", lambda self, step, view, picture: shown.append(picture))
+    trained(tmp_path, settings_of(dropout=0.5))
+    assert len(shown) == 2
+    assert all((picture.gaussians.opacities > 0.0).all() and not picture.image.requires_grad for picture in shown)
 
 
 def test_tensorboard_of_a_resumed_training_has_every_iteration_once(tmp_path):
