@@ -1,14 +1,16 @@
 """The stage `actors`: which vehicles become actors, and the initial points of their Gaussians.
 
 The points are the LiDAR returns of the training sweeps in an actor's box, accumulated over the drive in the actor's
-frame, plus random points in the box where there are few returns (Street Gaussians, Yan et al. 2024, arXiv 2401.01339).
-Colours come from training images that show the actor. Held-out images and sweeps contribute nothing.
+frame, plus random points in the box where there are few returns (Street Gaussians, Yan et al. 2024, arXiv 2401.01339),
+and on the sides and the roof of a vehicle's box above the highest returns: of a truck close ahead LiDAR meets the lower
+half. Colours come from training images that show the actor. Held-out images and sweeps contribute nothing.
 """
 
 import logging
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
@@ -27,6 +29,10 @@ from drivesplat.settings.train import PartName
 
 log = logging.getLogger(__name__)
 
+HIGHEST = 0.98
+"""Fraction of an actor's LiDAR points below the height up to which LiDAR reaches: higher ones are not its own."""
+MIN_UNREACHED = 0.3
+"""Minimum height in metres above the highest LiDAR points of a box for random points there."""
 UNSEEN = 127
 """Grey level of an actor whose points no image shows."""
 
@@ -65,19 +71,46 @@ def gathered_points(
     settings: ActorSeedSettings,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, int]:
-    """Points (n, 3) in an object's frame, LiDAR points before random ones in its box, and the number of LiDAR points.
+    """Points (n, 3) in an object's frame, LiDAR points before random ones, and the number of LiDAR points.
 
     `sweeps` come with their returns (m, 3) in world coordinates.
     """
+    track = dynamic_object.track
     in_box = (
         dynamic_object.own(points, scene.seconds(sweep.timestamp), settings.box_margin) for sweep, points in sweeps
     )
     lidar = np.concatenate([np.empty((0, 3)), *in_box])
-    target = min(settings.random_points, settings.max_points) if len(lidar) < settings.min_points else 0
-    if len(lidar) > settings.max_points:
-        lidar = lidar[np.sort(random.choice(len(lidar), settings.max_points, replace=False))]
-    filling = random.uniform(-0.5, 0.5, (max(0, target - len(lidar)), 3)) * dynamic_object.track.size
+    if len(lidar) < settings.min_points:
+        target = min(settings.random_points, settings.max_points)
+        filling = random.uniform(-0.5, 0.5, (max(0, target - len(lidar)), 3)) * track.size
+    elif len(lidar) and track.object_class.is_solid:
+        filling = points_above(lidar, track.size, min(settings.random_points, settings.max_points), random)
+    else:
+        filling = np.empty((0, 3))
+    most = settings.max_points - len(filling)
+    if len(lidar) > most:
+        lidar = lidar[np.sort(random.choice(len(lidar), most, replace=False))]
     return np.concatenate([lidar, filling]), len(lidar)
+
+
+def points_above(
+    lidar: Float[np.ndarray, "n 3"], size: Float[np.ndarray, "3"], per_box: int, random: np.random.Generator
+) -> Float[np.ndarray, "m 3"]:
+    """Random points on the sides and the roof of a box of `size` (metres) above its LiDAR points, all in the box's own
+    frame. There are `per_box` times the share of its height that LiDAR does not reach; none where that is less than
+    MIN_UNREACHED metres."""
+    reached = float(np.quantile(lidar[:, 2], HIGHEST))
+    unreached = size[2] / 2.0 - reached
+    if unreached < MIN_UNREACHED:
+        return np.empty((0, 3))
+    count = round(per_box * min(1.0, unreached / size[2]))
+    points = random.uniform(-0.5, 0.5, (count, 3)) * size
+    points[:, 2] = random.uniform(reached, size[2] / 2.0, count)
+    sides = np.where(points < 0.0, -0.5, 0.5) * size
+    sides[:, 2] = size[2] / 2.0
+    rows, nearest = np.arange(count), np.abs(sides - points).argmin(axis=1)
+    points[rows, nearest] = sides[rows, nearest]
+    return points
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@
 import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -28,9 +29,11 @@ from drivesplat.scene.images import (
     write_png,
 )
 from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name
-from drivesplat.scene.regions import LABELS, label_image, visibility_source
+from drivesplat.scene.regions import LABELS, fill, hull_of, label_image, visibility_source
+from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import Group, frame_groups
+from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.masks import MaskJob
 
 log = logging.getLogger(__name__)
@@ -45,6 +48,8 @@ SMOOTH = 0.045
 """Maximum brightness gradient of sky, per pixel at 640 pixels' width."""
 LIDAR_REACH = 12
 """Distance from a LiDAR return within which no pixel is sky, in pixels at 640 pixels' width."""
+BOX_MARGIN = 0.05
+"""Distance in metres from the sides of a vehicle's box, inwards, from which on no pixel is sky."""
 MIN_SKY = 0.005
 """Minimum share of sky over all images. Below it the heuristic, which looks for bright pixels, has found no sky."""
 NO_SKY = (
@@ -128,9 +133,23 @@ def _sky(sweeps: Sequence[Sweep], scene: Scene, frame: Frame, job: MaskJob, size
     if frame.classes_path is not None and scene.sky_class is not None:
         return _datasets_classes(frame, size) == scene.sky_class
     lidar = nearest_returns(sweeps, frame.timestamp, scene.key_frame_interval)
-    return sky_mask(
-        read_image(frame.image_path, size), continuous_intrinsics(frame, size), frame.camera_to_world, lidar
-    )
+    pixels, intrinsics = read_image(frame.image_path, size), continuous_intrinsics(frame, size)
+    return sky_mask(pixels, intrinsics, frame.camera_to_world, lidar, solid_pixels(scene, frame, size))
+
+
+def solid_pixels(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """The pixels (h, w) bool of a frame at `size` (width, height) that show a vehicle or what hides it, by the boxes of
+    vehicles without a margin. Cycles do not count, since they have gaps."""
+    world_to_camera, intrinsics = inverse(frame.camera_to_world), continuous_intrinsics(frame, size)
+    solid = np.zeros((size[1], size[0]), dtype=bool)
+    for box in boxes_at(scene, frame.timestamp):
+        if box.object_class.is_solid:
+            polygon = hull_of(
+                replace(box, size=np.maximum(box.size - 2.0 * BOX_MARGIN, 0.0)), world_to_camera, intrinsics
+            )
+            if polygon is not None:
+                solid |= fill(polygon, size)
+    return solid
 
 
 def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) -> np.ndarray:
@@ -171,10 +190,14 @@ def _refuse_own_folder(job: MaskJob, folder: Path) -> None:
 
 
 def sky_mask(
-    pixels: np.ndarray, intrinsics: np.ndarray, camera_to_world: np.ndarray, lidar: np.ndarray | None
+    pixels: np.ndarray,
+    intrinsics: np.ndarray,
+    camera_to_world: np.ndarray,
+    lidar: np.ndarray | None,
+    solid: np.ndarray | None = None,
 ) -> np.ndarray:
     """The sky (h, w) bool of an image (h, w, 3) uint8 RGB: pixels above the horizon, bright or blue, smooth, connected
-    to the top edge, without LiDAR returns.
+    to the top edge, without LiDAR returns, outside of `solid` (h, w) bool.
 
     `intrinsics` (3, 3) in the continuous convention; `lidar` (n, 3) world points of the nearest sweep, or None.
     """
@@ -190,6 +213,8 @@ def sky_mask(
         candidate &= ~_near_returns(
             lidar, np.linalg.inv(camera_to_world), intrinsics, (height, width), max(1, round(LIDAR_REACH * scale))
         )
+    if solid is not None:
+        candidate &= ~solid
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     candidate = cv2.morphologyEx(candidate.astype(np.uint8), cv2.MORPH_OPEN, cross, iterations=max(1, round(scale)))
     labels, _ = ndimage.label(candidate)

@@ -38,6 +38,11 @@ class ObjectClass(StrEnum):
         return not self.is_human and self not in (ObjectClass.ANIMAL, ObjectClass.OTHER_MOVABLE)
 
     @property
+    def is_solid(self) -> bool:
+        """Whether nothing is seen through it: a vehicle that is no cycle."""
+        return self.is_vehicle and self not in (ObjectClass.MOTORCYCLE, ObjectClass.BICYCLE, ObjectClass.RIDER)
+
+    @property
     def is_human(self) -> bool:
         """Whether it is a person on foot."""
         return self is ObjectClass.PEDESTRIAN

@@ -33,7 +33,7 @@ from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, ObjectClassName
 from drivesplat.settings.extract import SceneSource
@@ -159,6 +159,53 @@ def test_enough_lidar_points_get_no_random_ones(tiny_scene, less, count):
     lidar = len(returns_of(World(), CAR, TRAINING))
     actor = the_actor(tiny_scene, job(min_points=lidar + less, random_points=4000))
     assert len(actor.points) == (count or lidar)
+
+
+def raised(scene: Scene, metres: float, object_class: str = "truck") -> Scene:
+    """The scene with its cars as vehicles of another class, whose boxes are higher by some metres: no return is near
+    their roofs."""
+
+    def as_high(track: Track) -> Track:
+        poses = track.object_to_world.copy()
+        poses[:, 2, 3] += metres / 2
+        size, kind = track.size + np.array([0.0, 0.0, metres]), ObjectClass(object_class)
+        return dataclasses.replace(track, object_class=kind, size=size, object_to_world=poses)
+
+    tracks = (as_high(track) if track.object_class is ObjectClass.CAR else track for track in scene.tracks)
+    return dataclasses.replace(scene, tracks=tuple(tracks))
+
+
+@pytest.mark.parametrize("metres", [0.2, 0.8, 2.4])
+def test_the_sides_and_the_roof_of_a_truck_above_its_returns_have_points(tiny_scene, metres):
+    lidar, actor = the_actor(tiny_scene, job()), the_actor(raised(tiny_scene, metres), job(random_points=3000))
+    assert actor.lidar_points == lidar.lidar_points
+    above = actor.points[actor.lidar_points :].astype(float)
+    if metres == 0.2:
+        assert len(above) == 0, "a roof is as rarely as high as its box"
+        return
+    half = actor.size / 2
+    returns = np.quantile(actor.points[: actor.lidar_points, 2], 0.98)
+    assert len(above) == pytest.approx(3000 * (half[2] - returns) / actor.size[2], abs=1)
+    assert returns <= above[:, 2].min() < returns + 0.1 and above[:, 2].max() == pytest.approx(half[2])
+    on_face = np.isclose(np.abs(above), half, atol=1e-5)
+    on_face[:, 2] &= above[:, 2] > 0
+    assert on_face.any(axis=1).all()
+    for axis in range(2):
+        assert (on_face[:, axis] & (above[:, axis] > 0)).mean() == pytest.approx(
+            (on_face[:, axis] & (above[:, axis] < 0)).mean(), abs=0.05
+        )
+    assert on_face.mean(axis=0).min() > 0.05, "two sides, two ends and the roof"
+
+
+def test_people_and_cycles_have_no_points_above_their_returns(tiny_scene):
+    scene = raised(tiny_scene, 2.4, "bicycle")
+    actor = the_actor(scene, job(random_points=3000))
+    assert len(actor.points) == actor.lidar_points
+
+
+def test_points_above_the_returns_leave_room_for_fewer_returns(tiny_scene):
+    actor = the_actor(raised(tiny_scene, 2.4), job(random_points=3000, max_points=100))
+    assert len(actor.points) == 100 and 30 < actor.lidar_points < 70
 
 
 def test_random_points_respect_the_maximum(tiny_scene):

@@ -19,9 +19,10 @@ from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import project, read_image
 from drivesplat.scene.masks import UNLABELLED, mask_name, read_classes, read_labels, read_masks_record, read_sky_mask
-from drivesplat.scene.regions import LABELS, label_image, region_mask
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.regions import LABELS, fill, hulls_in, label_image, region_mask
 from drivesplat.scene.rigid import apply, inverse
-from drivesplat.scene.scene import Frame, Scene, write_scene
+from drivesplat.scene.scene import Frame, Scene, Track, write_scene
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.masks import MaskJob
 
@@ -146,6 +147,26 @@ def test_a_clear_sky_reaches_into_the_corners_of_the_image(tiny_scene, width):
     pixels = np.full((height, width, 3), (150, 190, 240), dtype=np.uint8)
     k = np.diag([width / 96, width / 96, 1.0]) @ K
     assert sky_mask(pixels, k, tiny_scene.frames[0].camera_to_world, None)[: height // 3].all()
+
+
+@pytest.mark.parametrize(("object_class", "is_sky"), [("truck", False), ("car", False), ("rider", True)])
+def test_a_vehicle_as_bright_as_the_sky_is_not_sky(tiny_scene, tmp_path, object_class, is_sky):
+    white = tmp_path / "white.png"
+    Image.new("RGB", SIZE, (235, 235, 235)).save(white)
+    frame = dataclasses.replace(tiny_scene.frames[0], image_path=str(white))
+    ahead = np.array([np.eye(4)] * 2)
+    ahead[:, :3, 3] = (frame.camera_to_world @ [0.0, -1.0, 14.0, 1.0])[:3]
+    box = Track(
+        "ahead", ObjectClass(object_class), object_class, np.array([4.0, 3.0, 6.0]),
+        frame.timestamp + np.array([0, 500_000]), np.arange(2), ahead, np.full(2, 4),
+    )  # fmt: skip
+    scene = dataclasses.replace(tiny_scene, frames=(frame,), sweeps=(), tracks=(box,))
+    make_masks(scene, job(), tmp_path / "masks")
+    sky = read_sky_mask(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE)
+    above, (inside,) = sky[:25], (fill(hull.polygon, SIZE)[:25] for hull in hulls_in(scene, frame, SIZE))
+    assert inside.sum() > 100 and (~inside).sum() > 100
+    assert above[~inside].mean() > 0.9
+    assert above[inside].all() if is_sky else above[inside].mean() < 0.25
 
 
 def test_a_bright_patch_not_connected_to_the_top_is_not_sky(tiny_scene):
