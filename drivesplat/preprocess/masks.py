@@ -9,7 +9,6 @@
 import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -29,11 +28,9 @@ from drivesplat.scene.images import (
     write_png,
 )
 from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name
-from drivesplat.scene.regions import LABELS, fill, hull_of, label_image, visibility_source
-from drivesplat.scene.rigid import inverse
+from drivesplat.scene.regions import LABELS, fill, hulls_in, label_image, visibility_source
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import Group, frame_groups
-from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.masks import MaskJob
 
 log = logging.getLogger(__name__)
@@ -48,8 +45,6 @@ SMOOTH = 0.045
 """Maximum brightness gradient of sky, per pixel at 640 pixels' width."""
 LIDAR_REACH = 12
 """Distance from a LiDAR return within which no pixel is sky, in pixels at 640 pixels' width."""
-BOX_MARGIN = 0.05
-"""Distance in metres from the sides of a vehicle's box, inwards, from which on no pixel is sky."""
 MIN_SKY = 0.005
 """Minimum share of sky over all images. Below it the heuristic, which looks for bright pixels, has found no sky."""
 NO_SKY = (
@@ -138,17 +133,12 @@ def _sky(sweeps: Sequence[Sweep], scene: Scene, frame: Frame, job: MaskJob, size
 
 
 def solid_pixels(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    """The pixels (h, w) bool of a frame at `size` (width, height) that show a vehicle or what hides it, by the boxes of
-    vehicles without a margin. Cycles do not count, since they have gaps."""
-    world_to_camera, intrinsics = inverse(frame.camera_to_world), continuous_intrinsics(frame, size)
+    """The pixels (h, w) bool of a frame at `size` (width, height) in the boxes of vehicles: what they show is a vehicle
+    or hides one. Cycles do not count, since they have gaps."""
     solid = np.zeros((size[1], size[0]), dtype=bool)
-    for box in boxes_at(scene, frame.timestamp):
-        if box.object_class.is_solid:
-            polygon = hull_of(
-                replace(box, size=np.maximum(box.size - 2.0 * BOX_MARGIN, 0.0)), world_to_camera, intrinsics
-            )
-            if polygon is not None:
-                solid |= fill(polygon, size)
+    for hull in hulls_in(scene, frame, size):
+        if hull.box.object_class.is_solid:
+            solid |= fill(hull.polygon, size)
     return solid
 
 
