@@ -45,14 +45,20 @@ def over_cube_map(
 
 def cube_map_colors(cube: CubeMap, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """RGB in [0, 1] along world directions of any length, interpolated bilinearly on a face."""
-    faces = cube.texels[cube.index]
-    sampled = F.grid_sample(
-        faces.permute(3, 0, 1, 2)[None],
+    return torch.sigmoid(sampled(cube.texels, cube.index, rays))
+
+
+def sampled(
+    texels: Float[Tensor, "n c"], index: Int[Tensor, "6 r r"], rays: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w c"]:
+    """Values of texels along world directions of any length, interpolated bilinearly on a face."""
+    values = F.grid_sample(
+        texels[index].permute(3, 0, 1, 2)[None],
         face_coordinates(rays)[None, None],
         align_corners=True,
         padding_mode="border",
     )
-    return torch.sigmoid(sampled[0, :, 0].permute(1, 2, 0))
+    return values[0, :, 0].permute(1, 2, 0)
 
 
 def face_coordinates(rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat.kernels.cube_map import CubeMap, cube_map_colors, over_cube_map
+from drivesplat.kernels.cube_map import CubeMap, cube_map_colors, over_cube_map, sampled
 from drivesplat.model.part import Sky
 from drivesplat.model.view import View
 
@@ -20,7 +20,7 @@ class ConstantSky(Sky):
 
     def __init__(self, color: Float[Tensor, "3"], learning_rate: float):
         super().__init__()
-        self.params = nn.ParameterDict({"color": nn.Parameter(_logit(color))})
+        self.params = nn.ParameterDict({"color": nn.Parameter(logit_of(color))})
         self._learning_rate = learning_rate
 
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -39,7 +39,7 @@ class CubemapSky(Sky):
         super().__init__()
         index, count = shared_vertices(resolution)
         self.register_buffer("index", index, persistent=False)
-        self.params = nn.ParameterDict({"texels": nn.Parameter(_logit(color).repeat(count, 1))})
+        self.params = nn.ParameterDict({"texels": nn.Parameter(logit_of(color).repeat(count, 1))})
         self._learning_rate = learning_rate
 
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -54,6 +54,17 @@ class CubemapSky(Sky):
         return over_cube_map(
             splats, alpha, self._cube_map, view.K, view.camera_to_world, view.rays, view.turning_by_line
         )
+
+    def directions(self) -> Float[Tensor, "n 3"]:
+        """Where the texels lie, as vertices of a cube with edges of 2."""
+        return vertex_directions(self.index.shape[-1]).to(self.params["texels"])
+
+    def sums(self, rays: Float[Tensor, "h w 3"], values: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
+        """The sums over an image of `values` by texel, with the weights of the bilinear interpolation."""
+        with torch.enable_grad():  # the gradient of an interpolation is its transpose
+            texels = values.new_zeros(len(self.params["texels"]), values.shape[-1], requires_grad=True)
+            interpolated = sampled(texels, self.index, rays)
+            return torch.autograd.grad(interpolated, texels, values)[0]
 
     @property
     def _cube_map(self) -> CubeMap:
@@ -79,5 +90,20 @@ def shared_vertices(resolution: int) -> tuple[Int[Tensor, "6 r r"], int]:
     return index, len(keys)
 
 
-def _logit(color: Tensor) -> Tensor:
+def vertex_directions(resolution: int) -> Float[Tensor, "n 3"]:
+    """The vertices of `shared_vertices` in [-1, 1]^3, in the order of their numbers."""
+    index, count = shared_vertices(resolution)
+    line = torch.linspace(-1.0, 1.0, resolution)
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    directions = torch.zeros(count, 3)
+    for face, rows in enumerate(index):
+        axis = face // 2
+        corner = torch.full((resolution, resolution, 3), -1.0 if face % 2 else 1.0)
+        corner[..., (axis + 1) % 3], corner[..., (axis + 2) % 3] = u, v
+        directions[rows] = corner
+    return directions
+
+
+def logit_of(color: Tensor) -> Tensor:
+    """The logits of colours in [0, 1], limited to finite ones."""
     return torch.logit(color.clamp(0.02, 0.98))

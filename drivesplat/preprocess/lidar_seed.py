@@ -1,15 +1,17 @@
 """The stage `lidar_seed`: the initial points of the static Gaussians.
 
-The sources are static LiDAR returns of the training sweeps, without the ego vehicle and thinned; points triangulated
-by pose refinement that two training images see; points of a file, if given; and far points along pixels that none of
-these cover. Colours come from training images, and points that none of them sees are left out. Held-out images and
-sweeps contribute neither LiDAR positions nor colours.
+The sources are static LiDAR returns of the training sweeps, without the ego vehicle and thinned; points triangulated by
+pose refinement that two training images see; points of a file, if given; and far points along pixels that none of these
+cover, upright above them where they show more than the ground. Colours come from training images, and points that none
+of them sees are left out. Held-out images and sweeps contribute neither LiDAR positions nor colours.
 """
 
 import logging
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from plyfile import PlyParseError
 
 from drivesplat.errors import DatasetError
@@ -34,6 +36,8 @@ log = logging.getLogger(__name__)
 
 COVERAGE_CELL = 8
 """Edge length in pixels of the image cell that a seed point covers."""
+RAISED = 1.0
+"""Metres above the ground under the camera from which on a seed point is part of something upright."""
 
 
 def seed_points(
@@ -161,52 +165,76 @@ def _far_points(
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
 
-    def view_of(frame: Frame) -> tuple[ColorView, np.ndarray]:
-        view = color_view(scene, frame, job.images, ego_mask)
-        return view, uncovered(view, covered)
+    def view_of(frame: Frame) -> tuple[ColorView, float, Uncovered]:
+        view, ground_z = color_view(scene, frame, job.images, ego_mask), float(frame.ego_to_world[2, 3])
+        return view, ground_z, uncovered(view, covered, ground_z)
 
     settings = job.lidar_seed
     positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
     shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
-    for frame, (view, candidates), count in zip(frames, prefetch(view_of, frames), shares, strict=True):
-        ground_z = float(frame.ego_to_world[2, 3])
+    for (view, ground_z, candidates), count in zip(prefetch(view_of, frames), shares, strict=True):
         p, c = far_points(view, ground_z, candidates, count, settings.far_depths, random)
         positions.append(p)
         colors.append(c)
     return np.concatenate(positions), np.concatenate(colors)
 
 
-def uncovered(view: ColorView, points: np.ndarray) -> np.ndarray:
-    """Flat row-major indices (m,) of a view's usable pixels in cells of COVERAGE_CELL pixels into which none of the
-    world points (n, 3) projects."""
+class Uncovered(NamedTuple):
+    """Pixels of a view that no seed point covers: their flat row-major indices, and the depths along the axis (metres)
+    at which something upright may continue to them from the seed points below them; inf where there is none."""
+
+    pixels: Int[np.ndarray, " m"]
+    upright: Float[np.ndarray, " m"]
+
+
+def uncovered(view: ColorView, points: Float[np.ndarray, "n 3"], ground_z: float) -> Uncovered:
+    """A view's usable pixels in cells of COVERAGE_CELL pixels into which none of the world points projects.
+
+    LiDAR reaches a few metres up facades and trees, and what it does not reach stands mostly above what it does. An
+    upright surface has one depth in all rows of a level camera's column. Its depth is that of the nearest point in the
+    next covered cell below, if this point is at least RAISED metres above the ground at height `ground_z`.
+    """
     height, width = view.pixels.shape[:2]
-    cells = np.zeros((height // COVERAGE_CELL + 1, width // COVERAGE_CELL + 1), dtype=bool)
-    _, rows, columns, _ = in_image(view.where_seen(points), view.world_to_camera, view.intrinsics, (height, width))
-    cells[rows // COVERAGE_CELL, columns // COVERAGE_CELL] = True
-    covered = cells.repeat(COVERAGE_CELL, axis=0).repeat(COVERAGE_CELL, axis=1)[:height, :width]
-    return np.flatnonzero(view.usable & ~covered)
+    index, rows, columns, depths = in_image(
+        view.where_seen(points), view.world_to_camera, view.intrinsics, (height, width)
+    )
+    raised = points[index, 2] > ground_z + RAISED
+    shape = height // COVERAGE_CELL + 1, width // COVERAGE_CELL + 1
+    nearest, nearest_raised = np.full(shape, np.inf), np.full(shape, np.inf)
+    np.minimum.at(nearest, (rows // COVERAGE_CELL, columns // COVERAGE_CELL), depths)
+    at_raised = rows[raised] // COVERAGE_CELL, columns[raised] // COVERAGE_CELL
+    np.minimum.at(nearest_raised, at_raised, depths[raised])
+    covered, upright = np.isfinite(nearest), np.where(nearest_raised <= nearest, nearest_raised, np.inf)
+    for row in range(shape[0] - 2, -1, -1):
+        upright[row] = np.where(covered[row], upright[row], upright[row + 1])
+    filled = covered.repeat(COVERAGE_CELL, axis=0).repeat(COVERAGE_CELL, axis=1)[:height, :width]
+    pixels = np.flatnonzero(view.usable & ~filled)
+    rows, columns = np.divmod(pixels, width)
+    return Uncovered(pixels, upright[rows // COVERAGE_CELL, columns // COVERAGE_CELL])
 
 
 def far_points(
     view: ColorView,
     ground_z: float,
-    candidates: np.ndarray,
+    candidates: Uncovered,
     count: int,
     depths: tuple[float, float],
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At most `count` random points on the rays of pixels drawn from `candidates`, which `uncovered` returns.
+    """At most `count` random points on the rays of pixels drawn from `candidates`.
 
-    Depth is log-uniform between `depths` (metres). A point below the ground plane at height `ground_z` is moved along
-    its ray onto the plane. Returns world positions (m, 3) and the colours (m, 3) uint8 of the pixels.
+    Their depth is that of something upright, or log-uniform between `depths` (metres). A point below the ground plane
+    at height `ground_z` is moved along its ray onto the plane. Returns world positions (m, 3) and the colours (m, 3)
+    uint8 of the pixels.
     """
-    chosen = random.choice(candidates, size=min(count, len(candidates)), replace=False)
-    rows, columns = np.divmod(chosen, view.pixels.shape[1])
+    chosen = random.choice(len(candidates.pixels), size=min(count, len(candidates.pixels)), replace=False)
+    rows, columns = np.divmod(candidates.pixels[chosen], view.pixels.shape[1])
     camera_to_world = np.linalg.inv(view.world_to_camera)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
     rays = pixels @ np.linalg.inv(view.intrinsics).T @ camera_to_world[:3, :3].T
     center = camera_to_world[:3, 3]
-    depth = np.exp(random.uniform(*np.log(depths), size=len(rows)))
+    anywhere, upright = np.exp(random.uniform(*np.log(depths), size=len(rows))), candidates.upright[chosen]
+    depth = np.where(np.isfinite(upright), upright, anywhere)
     with np.errstate(divide="ignore"):
         to_ground = np.where(rays[:, 2] < 0, (ground_z - center[2]) / rays[:, 2], np.inf)
     depth = np.minimum(depth, np.where(to_ground > 0, to_ground, np.inf))

@@ -30,9 +30,11 @@ class LidarSeedSettings(Settings):
     box_margin: float = Field(0.2, ge=0, le=2)
     """Margin (metres) around boxes of moving objects in which points are left out."""
     far_points: int = Field(80_000, ge=0, le=2_000_000)
-    """Number of random points along pixels that no other seed point covers (sky, tall buildings, missing LiDAR)."""
+    """Number of random points along pixels that no other seed point covers (sky, tall buildings, missing LiDAR). Above
+    seed points that are higher than the ground they have the same depth, as facades and trees do."""
     far_depths: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (3.0, 300.0)
-    """Minimum and maximum depth of far points (metres), log-uniformly distributed and never below the road."""
+    """Minimum and maximum depth of all other far points (metres), log-uniformly distributed and never below the road.
+    """
 
     @field_validator("far_depths")
     @classmethod

@@ -231,7 +231,7 @@ class TrainSettings(Settings):
     smoothness_weight: float = Field(0.0, ge=0)
     """Loss weight of the unevenness of rendered surfaces: the mean absolute second difference of inverse depth between
     neighbouring pixels, divided by inverse depth; clipped and down-weighted at edges (docs/off_the_lane.md)."""
-    entropy_weight: float = Field(0.02, ge=0)
+    entropy_weight: float = Field(0.005, ge=0)
     """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
     consist of objects."""
     entropy_every: int = Field(1, ge=1)

@@ -36,6 +36,7 @@ from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
 from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
+from drivesplat.training.unseen_sky import fill_unseen_sky
 from drivesplat.training.views import Guides, TrainingView, load_views
 from drivesplat.training.visits import NO_VISITS, Visits
 
@@ -240,6 +241,7 @@ def run_training(
             model, begun.views, begun.settings, seed, device, folders, begun.priors,
             curves=begun.curves, scans=begun.scans, visits=visits,
         )  # fmt: skip
+        fill_unseen_sky(model, begun.views)
         write_checkpoint(files.checkpoint, TrainedCheckpoint.of(model, job, provenance))
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
     if os.getppid() == started_by:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from drivesplat.kernels.cube_map import face_coordinates
+from drivesplat.kernels.cube_map import face_coordinates, sampled
 from drivesplat.model.sky import ConstantSky, CubemapSky, shared_vertices
 
 AXES = {0: (1, 0, 0), 1: (-1, 0, 0), 2: (0, 1, 0), 3: (0, -1, 0), 4: (0, 0, 1), 5: (0, 0, -1)}
@@ -181,3 +181,19 @@ def test_learning_rates_are_given_for_every_parameter(kind, name):
 def test_only_learned_texels_are_saved():
     assert set(random_sky(4).state_dict()) == {"params.texels"}
     assert math.prod(random_sky(4).state_dict()["params.texels"].shape) == 56 * 3
+
+
+@pytest.mark.parametrize("resolution", [2, 5, 16])
+def test_directions_are_those_of_the_texels(resolution):
+    sky = random_sky(resolution)
+    assert torch.allclose(sky.directions()[sky.index], surface_points(resolution), atol=1e-6)
+
+
+def test_sums_are_the_transpose_of_the_interpolation():
+    sky, rays = random_sky(8), random_rays(1, 300)
+    values = torch.from_numpy(np.random.default_rng(2).normal(size=(1, 300, 2))).float()
+    texels = torch.from_numpy(np.random.default_rng(3).normal(size=(len(sky.params["texels"]), 2))).float()
+    interpolated = sampled(texels, sky.index, rays)
+    found = sky.sums(rays, values)
+    assert torch.allclose((found * texels).sum(dim=0), (interpolated * values).sum(dim=(0, 1)), rtol=1e-4)
+    assert torch.allclose(sky.sums(rays, torch.ones(1, 300, 1)).sum(), torch.tensor(300.0))

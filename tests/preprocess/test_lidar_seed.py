@@ -280,7 +280,7 @@ GROUND = 3.0
 
 
 def some_far_points(count: int, covered: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    candidates = uncovered(far_view(), covered)
+    candidates = uncovered(far_view(), covered, GROUND)
     return far_points(far_view(), GROUND, candidates, count, (3.0, 300.0), np.random.default_rng(seed))
 
 
@@ -328,10 +328,36 @@ def test_far_points_skip_covered_cells():
     assert len(positions) == 60 * 44 - 64 - 64 - 4 * 4
 
 
+def above(covered: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
+    """The depths of far points along all pixels, by cell (x, y), where LiDAR met the points `covered` (n, 3): columns
+    and rows in pixels, and depth along the axis."""
+    x, y, depth = covered.T
+    in_camera = np.stack([(x - 40.0) / 50.0 * depth, (y - 30.0) / 50.0 * depth, depth], axis=1)
+    pose = inverse(far_view().world_to_camera)
+    positions, _ = some_far_points(60 * 44, in_camera @ pose[:3, :3].T + pose[:3, 3])
+    pixels, depths = project(positions, far_view().world_to_camera, K)
+    cells = np.floor(pixels / 8).astype(int)
+    return {
+        (x, y): depths[(cells == (x, y)).all(axis=1)] for x, y in sorted({(int(x), int(y)) for x, y in cells})
+    }  # fmt: skip
+
+
+def test_far_points_above_something_upright_have_its_depth():
+    """The camera is 1.5 m above the ground: at a depth of 10 m a point in row 28 is 1.9 m high, one in row 36 is 0.3 m
+    high. Cells are 8 x 8 pixels."""
+    wall, behind_it, low, far_wall = (20.0, 28.0, 10.0), (21.0, 28.5, 60.0), (36.0, 36.0, 10.0), (37.0, 12.0, 40.0)
+    depths = above(np.array([wall, behind_it, low, far_wall]))
+    for y in range(3):
+        np.testing.assert_allclose(depths[2, y], 10.0, err_msg="of the nearest point, in every row above it")
+    np.testing.assert_allclose(depths[4, 0], 40.0)
+    for cell in ((4, 2), (4, 3), (2, 4), (3, 0)):
+        assert np.ptp(np.log(depths[cell])) > 0.5, "neither above the ground, nor below a wall, nor beside it"
+
+
 def test_without_free_pixels_there_are_no_far_points():
     everywhere = far_view()
     unusable = dataclasses.replace(everywhere, usable=np.zeros_like(everywhere.usable))
-    candidates = uncovered(unusable, np.empty((0, 3)))
+    candidates = uncovered(unusable, np.empty((0, 3)), GROUND)
     positions, colors = far_points(unusable, GROUND, candidates, 10, (3.0, 300.0), np.random.default_rng(0))
     assert positions.shape == (0, 3) and colors.shape == (0, 3)
 

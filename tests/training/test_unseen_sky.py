@@ -1,0 +1,135 @@
+"""Texels of the sky that no training image sees through the scene get the colours around them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers.trainings import CPU, PROVENANCE, files_in, inputs_in, job_of
+
+from drivesplat.model.background import Background
+from drivesplat.model.checkpoint import read_checkpoint, trained_model
+from drivesplat.model.sky import ConstantSky, CubemapSky, logit_of
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.train import GaussianSettings
+from drivesplat.training.run import run_training
+from drivesplat.training.unseen_sky import fill_unseen_sky
+from drivesplat.training.views import TrainingView
+
+WIDTH, HEIGHT = 64, 48
+RED, BLUE = (0.8, 0.1, 0.1), (0.2, 0.3, 0.9)
+
+
+def a_view(
+    moving: torch.Tensor | None = None, ego: torch.Tensor | None = None, device: torch.device = CPU
+) -> TrainingView:
+    """A camera at the origin that looks along z, 45 degrees to both sides; x is to the right, y down."""
+    intrinsics = torch.tensor([[32.0, 0.0, 32.0], [0.0, 32.0, 24.0], [0.0, 0.0, 1.0]], device=device)
+    view = View(intrinsics, torch.eye(4, device=device), WIDTH, HEIGHT, time=0.0)
+    black = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8, device=device)
+    return TrainingView(view, black, moving=moving, ego_mask=ego)
+
+
+def beside_a_wall(color: tuple[float, float, float] = RED) -> SplatModel:
+    """An opaque wall 2 m ahead on the left side of the image, and blue sky with noise of other colours behind it and
+    where the camera does not look."""
+    x, y = np.meshgrid(np.arange(-5.0, -0.1, 0.1), np.arange(-4.0, 4.0, 0.1))
+    points = np.stack([x, y, np.full_like(x, 2.0)], axis=-1).reshape(-1, 3)
+    wall = Background.from_points(points, np.tile(color, (len(points), 1)), GaussianSettings(sh_degree=0), 1.0)
+    sky = CubemapSky(16, torch.tensor(BLUE), 1e-2)
+    with torch.no_grad():
+        wall.params["opacities"].fill_(6.0)
+        wall.params["scales"].fill_(float(np.log(0.08)))
+        seen = seen_by_the_camera(sky)
+        noise = torch.randn(len(seen), 3, generator=torch.Generator().manual_seed(0))
+        sky.params["texels"][~seen] = noise[~seen]
+    return SplatModel([wall], sky)
+
+
+def seen_by_the_camera(sky: CubemapSky) -> torch.Tensor:
+    """The texels that interpolate pixels to the right of the wall."""
+    x, y, z = sky.directions().unbind(dim=1)
+    return (z > 0.9) & (x > -0.1) & (y.abs() < 0.8)
+
+
+def filled(model: SplatModel, *views: TrainingView) -> torch.Tensor:
+    """The colours of the texels afterwards."""
+    fill_unseen_sky(model, list(views))
+    return torch.sigmoid(model.sky.params["texels"]).detach()
+
+
+def test_texels_behind_a_wall_get_its_colour_and_seen_ones_keep_theirs():
+    model = beside_a_wall()
+    before, x, y, z = torch.sigmoid(model.sky.params["texels"]).detach(), *model.sky.directions().unbind(dim=1)
+    after = filled(model, a_view())
+    behind, open_sky = (z > 0.99) & (x < -0.3) & (y.abs() < 0.6), (z > 0.99) & (x > 0.3) & (y.abs() < 0.6)
+    assert behind.sum() > 20 and open_sky.sum() > 20
+    assert torch.allclose(after[behind], torch.tensor(RED), atol=0.03)
+    assert torch.allclose(after[open_sky], before[open_sky], atol=1e-6)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_on_a_gpu_texels_get_the_same_colours():
+    gpu = torch.device("cuda")
+    expected, found = filled(beside_a_wall(), a_view()), filled(beside_a_wall().to(gpu), a_view(device=gpu))
+    assert torch.allclose(found.cpu(), expected, atol=5e-3)
+
+
+def test_where_no_image_looks_texels_have_the_nearest_colours():
+    model = beside_a_wall()
+    after, (x, _, _) = filled(model, a_view()), model.sky.directions().unbind(dim=1)
+    assert torch.allclose(after[x < -0.99], torch.tensor(RED), atol=0.05)
+    assert torch.allclose(after[x > 0.99], torch.tensor(BLUE), atol=0.05)
+
+
+@pytest.mark.parametrize("mask", ["moving", "ego"])
+def test_pixels_of_moving_objects_and_of_the_ego_vehicle_give_no_colour(mask):
+    """All of the wall but its uppermost part is masked, where it is green and blue. Nothing else is green."""
+    model = beside_a_wall()
+    with torch.no_grad():
+        low = model.parts[0].params["means"][:, 1] > -1.0
+        model.parts[0].params["sh0"][low] *= -1.0
+    rows = torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH)
+    columns = torch.arange(WIDTH).expand(HEIGHT, WIDTH)
+    view = a_view(**{mask: (rows > 6) & (columns < WIDTH // 2)})
+    x, y, z = model.sky.directions().unbind(dim=1)
+    behind = (z > 0.99) & (x < -0.5) & (y.abs() < 0.6)
+    assert filled(beside_a_wall((0.2, 0.9, 0.9)), a_view())[behind, 1].min() > 0.8
+    assert filled(model, view)[behind, 1].max() < 0.35
+
+
+def test_of_many_images_one_that_sees_through_is_enough():
+    """The second camera is 6 m further left, behind the wall's end, and the third one further right."""
+    model, shifted = beside_a_wall(), []
+    for x in (0.0, -7.0, 7.0):
+        pose = torch.eye(4)
+        pose[0, 3] = x
+        shifted.append(dataclasses.replace(a_view(), view=dataclasses.replace(a_view().view, camera_to_world=pose)))
+    before, (x, y, z) = model.sky.params["texels"].detach().clone(), model.sky.directions().unbind(dim=1)
+    fill_unseen_sky(model, shifted)
+    through = (z > 0.99) & (x.abs() < 0.8) & (y.abs() < 0.6)
+    assert (model.sky.params["texels"][through] - before[through]).abs().max() < 0.35
+    assert (model.sky.params["texels"][~through] - before[~through]).abs().max() > 1.0
+
+
+def test_without_a_cube_map_or_images_nothing_changes():
+    model = beside_a_wall()
+    before = model.sky.params["texels"].detach().clone()
+    assert torch.equal(torch.sigmoid(before), filled(model))
+    constant = SplatModel(list(model.parts), ConstantSky(torch.tensor(BLUE), 1e-2))
+    fill_unseen_sky(constant, [a_view()])
+    assert torch.equal(constant.sky.params["color"], logit_of(torch.tensor(BLUE)))
+    fill_unseen_sky(SplatModel(list(model.parts), None), [a_view()])
+
+
+def test_a_finished_training_has_a_filled_sky(tmp_path):
+    """Training alone leaves what no image shows as it began."""
+    files = files_in(tmp_path / "it")
+    job = job_of(sky="cubemap", sky_resolution=8)
+    run_training(inputs_in(tmp_path, actors=True), job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
+    sky = trained_model(read_checkpoint(files.checkpoint)).sky
+    behind = sky.params["texels"][sky.directions()[:, 2] < -0.9]
+    assert behind.std(dim=0).min() > 1e-3
