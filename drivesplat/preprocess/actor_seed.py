@@ -30,7 +30,7 @@ from drivesplat.settings.train import PartName
 log = logging.getLogger(__name__)
 
 HIGHEST = 0.98
-"""Fraction of an actor's LiDAR points below the height up to which LiDAR reaches: higher ones are not its own."""
+"""Quantile of the heights of an actor's LiDAR points up to which LiDAR reaches; higher points count as outliers."""
 MIN_UNREACHED = 0.3
 """Minimum height in metres above the highest LiDAR points of a box for random points there."""
 UNSEEN = 127
@@ -97,7 +97,7 @@ def points_above(
     lidar: Float[np.ndarray, "n 3"], size: Float[np.ndarray, "3"], per_box: int, random: np.random.Generator
 ) -> Float[np.ndarray, "m 3"]:
     """Random points on the sides and the roof of a box of `size` (metres) above its LiDAR points, all in the box's own
-    frame. There are `per_box` times the share of its height that LiDAR does not reach; none where that is less than
+    frame: `per_box` times the share of its height that LiDAR does not reach, or none where this is less than
     MIN_UNREACHED metres."""
     reached = float(np.quantile(lidar[:, 2], HIGHEST))
     unreached = size[2] / 2.0 - reached

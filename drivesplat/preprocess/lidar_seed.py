@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 COVERAGE_CELL = 8
 """Edge length in pixels of the image cell that a seed point covers."""
 RAISED = 1.0
-"""Metres above the ground under the camera from which on a seed point is part of something upright."""
+"""Minimum height in metres, above the ground under the ego vehicle, of a seed point that counts as upright."""
 
 
 def seed_points(

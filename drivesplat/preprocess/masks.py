@@ -133,8 +133,8 @@ def _sky(sweeps: Sequence[Sweep], scene: Scene, frame: Frame, job: MaskJob, size
 
 
 def solid_pixels(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    """The pixels (h, w) bool of a frame at `size` (width, height) in the boxes of vehicles: what they show is a vehicle
-    or hides one. Cycles do not count, since they have gaps."""
+    """The pixels (h, w) bool of a frame at `size` (width, height) in the boxes of vehicles that fill them: they hardly
+    show the sky."""
     solid = np.zeros((size[1], size[0]), dtype=bool)
     for hull in hulls_in(scene, frame, size):
         if hull.box.object_class.is_solid:

@@ -39,8 +39,9 @@ class ObjectClass(StrEnum):
 
     @property
     def is_solid(self) -> bool:
-        """Whether nothing is seen through it: a vehicle that is no cycle."""
-        return self.is_vehicle and self not in (ObjectClass.MOTORCYCLE, ObjectClass.BICYCLE, ObjectClass.RIDER)
+        """Whether it fills most of its box: a vehicle that is neither a cycle nor a construction vehicle."""
+        with_gaps = (ObjectClass.MOTORCYCLE, ObjectClass.BICYCLE, ObjectClass.RIDER, ObjectClass.CONSTRUCTION_VEHICLE)
+        return self.is_vehicle and self not in with_gaps
 
     @property
     def is_human(self) -> bool:

@@ -31,9 +31,9 @@ class ActorSeedSettings(Settings):
     """Minimum number of LiDAR points of an actor over the whole drive. With fewer, random points in its box are added.
     """
     random_points: int = Field(8_000, ge=0, le=1_000_000)
-    """Number of points, LiDAR points included, up to which random points are added. For other vehicles: number of
-    random points on the sides and the roof of a box that LiDAR does not reach; those below its highest LiDAR points are
-    left out."""
+    """Number of points, LiDAR points included, up to which random points are added in boxes with fewer than min_points.
+    Boxes of other vehicles get this number times the share of their height above their LiDAR points, on the sides and
+    the roof there."""
     max_points: int = Field(20_000, ge=1, le=10_000_000)
     """Maximum number of seed points of an actor. Further points are dropped at random."""
     box_margin: float = Field(0.1, ge=0, le=2)

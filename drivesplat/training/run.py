@@ -64,7 +64,7 @@ class TrainingInputs:
         images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         not_sky_wanted = self.masks is not None and not self.sky_known and job.train.horizon_weight
-        moving_wanted = self.actors and job.train.dynamic_weight
+        moving_wanted = self.actors and (job.train.dynamic_weight or job.sky == "cubemap")
         return Guides(
             sky=_of_each(images, lambda i: read_sky_mask(*self._image(i))) if sky_wanted else {},
             moving=_of_each(images, self._moving) if moving_wanted else {},
@@ -241,7 +241,8 @@ def run_training(
             model, begun.views, begun.settings, seed, device, folders, begun.priors,
             curves=begun.curves, scans=begun.scans, visits=visits,
         )  # fmt: skip
-        fill_unseen_sky(model, begun.views)
+        with explain_out_of_memory(lambda: len(model)):
+            fill_unseen_sky(model, begun.views)
         write_checkpoint(files.checkpoint, TrainedCheckpoint.of(model, job, provenance))
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
     if os.getppid() == started_by:

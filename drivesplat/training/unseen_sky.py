@@ -1,8 +1,9 @@
 """Colours of the sky's cube map where no training image sees through the scene.
 
-Such texels have no gradient but the traces that opaque surfaces let through, which Adam amplifies to noise. They show
-wherever Gaussians leave a hole: behind a removed vehicle, and from beside the path. After the training they get the
-mean colour that static pixels of training images have in their direction, so that a hole looks like what surrounds it.
+The only gradient of such texels comes from the little light that opaque surfaces let through; Adam amplifies it to
+noise. They show wherever Gaussians leave a hole: behind a removed vehicle, and from beside the path. After the training
+they get the mean colour that static pixels of training images have in their direction, so that a hole looks like what
+surrounds it.
 """
 
 import numpy as np
@@ -16,7 +17,9 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.views import TrainingView
 
 SEEN = 0.25
-"""Part of its area over which images have to see through the scene for a texel to be half as it was learned."""
+"""Texel areas seen through the scene, summed over images, at which a texel keeps half of what it has learned."""
+MIN_PIXELS = 0.01
+"""Pixels that a texel needs for a mean colour. Interpolation at the edges of faces leaks a millionth of a pixel."""
 NEIGHBOURS = 16
 """Texels with a mean colour that those without one average."""
 
@@ -25,8 +28,9 @@ NEIGHBOURS = 16
 def fill_unseen_sky(model: SplatModel, views: list[TrainingView]) -> None:
     """Replaces the colours of unseen texels of a cube map, in place; without one, or without views, does nothing.
 
-    A texel keeps its logits with the weight w / (w + SEEN). w is the sum of squared transmittance over the pixels that
-    interpolate it, in all views, divided by the number of pixels that a texel has in an image.
+    A texel keeps its logits with the weight w² / (w² + SEEN²). w is the sum of squared transmittance over the pixels
+    that interpolate it, in all views, divided by the number of pixels that a texel has in an image. Pixels of the ego
+    vehicle have no effect. Moving objects, where views have masks of them, and objects of the model give no colour.
     """
     sky = model.sky
     if not isinstance(sky, CubemapSky) or not views:
@@ -34,19 +38,21 @@ def fill_unseen_sky(model: SplatModel, views: list[TrainingView]) -> None:
     texels = sky.params["texels"]
     through, sums = torch.zeros_like(texels[:, :1]), torch.zeros(len(texels), 4).to(texels)
     for view in views:
-        picture, seen_from = model.render(view.view), model.seen_from(view.view)
-        alpha, rays = picture.alpha[..., None], seen_from.rays()
-        usable = torch.ones_like(alpha)
-        for mask in (view.moving, view.ego_mask):
-            usable = usable if mask is None else usable * ~mask[..., None]
+        picture, seen_from = model.render(view.view, with_objects=True), model.seen_from(view.view)
+        alpha, objects = picture.alpha[..., None], model.objects_alpha(picture, view.view)
+        outside = torch.ones_like(alpha) if view.ego_mask is None else (~view.ego_mask[..., None]).to(alpha)
+        static = outside if view.moving is None else outside * ~view.moving[..., None]
+        static = static if objects is None else static * (1.0 - objects[..., None])
         colors = sky.behind(picture.splats, alpha, seen_from)
-        found = sky.sums(rays, torch.cat([usable * (1.0 - alpha).square(), usable * colors, usable], dim=-1))
+        values = torch.cat([outside * (1.0 - alpha).square(), static * colors, static], dim=-1)
+        found = sky.sums(seen_from.rays(), values)
         through += found[:, :1] / _texel_area(sky, view)
         sums += found[:, 1:]
-    known = sums[:, 3] > 0.0
+    known = sums[:, 3] > MIN_PIXELS
     if known.any():
         means = _completed(sky.directions(), sums[:, :3] / sums[:, 3:].clamp(min=1e-12), known)
-        texels.copy_(torch.lerp(logit_of(means), texels, through / (through + SEEN)))
+        kept = through.square() / (through.square() + SEEN**2)
+        texels.copy_(torch.lerp(logit_of(means), texels, kept))
 
 
 def _texel_area(sky: CubemapSky, view: TrainingView) -> float:

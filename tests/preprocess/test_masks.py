@@ -149,7 +149,9 @@ def test_a_clear_sky_reaches_into_the_corners_of_the_image(tiny_scene, width):
     assert sky_mask(pixels, k, tiny_scene.frames[0].camera_to_world, None)[: height // 3].all()
 
 
-@pytest.mark.parametrize(("object_class", "is_sky"), [("truck", False), ("car", False), ("rider", True)])
+@pytest.mark.parametrize(
+    ("object_class", "is_sky"), [("truck", False), ("trailer", False), ("rider", True), ("construction_vehicle", True)]
+)
 def test_a_vehicle_as_bright_as_the_sky_is_not_sky(tiny_scene, tmp_path, object_class, is_sky):
     white = tmp_path / "white.png"
     Image.new("RGB", SIZE, (235, 235, 235)).save(white)
