@@ -2,8 +2,9 @@
 
 The sources are static LiDAR returns of the training sweeps, without the ego vehicle and thinned; points triangulated by
 pose refinement that two training images see; points of a file, if given; and far points along pixels that none of these
-cover, upright above them where they show more than the ground. Colours come from training images, and points that none
-of them sees are left out. Held-out images and sweeps contribute neither LiDAR positions nor colours.
+cover. Above points that are higher than the ground far points have the depth of these, elsewhere a random one. Colours
+come from training images, and points that none of them sees are left out. Held-out images and sweeps contribute neither
+LiDAR positions nor colours.
 """
 
 import logging
