@@ -57,7 +57,10 @@ class CubemapSky(Sky):
 
     def directions(self) -> Float[Tensor, "n 3"]:
         """Where the texels lie, as vertices of a cube with edges of 2."""
-        return vertex_directions(self.index.shape[-1]).to(self.params["texels"])
+        texels, resolution = self.params["texels"], self.index.shape[-1]
+        directions = texels.new_zeros(len(texels), 3)
+        directions[self.index] = (2.0 * _vertices(resolution) / (resolution - 1) - 1.0).to(texels)
+        return directions
 
     def sums(self, rays: Float[Tensor, "h w 3"], values: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
         """The sums over an image of `values` by texel, with the weights of the bilinear interpolation."""
@@ -76,32 +79,21 @@ class CubemapSky(Sky):
 
 def shared_vertices(resolution: int) -> tuple[Int[Tensor, "6 r r"], int]:
     """For every face texel (face, v, u) the index of its cube-surface vertex, and how many vertices there are."""
-    line = torch.arange(resolution)
-    v, u = torch.meshgrid(line, line, indexing="ij")
-    faces = []
-    for face in range(6):
-        axis, end = face // 2, 0 if face % 2 else resolution - 1
-        corner = torch.zeros(resolution, resolution, 3, dtype=torch.long)
-        corner[..., axis] = end
-        corner[..., (axis + 1) % 3] = u
-        corner[..., (axis + 2) % 3] = v
-        faces.append((corner[..., 0] * resolution + corner[..., 1]) * resolution + corner[..., 2])
-    keys, index = torch.unique(torch.stack(faces), return_inverse=True)
+    x, y, z = _vertices(resolution).unbind(dim=-1)
+    keys, index = torch.unique((x * resolution + y) * resolution + z, return_inverse=True)
     return index, len(keys)
 
 
-def vertex_directions(resolution: int) -> Float[Tensor, "n 3"]:
-    """The vertices of `shared_vertices` in [-1, 1]^3, in the order of their numbers."""
-    index, count = shared_vertices(resolution)
-    line = torch.linspace(-1.0, 1.0, resolution)
+def _vertices(resolution: int) -> Int[Tensor, "6 r r 3"]:
+    """For every face texel (face, v, u) its vertex of the grid on the cube, from 0 to `resolution` - 1."""
+    line = torch.arange(resolution)
     v, u = torch.meshgrid(line, line, indexing="ij")
-    directions = torch.zeros(count, 3)
-    for face, rows in enumerate(index):
+    vertices = torch.zeros(6, resolution, resolution, 3, dtype=torch.long)
+    for face, vertex in enumerate(vertices):
         axis = face // 2
-        corner = torch.full((resolution, resolution, 3), -1.0 if face % 2 else 1.0)
-        corner[..., (axis + 1) % 3], corner[..., (axis + 2) % 3] = u, v
-        directions[rows] = corner
-    return directions
+        vertex[..., axis] = 0 if face % 2 else resolution - 1
+        vertex[..., (axis + 1) % 3], vertex[..., (axis + 2) % 3] = u, v
+    return vertices
 
 
 def logit_of(color: Tensor) -> Tensor:

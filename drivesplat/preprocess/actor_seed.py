@@ -80,11 +80,11 @@ def gathered_points(
         dynamic_object.own(points, scene.seconds(sweep.timestamp), settings.box_margin) for sweep, points in sweeps
     )
     lidar = np.concatenate([np.empty((0, 3)), *in_box])
+    target = min(settings.random_points, settings.max_points)
     if len(lidar) < settings.min_points:
-        target = min(settings.random_points, settings.max_points)
         filling = random.uniform(-0.5, 0.5, (max(0, target - len(lidar)), 3)) * track.size
     elif len(lidar) and track.object_class.is_solid:
-        filling = points_above(lidar, track.size, min(settings.random_points, settings.max_points), random)
+        filling = points_above(lidar, track.size, target, random)
     else:
         filling = np.empty((0, 3))
     most = settings.max_points - len(filling)
