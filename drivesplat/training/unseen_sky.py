@@ -30,7 +30,7 @@ def fill_unseen_sky(model: SplatModel, views: list[TrainingView]) -> None:
 
     A texel keeps its logits with the weight w² / (w² + SEEN²). w is the sum of squared transmittance over the pixels
     that interpolate it, in all views, divided by the number of pixels that a texel has in an image. Pixels of the ego
-    vehicle have no effect. Moving objects, where views have masks of them, and objects of the model give no colour.
+    vehicle and of moving objects, where views have masks of them, have no effect. Objects of the model give no colour.
     """
     sky = model.sky
     if not isinstance(sky, CubemapSky) or not views:
@@ -40,11 +40,12 @@ def fill_unseen_sky(model: SplatModel, views: list[TrainingView]) -> None:
     for view in views:
         picture, seen_from = model.render(view.view, with_objects=True), model.seen_from(view.view)
         alpha, objects = picture.alpha[..., None], model.objects_alpha(picture, view.view)
-        outside = torch.ones_like(alpha) if view.ego_mask is None else (~view.ego_mask[..., None]).to(alpha)
-        static = outside if view.moving is None else outside * ~view.moving[..., None]
-        static = static if objects is None else static * (1.0 - objects[..., None])
+        static = torch.ones_like(alpha)
+        for mask in (view.ego_mask, view.moving):
+            static = static if mask is None else static * ~mask[..., None]
+        background = static if objects is None else static * (1.0 - objects[..., None])
         colors = sky.behind(picture.splats, alpha, seen_from)
-        values = torch.cat([outside * (1.0 - alpha).square(), static * colors, static], dim=-1)
+        values = torch.cat([static * (1.0 - alpha).square(), background * colors, background], dim=-1)
         found = sky.sums(seen_from.rays(), values)
         through += found[:, :1] / _texel_area(sky, view)
         sums += found[:, 1:]

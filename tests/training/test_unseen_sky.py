@@ -101,12 +101,18 @@ def test_pixels_of_moving_objects_and_of_the_ego_vehicle_give_no_colour(mask):
     assert filled(model, view)[behind, 1].max() < 0.35
 
 
-def test_sky_in_the_box_of_a_moving_object_is_kept():
-    model, everywhere = beside_a_wall(), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    everywhere[:, : WIDTH // 2] = False
-    before, (x, y, z) = torch.sigmoid(model.sky.params["texels"]).detach(), model.sky.directions().unbind(dim=1)
-    open_sky = (z > 0.99) & (x > 0.3) & (y.abs() < 0.6)
-    assert torch.allclose(filled(model, *[a_view(everywhere)] * 4)[open_sky], before[open_sky], atol=0.01)
+@pytest.mark.parametrize(("another", "expected"), [(False, BLUE), (True, RED)], ids=["in boxes only", "also outside"])
+def test_sky_that_shows_only_in_boxes_of_moving_objects_gets_the_colours_around_it(another, expected):
+    """What it has learned there is the colour of the objects."""
+    model, boxes = beside_a_wall(), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    boxes[12:36, 39:57] = True
+    x, y, z = model.sky.directions().unbind(dim=1)
+    inside = (z > 0.99) & ((x - 0.5).abs() < 0.12) & (y.abs() < 0.15)
+    assert inside.sum() >= 4
+    with torch.no_grad():
+        model.sky.params["texels"][inside] = logit_of(torch.tensor(RED))
+    views = [a_view(boxes), a_view()] if another else [a_view(boxes)]
+    assert torch.allclose(filled(model, *views)[inside], torch.tensor(expected), atol=0.05)
 
 
 def test_a_camera_gives_no_colour_to_the_direction_opposite_to_its_own():
