@@ -2,6 +2,8 @@
 
 import fcntl
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -32,3 +34,12 @@ def locked_file(path: Path) -> BinaryIO:
         file.close()
         raise
     return file
+
+
+@contextmanager
+def waiting_for_lock(path: Path) -> Iterator[None]:
+    """Holds the lock of the file at `path`, in a folder that exists, during the block; waits while another process
+    holds it. Raises OSError if the file cannot be written."""
+    with open(path, "ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

@@ -15,6 +15,7 @@ import numba
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_write
 from drivesplat.kernels.cache_folder import cache_folder
+from drivesplat.kernels.numba_private import cached_on_disk
 from drivesplat.provenance.code_digest import code_digest
 
 OPTIONS = {"nogil": True, "error_model": "numpy"}
@@ -36,7 +37,7 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
         source = _cached_source(Path(function.__code__.co_filename), configured)
         function.__code__ = function.__code__.replace(co_filename=str(source))
         numba.config.CACHE_DIR = str(source.parent)
-        return numba.njit(cache=True, **options)(function)
+        return cached_on_disk(numba.njit(**options)(function), function)
     except (OSError, RuntimeError, ResultError):  # no folder is writable
         return numba.njit(**options)(function)
     finally:

@@ -15,6 +15,22 @@ CALLER = (
     "from drivesplat.kernels.cache import kernel\nfrom drivesplat.callee import SCALE, scaled\n\n\n"
     "@kernel\ndef total(x):\n    return scaled(x) + SCALE\n"
 )
+COMPILE_SLOWLY = """
+import sys, time
+from numba.core.caching import IndexDataCacheFile
+read = IndexDataCacheFile._load_index
+def read_and_wait(self):
+    index = read(self)
+    time.sleep(1.0)
+    return index
+from drivesplat.callee import scaled
+IndexDataCacheFile._load_index = read_and_wait
+scaled(eval(sys.argv[1]))
+"""
+LOAD = """
+from drivesplat.callee import scaled
+print([scaled(2), scaled(2.0), scaled(2j)], sum(scaled.stats.cache_hits.values()))
+"""
 SHOW = "from drivesplat.caller import total\nprint(total(10.0))\nprint(sum(total.stats.cache_hits.values()))\n"
 
 
@@ -24,8 +40,10 @@ def small_package(root: Path) -> Path:
     used = (
         "kernels/cache",
         "kernels/cache_folder",
+        "kernels/numba_private",
         "provenance/code_digest",
         "provenance/syntax_digest",
+        "io/file_lock",
         "io/storage",
         "errors",
     )
@@ -38,13 +56,18 @@ def small_package(root: Path) -> Path:
     return package
 
 
-def show(root: Path, **environment: str) -> tuple[float, int]:
+def environment(root: Path, **variables: str) -> dict[str, str]:
+    """The environment of a process that uses the package at `root`."""
+    known = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    return {**known, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1", **variables}
+
+
+def show(root: Path, **variables: str) -> tuple[float, int]:
     """The kernel's value in a new process, and its number of cache hits.
 
     The process writes no bytecode, which Python would also use for another source of the same size and second.
     """
-    known = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    env = {**known, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1", **environment}
+    env = environment(root, **variables)
     done = subprocess.run([sys.executable, "-c", SHOW], env=env, cwd=root, capture_output=True, text=True, check=True)
     value, hits = done.stdout.split()
     return float(value), int(hits)
@@ -108,3 +131,13 @@ def test_the_folder_in_numba_cache_dir_is_used(tmp_path):
     show(tmp_path, NUMBA_CACHE_DIR=str(elsewhere))
     assert list(elsewhere.glob("kernels-caller-*")) and not list(package.glob("__pycache__/kernels-*"))
     assert show(tmp_path, NUMBA_CACHE_DIR=str(elsewhere)) == (22.0, 1)
+
+
+def test_processes_that_compile_other_signatures_at_the_same_time_share_the_cache(tmp_path):
+    """Between its reading and writing of the index each waits for a second."""
+    (small_package(tmp_path) / "callee.py").write_text(CALLEE.format(scale=3.0))
+    run = {"cwd": tmp_path, "env": environment(tmp_path)}
+    compiling = [subprocess.Popen([sys.executable, "-c", COMPILE_SLOWLY, x], **run) for x in ("2", "2.0", "2j")]
+    assert [process.wait() for process in compiling] == [0, 0, 0]
+    loaded = subprocess.run([sys.executable, "-c", LOAD], **run, capture_output=True, text=True, check=True)
+    assert loaded.stdout.strip() == "[6.0, 6.0, 6j] 3"

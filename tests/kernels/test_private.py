@@ -1,4 +1,4 @@
-"""The private functions of torch and gsplat that the library calls: unchanged, and called in one module each."""
+"""What the library uses of the private names of torch, gsplat and numba: unchanged, and used in one module each."""
 
 import ast
 import inspect
@@ -11,6 +11,8 @@ from gsplat import DefaultStrategy
 from gsplat.cuda import _torch_impl
 from gsplat.strategy import ops
 from helpers import REPOSITORY
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
 
 from drivesplat.kernels.relocation import relocation
 
@@ -66,6 +68,11 @@ def test_torch_compiles_and_loads_cuda_with_the_arguments_that_we_pass():
     assert _utils._CudaKernel("function", "module").func == "function"
     assert callable(_utils._get_gpu_runtime_library)
     assert list(inspect.signature(_utils._check_cuda).parameters) == ["result"]
+
+
+def test_numba_caches_compiled_functions_by_the_class_that_we_replace():
+    assert inspect.getsource(Dispatcher.enable_caching).rstrip().endswith("self._cache = FunctionCache(self.py_func)")
+    assert list(inspect.signature(FunctionCache.save_overload).parameters) == ["self", "sig", "data"]
 
 
 @pytest.mark.parametrize(("function", "parameters"), GSPLAT, ids=[function.__name__ for function, _ in GSPLAT])

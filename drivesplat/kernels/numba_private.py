@@ -1,0 +1,34 @@
+"""numba's cache on disk behind one function of ours, which sets a private attribute. tests/kernels/test_private.py
+checks it.
+
+There is no public way to choose the class of the cache.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from numba.core.caching import FunctionCache
+
+from drivesplat.io.file_lock import waiting_for_lock
+
+
+class SharedCache(FunctionCache):
+    """A cache that processes may fill at the same time.
+
+    numba numbers the files of a function's signatures by its index. Without the lock two processes that compile
+    different signatures write the same file and lose an entry of the index, and other processes load the wrong code.
+    """
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        folder = Path(self.cache_path)
+        folder.mkdir(parents=True, exist_ok=True)
+        with waiting_for_lock(folder / "lock"):
+            super().save_overload(sig, data)
+
+
+def cached_on_disk(dispatcher: Any, function: Callable[..., Any]) -> Any:
+    """The compiled `function`, whose machine code is cached on disk. Raises RuntimeError where no folder is
+    writable."""
+    dispatcher._cache = SharedCache(function)
+    return dispatcher
