@@ -252,7 +252,7 @@ class SplatModel(nn.Module):
         if not objects:
             return None
         alone = concatenate(objects)
-        return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha.squeeze((0, 3))
+        return self.composited(alone, alone.means.new_ones(len(alone), 1), view).alpha.squeeze((0, 3))
 
     def _rows_of_objects(self) -> slice | None:
         """The rows of the parts with objects; None without any, or where rows of other parts lie between them."""
@@ -266,9 +266,10 @@ class SplatModel(nn.Module):
         if not all("classes" in part.params for part in self.parts):
             return None
         logits = torch.cat([part.params["classes"] for part in self.parts])
-        return self._composited(picture.gaussians, logits, view).image.squeeze(0)
+        return self.composited(picture.gaussians, logits, view).image.squeeze(0)
 
-    def _composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
+    def composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
+        """A rendering of `values` of Gaussians in place of their colours, without sky and exposure."""
         seen_from = self.seen_from(view)
         means, scales = where_seen(gaussians, seen_from)
         return rasterize(

@@ -36,7 +36,7 @@ from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
 from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
-from drivesplat.training.unseen_sky import fill_unseen_sky
+from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import Guides, TrainingView, load_views
 from drivesplat.training.visits import NO_VISITS, Visits
 
@@ -242,7 +242,7 @@ def run_training(
             curves=begun.curves, scans=begun.scans, visits=visits,
         )  # fmt: skip
         with explain_out_of_memory(lambda: len(model)):
-            fill_unseen_sky(model, begun.views)
+            fill_unseen(model, begun.views)
         write_checkpoint(files.checkpoint, TrainedCheckpoint.of(model, job, provenance))
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
     if os.getppid() == started_by:

@@ -1,21 +1,23 @@
-"""Texels of the sky that no training image sees through the scene get the colours around them."""
+"""What no training image shows gets the colours around it: texels of the sky, and Gaussians behind objects."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 import torch
+from helpers.hand_made import motion_through, track_of
 from helpers.trainings import CPU, PROVENANCE, files_in, inputs_in, job_of
 
+from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.sky import ConstantSky, CubemapSky, logit_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train import ActorSettings, GaussianSettings
 from drivesplat.training.run import run_training
-from drivesplat.training.unseen_sky import fill_unseen_sky
+from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import TrainingView
 
 WIDTH, HEIGHT = 64, 48
@@ -56,7 +58,7 @@ def seen_by_the_camera(sky: CubemapSky) -> torch.Tensor:
 
 def filled(model: SplatModel, *views: TrainingView) -> torch.Tensor:
     """The colours of the texels afterwards."""
-    fill_unseen_sky(model, list(views))
+    fill_unseen(model, list(views))
     return torch.sigmoid(model.sky.params["texels"]).detach()
 
 
@@ -138,11 +140,93 @@ def test_of_many_images_one_that_sees_through_is_enough():
         pose[0, 3] = x
         shifted.append(dataclasses.replace(a_view(), view=dataclasses.replace(a_view().view, camera_to_world=pose)))
     before, (x, y, z) = model.sky.params["texels"].detach().clone(), model.sky.directions().unbind(dim=1)
-    fill_unseen_sky(model, shifted)
+    fill_unseen(model, shifted)
     through = (z > 0.99) & (x.abs() < 0.8) & (y.abs() < 0.6)
     assert (model.sky.params["texels"][through] - before[through]).abs().max() < 0.35
     behind = z < -0.99
     assert (model.sky.params["texels"][behind] - before[behind]).std() > 0.5, "they were noise"
+
+
+def behind_a_van() -> tuple[SplatModel, torch.Tensor]:
+    """A red wall 4 m ahead and an opaque blue plate 2 m ahead, which is an object and hides a quarter of the wall; what
+    it hides is green, with harmonics. And the mask of Gaussians of the wall that are well inside the plate's shadow."""
+    x, y = np.meshgrid(np.arange(-4.0, 4.0, 0.1), np.arange(-3.0, 3.0, 0.1))
+    points = np.stack([x, y, np.full_like(x, 4.0)], axis=-1).reshape(-1, 3)
+    wall = Background.from_points(points, np.tile(RED, (len(points), 1)), GaussianSettings(sh_degree=1), 1.0)
+    x, y = np.meshgrid(np.arange(-1.0, 1.0, 0.05), np.arange(-0.75, 0.75, 0.05))
+    plate = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    van = track_of(motion_through([-1.0, 1.0], [[0.0, 0.0, 2.0]] * 2), size=(2.0, 1.5, 1.0))
+    actors = Actors.from_points([van], [plate], [np.tile(BLUE, (len(plate), 1))], ActorSettings(), GaussianSettings())
+    inside = torch.from_numpy((np.abs(points[:, 0]) < 1.4) & (np.abs(points[:, 1]) < 1.0))
+    with torch.no_grad():
+        for part, scale in ((wall, 0.08), (actors, 0.04)):
+            part.params["opacities"].fill_(8.0)
+            part.params["scales"].fill_(float(np.log(scale)))
+        wall.params["sh0"][inside] = torch.tensor([-1.5, 1.5, -1.5])
+        wall.params["shN"][inside] = 0.3
+    return SplatModel([wall, actors], None), inside
+
+
+def test_static_gaussians_hidden_by_an_object_get_the_colour_around_them():
+    model, hidden = behind_a_van()
+    wall, van = (dict(part.params.items()) for part in model.parts)
+    before, blue = wall["sh0"].detach().clone(), van["sh0"].detach().clone()
+    red = before[0]
+    fill_unseen(model, [a_view()])
+    assert torch.allclose(wall["sh0"][hidden], red.expand_as(before[hidden]), atol=1e-4)
+    assert torch.equal(wall["shN"][hidden], torch.zeros_like(wall["shN"][hidden]))
+    assert torch.equal(wall["sh0"][~hidden], before[~hidden]) and torch.equal(van["sh0"], blue)
+
+
+def test_one_image_that_shows_them_is_enough_to_keep_their_colour():
+    """The second camera is 2.5 m to the left, and the van hides another part of the wall from it."""
+    model, hidden = behind_a_van()
+    before, pose = model.parts[0].params["sh0"].detach().clone(), torch.eye(4)
+    pose[0, 3] = -2.5
+    aside = dataclasses.replace(a_view(), view=dataclasses.replace(a_view().view, camera_to_world=pose))
+    seen_from_there = hidden & (model.parts[0].params["means"][:, 0] < 0.0)
+    fill_unseen(model, [a_view(), aside])
+    assert torch.equal(model.parts[0].params["sh0"][seen_from_there], before[seen_from_there])
+
+
+def test_pixels_of_the_ego_vehicle_show_no_gaussians():
+    model, _ = behind_a_van()
+    hood, wall = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), model.parts[0].params
+    hood[40:] = True
+    below = wall["means"][:, 1] > 2.3
+    with torch.no_grad():
+        wall["sh0"][below] = torch.tensor([-1.5, 1.5, -1.5])
+    fill_unseen(model, [a_view(ego=hood)])
+    assert (wall["sh0"][below][:, 0, 1] < 0.0).all()
+
+
+def test_a_model_without_objects_keeps_its_gaussians():
+    model = beside_a_wall()
+    hidden = model.parts[0].params["means"][:, 1].abs() > 3.0
+    before = model.parts[0].params["sh0"].detach().clone()
+    assert hidden.any()
+    fill_unseen(model, [a_view()])
+    assert torch.equal(model.parts[0].params["sh0"], before)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_on_a_gpu_gaussians_get_the_same_colours():
+    gpu, (expected, hidden), (model, _) = torch.device("cuda"), behind_a_van(), behind_a_van()
+    fill_unseen(expected, [a_view()])
+    fill_unseen(model.to(gpu), [a_view(device=gpu)])
+    found = model.parts[0].params["sh0"].cpu()
+    assert torch.allclose(found[hidden], expected.parts[0].params["sh0"][hidden], atol=1e-3)
+
+
+def test_sky_behind_an_object_that_stands_does_not_get_its_colour():
+    """Although no mask says that it moves, and many images show it."""
+    model, _ = behind_a_van()
+    model.sky = CubemapSky(32, torch.tensor(RED), 1e-2)
+    x, y, z = model.sky.directions().unbind(dim=1)
+    behind = (z > 0.99) & (x.abs() < 0.3) & (y.abs() < 0.2)
+    after = filled(model, *[a_view()] * 40)
+    assert torch.allclose(after[behind], torch.tensor(RED).expand_as(after[behind]), atol=0.1)
 
 
 def test_without_a_cube_map_or_images_nothing_changes():
@@ -150,9 +234,9 @@ def test_without_a_cube_map_or_images_nothing_changes():
     before = model.sky.params["texels"].detach().clone()
     assert torch.equal(torch.sigmoid(before), filled(model))
     constant = SplatModel(list(model.parts), ConstantSky(torch.tensor(BLUE), 1e-2))
-    fill_unseen_sky(constant, [a_view()])
+    fill_unseen(constant, [a_view()])
     assert torch.equal(constant.sky.params["color"], logit_of(torch.tensor(BLUE)))
-    fill_unseen_sky(SplatModel(list(model.parts), None), [a_view()])
+    fill_unseen(SplatModel(list(model.parts), None), [a_view()])
 
 
 def test_a_finished_training_has_a_filled_sky(tmp_path):

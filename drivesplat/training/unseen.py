@@ -1,0 +1,149 @@
+"""Colours of what no training image shows: texels of the sky's cube map, and static Gaussians hidden by objects.
+
+The only gradient of these comes from the little light that opaque surfaces let through, and Adam amplifies it: texels
+learn noise, and Gaussians behind a vehicle that was followed learn the colour of the vehicle. They show where Gaussians
+leave a hole, where an object is removed, and from beside the path. After the training they get colours of their
+surroundings.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.part import Part
+from drivesplat.model.sky import CubemapSky, logit_of
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
+from drivesplat.training.views import TrainingView
+
+COVERED = 0.5
+"""Alpha of objects from which a pixel shows them rather than what is behind them."""
+MIN_WEIGHT = 0.02
+"""Sum of the weights in pixels, over all images, that a Gaussian needs to keep the colour that it has learned."""
+SEEN = 0.25
+"""Texel areas seen through the scene, summed over images, at which a texel keeps half of what it has learned."""
+MIN_PIXELS = 0.01
+"""Pixels that a texel needs for a mean colour. Interpolation at the edges of faces leaks a millionth of a pixel."""
+NEIGHBOURS = {"texel": 16, "gaussian": 8}
+"""The nearest ones with a colour that those without one average."""
+
+
+@torch.no_grad()
+def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
+    """Replaces colours that no training image shows, in place; without views does nothing.
+
+    Static Gaussians of a model with objects whose weights in pixels without objects sum to less than `MIN_WEIGHT` get
+    the mean colour of the nearest other ones, the same from all sides.
+
+    A texel of a cube map keeps its logits with the weight w² / (w² + SEEN²). w is the sum of squared transmittance over
+    the pixels that interpolate it, in all views, divided by the number of pixels that a texel has in an image. The rest
+    is the mean colour of the pixels in its direction that show nothing that moves and no object of the model, or that
+    of the nearest texels with such pixels. Pixels of moving objects, where views have masks of them, do not count in w.
+
+    Pixels of the ego vehicle have no effect.
+    """
+    if not views:
+        return
+    device = model.parts[0].params["means"].device
+    weights = torch.zeros(sum(part.row_count for part in model.parts), device=device)
+    texels = _TexelColors(model.sky) if isinstance(model.sky, CubemapSky) else None
+    has_objects = any(part.has_objects for part in model.parts)
+    for view, picture, bare in _pictures(model, views):
+        if has_objects:
+            weights += _weights(model, picture.gaussians, view.view, bare)
+        if texels is not None:
+            texels.add(model, view, picture, bare)
+    if has_objects:
+        for part, rows in zip(model.parts, model.rows, strict=True):
+            if not part.moves:
+                _recolour(part, weights[rows] < MIN_WEIGHT)
+    if texels is not None:
+        texels.fill()
+
+
+def _pictures(
+    model: SplatModel, views: list[TrainingView]
+) -> Iterator[tuple[TrainingView, Picture, Bool[Tensor, "h w"]]]:
+    """Each view's picture, and the mask of its pixels that show neither an object of the model nor the ego vehicle."""
+    for view in views:
+        picture = model.render(view.view, with_objects=True)
+        objects = model.objects_alpha(picture, view.view)
+        bare = torch.ones_like(picture.alpha, dtype=torch.bool) if objects is None else objects < COVERED
+        yield view, picture, bare if view.ego_mask is None else bare & ~view.ego_mask
+
+
+def _weights(model: SplatModel, gaussians: Gaussians, view: View, pixels: Bool[Tensor, "h w"]) -> Float[Tensor, " n"]:
+    """The weight of each Gaussian in the image of a view, summed over `pixels`: how the sum of a rendered value depends
+    on the Gaussian's."""
+    values = torch.zeros_like(gaussians.means[:, :1]).requires_grad_()
+    with torch.enable_grad():
+        image = model.composited(gaussians, values, view).image.squeeze((0, 3))
+    (weights,) = torch.autograd.grad(image, values, pixels.to(image))
+    return weights[:, 0]
+
+
+def _recolour(part: Part, hidden: Bool[Tensor, " n"]) -> None:
+    """Gives `hidden` Gaussians of a part the mean colour of the nearest others, without view dependence, in place."""
+    if hidden.all() or not hidden.any():
+        return
+    means, sh0 = part.params["means"], part.params["sh0"]
+    found = _nearest_means(means[~hidden], sh0[~hidden].flatten(1), means[hidden], NEIGHBOURS["gaussian"])
+    sh0[hidden] = found.reshape(-1, *sh0.shape[1:])
+    part.params["shN"][hidden] = 0.0
+
+
+class _TexelColors:
+    """Sums over images for the n texels of a cube map: squared transmittance in texel areas (n, 1), and of pixels that
+    show the static scene their colours and number (n, 4)."""
+
+    def __init__(self, sky: CubemapSky):
+        self._sky = sky
+        self._texels = sky.params["texels"]
+        self._through = torch.zeros_like(self._texels[:, :1])
+        self._sums = torch.zeros(len(self._texels), 4).to(self._texels)
+
+    def add(self, model: SplatModel, view: TrainingView, picture: Picture, bare: Bool[Tensor, "h w"]) -> None:
+        alpha, seen_from = picture.alpha[..., None], model.seen_from(view.view)
+        static = torch.ones_like(alpha)
+        for mask in (view.ego_mask, view.moving):
+            static = static if mask is None else static * ~mask[..., None]
+        background = static * bare[..., None]
+        colors = self._sky.behind(picture.splats, alpha, seen_from)
+        values = torch.cat([static * (1.0 - alpha).square(), background * colors, background], dim=-1)
+        found = self._sky.sums(seen_from.rays(), values)
+        self._through += found[:, :1] / self._texel_area(view)
+        self._sums += found[:, 1:]
+
+    def fill(self) -> None:
+        """Replaces the colours of unseen texels."""
+        known = self._sums[:, 3] > MIN_PIXELS
+        if not known.any():
+            return
+        means, directions = self._sums[:, :3] / self._sums[:, 3:].clamp(min=1e-12), self._sky.directions()
+        at = torch.nn.functional.normalize(directions, dim=1)
+        means[~known] = _nearest_means(at[known], means[known], at[~known], NEIGHBOURS["texel"])
+        kept = self._through.square() / (self._through.square() + SEEN**2)
+        self._texels.copy_(torch.lerp(logit_of(means), self._texels, kept))
+
+    def _texel_area(self, view: TrainingView) -> float:
+        """The pixels of an image that a texel in the middle of a face covers."""
+        width = 2.0 / (self._sky.index.shape[-1] - 1)
+        return float(view.view.K[0, 0] * view.view.K[1, 1]) * width**2
+
+
+def _nearest_means(
+    places: Float[Tensor, "n 3"], values: Float[Tensor, "n v"], wanted: Float[Tensor, "m 3"], neighbours: int
+) -> Float[Tensor, "m v"]:
+    """The means of the `values` of the nearest of `places`, by inverse square distance, at the places `wanted`."""
+    tree = cKDTree(places.cpu().numpy(), compact_nodes=False, balanced_tree=False)
+    count = np.arange(1, min(neighbours, len(places)) + 1)
+    distances, nearest = tree.query(wanted.cpu().numpy(), k=count, workers=torch.get_num_threads())
+    weights = 1.0 / (distances**2 + 1e-6)
+    weights /= weights.sum(axis=1, keepdims=True)
+    found = (weights[..., None] * values.cpu().numpy()[nearest]).sum(axis=1)
+    return torch.from_numpy(found).to(values)
