@@ -38,8 +38,12 @@ def locked_file(path: Path) -> BinaryIO:
 
 @contextmanager
 def waiting_for_lock(path: Path) -> Iterator[None]:
-    """Holds the lock of the file at `path`, in a folder that exists, during the block; waits while another process
-    holds it. Raises OSError if the file cannot be written."""
+    """Holds the lock of the file at `path`, whose folder is made, during the block; waits while another process holds
+    it. Raises OSError if the file cannot be written or locked."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+        try:
+            yield
+        finally:
+            fcntl.flock(file, fcntl.LOCK_UN)  # a process forked meanwhile has the file open, too

@@ -5,6 +5,7 @@ There is no public way to choose the class of the cache.
 """
 
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ class SharedCache(FunctionCache):
     """
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        folder = Path(self.cache_path)
-        folder.mkdir(parents=True, exist_ok=True)
-        with waiting_for_lock(folder / "lock"):
+        with ExitStack() as held:
+            with suppress(OSError):  # a file system without locks, or a lock file of another user
+                held.enter_context(waiting_for_lock(Path(self.cache_path) / "lock"))
             super().save_overload(sig, data)
 
 

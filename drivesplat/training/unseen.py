@@ -1,12 +1,10 @@
-"""Colours of what no training image shows: texels of the sky's cube map, and static Gaussians hidden by objects.
+"""Colours of what no training image shows: texels of the sky's cube map, and static Gaussians behind objects.
 
 The only gradient of these comes from the little light that opaque surfaces let through, and Adam amplifies it: texels
 learn noise, and Gaussians behind a vehicle that was followed learn the colour of the vehicle. They show where Gaussians
 leave a hole, where an object is removed, and from beside the path. After the training they get colours of their
 surroundings.
 """
-
-from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -18,11 +16,10 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
 from drivesplat.model.sky import CubemapSky, logit_of
 from drivesplat.model.splat_model import Picture, SplatModel
-from drivesplat.model.view import View
 from drivesplat.training.views import TrainingView
 
 COVERED = 0.5
-"""Alpha of objects from which a pixel shows them rather than what is behind them."""
+"""Share of a pixel that objects need for the pixel to show them rather than the static scene."""
 MIN_WEIGHT = 0.02
 """Sum of the weights in pixels, over all images, that a Gaussian needs to keep the colour that it has learned."""
 SEEN = 0.25
@@ -37,27 +34,29 @@ NEIGHBOURS = {"texel": 16, "gaussian": 8}
 def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
     """Replaces colours that no training image shows, in place; without views does nothing.
 
-    Static Gaussians of a model with objects whose weights in pixels without objects sum to less than `MIN_WEIGHT` get
-    the mean colour of the nearest other ones, the same from all sides.
+    In a model with objects, static Gaussians whose weights in pixels of the static scene sum to less than `MIN_WEIGHT`
+    get the mean colour of the nearest other ones, the same from all sides. Most of them are behind objects in all
+    images; others are outside all images, or almost transparent.
 
     A texel of a cube map keeps its logits with the weight w² / (w² + SEEN²). w is the sum of squared transmittance over
     the pixels that interpolate it, in all views, divided by the number of pixels that a texel has in an image. The rest
-    is the mean colour of the pixels in its direction that show nothing that moves and no object of the model, or that
-    of the nearest texels with such pixels. Pixels of moving objects, where views have masks of them, do not count in w.
+    is the mean colour of the pixels of the static scene in its direction, or that of the nearest texels with such
+    pixels. Pixels of moving objects, where views have masks of them, count neither in w nor in means.
 
-    Pixels of the ego vehicle have no effect.
+    Objects of the model cover less than `COVERED` of a pixel of the static scene. Pixels of the ego vehicle have no
+    effect.
     """
-    if not views:
-        return
-    device = model.parts[0].params["means"].device
-    weights = torch.zeros(sum(part.row_count for part in model.parts), device=device)
-    texels = _TexelColors(model.sky) if isinstance(model.sky, CubemapSky) else None
     has_objects = any(part.has_objects for part in model.parts)
-    for view, picture, bare in _pictures(model, views):
-        if has_objects:
-            weights += _weights(model, picture.gaussians, view.view, bare)
+    texels = _TexelColors(model.sky) if isinstance(model.sky, CubemapSky) else None
+    if not views or not (has_objects or texels):
+        return
+    weights = torch.zeros(sum(part.row_count for part in model.parts), device=model.parts[0].params["means"].device)
+    for view in views:
+        picture = model.render(view.view)
+        share, of_view = _objects(model, picture.gaussians, view) if has_objects else (None, 0.0)
+        weights += of_view
         if texels is not None:
-            texels.add(model, view, picture, bare)
+            texels.add(model, view, picture, torch.zeros_like(picture.alpha) if share is None else share)
     if has_objects:
         for part, rows in zip(model.parts, model.rows, strict=True):
             if not part.moves:
@@ -66,25 +65,22 @@ def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
         texels.fill()
 
 
-def _pictures(
-    model: SplatModel, views: list[TrainingView]
-) -> Iterator[tuple[TrainingView, Picture, Bool[Tensor, "h w"]]]:
-    """Each view's picture, and the mask of its pixels that show neither an object of the model nor the ego vehicle."""
-    for view in views:
-        picture = model.render(view.view, with_objects=True)
-        objects = model.objects_alpha(picture, view.view)
-        bare = torch.ones_like(picture.alpha, dtype=torch.bool) if objects is None else objects < COVERED
-        yield view, picture, bare if view.ego_mask is None else bare & ~view.ego_mask
+def _objects(
+    model: SplatModel, gaussians: Gaussians, view: TrainingView
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, " n"]]:
+    """The share of each pixel of a view that shows objects, and the weight of each Gaussian, summed over the pixels
+    that show the static scene.
 
-
-def _weights(model: SplatModel, gaussians: Gaussians, view: View, pixels: Bool[Tensor, "h w"]) -> Float[Tensor, " n"]:
-    """The weight of each Gaussian in the image of a view, summed over `pixels`: how the sum of a rendered value depends
-    on the Gaussian's."""
-    values = torch.zeros_like(gaussians.means[:, :1]).requires_grad_()
+    The share is the rendering of a value that is 1 for Gaussians of objects. It is linear in the values: its gradient
+    for them are the weights.
+    """
+    of_parts = [torch.full((part.row_count, 1), float(part.has_objects)) for part in model.parts]
+    values = torch.cat(of_parts).to(gaussians.means).requires_grad_()
     with torch.enable_grad():
-        image = model.composited(gaussians, values, view).image.squeeze((0, 3))
-    (weights,) = torch.autograd.grad(image, values, pixels.to(image))
-    return weights[:, 0]
+        share = model.composited(gaussians, values, view.view).image.squeeze((0, 3))
+    static = share.detach() < COVERED if view.ego_mask is None else (share.detach() < COVERED) & ~view.ego_mask
+    (weights,) = torch.autograd.grad(share, values, static.to(share))
+    return share.detach(), weights[:, 0]
 
 
 def _recolour(part: Part, hidden: Bool[Tensor, " n"]) -> None:
@@ -107,12 +103,13 @@ class _TexelColors:
         self._through = torch.zeros_like(self._texels[:, :1])
         self._sums = torch.zeros(len(self._texels), 4).to(self._texels)
 
-    def add(self, model: SplatModel, view: TrainingView, picture: Picture, bare: Bool[Tensor, "h w"]) -> None:
-        alpha, seen_from = picture.alpha[..., None], model.seen_from(view.view)
+    def add(self, model: SplatModel, view: TrainingView, picture: Picture, objects: Float[Tensor, "h w"]) -> None:
+        """Adds a view whose pixels show objects in the share `objects`."""
+        alpha, seen_from, objects = picture.alpha[..., None], model.seen_from(view.view), objects[..., None]
         static = torch.ones_like(alpha)
         for mask in (view.ego_mask, view.moving):
             static = static if mask is None else static * ~mask[..., None]
-        background = static * bare[..., None]
+        background = static * (1.0 - objects) * (objects < COVERED)
         colors = self._sky.behind(picture.splats, alpha, seen_from)
         values = torch.cat([static * (1.0 - alpha).square(), background * colors, background], dim=-1)
         found = self._sky.sums(seen_from.rays(), values)

@@ -16,7 +16,7 @@ CALLER = (
     "@kernel\ndef total(x):\n    return scaled(x) + SCALE\n"
 )
 COMPILE_SLOWLY = """
-import sys, time
+import pathlib, sys, time
 from numba.core.caching import IndexDataCacheFile
 read = IndexDataCacheFile._load_index
 def read_and_wait(self):
@@ -25,6 +25,9 @@ def read_and_wait(self):
     return index
 from drivesplat.callee import scaled
 IndexDataCacheFile._load_index = read_and_wait
+pathlib.Path(f"ready-{sys.argv[1]}").touch()
+while len(list(pathlib.Path().glob("ready-*"))) < 3:
+    time.sleep(0.01)
 scaled(eval(sys.argv[1]))
 """
 LOAD = """
@@ -134,10 +137,20 @@ def test_the_folder_in_numba_cache_dir_is_used(tmp_path):
 
 
 def test_processes_that_compile_other_signatures_at_the_same_time_share_the_cache(tmp_path):
-    """Between its reading and writing of the index each waits for a second."""
+    """They begin together, and each waits for a second between its reading and writing of the index."""
     (small_package(tmp_path) / "callee.py").write_text(CALLEE.format(scale=3.0))
     run = {"cwd": tmp_path, "env": environment(tmp_path)}
     compiling = [subprocess.Popen([sys.executable, "-c", COMPILE_SLOWLY, x], **run) for x in ("2", "2.0", "2j")]
     assert [process.wait() for process in compiling] == [0, 0, 0]
     loaded = subprocess.run([sys.executable, "-c", LOAD], **run, capture_output=True, text=True, check=True)
     assert loaded.stdout.strip() == "[6.0, 6.0, 6j] 3"
+
+
+def test_where_files_cannot_be_locked_kernels_are_compiled_and_cached_all_the_same(tmp_path):
+    (small_package(tmp_path) / "callee.py").write_text(CALLEE.format(scale=2.0))
+    no_locks = (
+        "import errno, fcntl\n\ndef flock(*_):\n    raise OSError(errno.ENOLCK, 'no locks')\n\nfcntl.flock = flock\n"
+    )
+    (tmp_path / "sitecustomize.py").write_text(no_locks)
+    assert show(tmp_path) == (22.0, 0)
+    assert show(tmp_path) == (22.0, 1)

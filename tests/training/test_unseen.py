@@ -189,6 +189,26 @@ def test_one_image_that_shows_them_is_enough_to_keep_their_colour():
     assert torch.equal(model.parts[0].params["sh0"][seen_from_there], before[seen_from_there])
 
 
+def test_what_stands_before_an_object_keeps_its_colour():
+    model, _ = behind_a_van()
+    y = np.arange(-0.3, 0.3, 0.05)
+    places = np.stack([np.zeros_like(y), y, np.ones_like(y)], axis=-1)
+    pole = Background.from_points(places, np.tile((0.1, 0.9, 0.1), (len(y), 1)), GaussianSettings(sh_degree=1), 1.0)
+    with torch.no_grad():
+        pole.params["opacities"].fill_(8.0)
+        pole.params["scales"].fill_(float(np.log(0.03)))
+    before = pole.params["sh0"].detach().clone()
+    fill_unseen(SplatModel([*model.parts, pole], None), [a_view()])
+    assert torch.equal(pole.params["sh0"], before)
+
+
+def test_where_nothing_is_seen_colours_are_kept():
+    model, _ = behind_a_van()
+    before = model.parts[0].params["sh0"].detach().clone()
+    fill_unseen(model, [a_view(ego=torch.ones(HEIGHT, WIDTH, dtype=torch.bool))])
+    assert torch.equal(model.parts[0].params["sh0"], before)
+
+
 def test_pixels_of_the_ego_vehicle_show_no_gaussians():
     model, _ = behind_a_van()
     hood, wall = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), model.parts[0].params
@@ -222,7 +242,7 @@ def test_on_a_gpu_gaussians_get_the_same_colours():
 def test_sky_behind_an_object_that_stands_does_not_get_its_colour():
     """Although no mask says that it moves, and many images show it."""
     model, _ = behind_a_van()
-    model.sky = CubemapSky(32, torch.tensor(RED), 1e-2)
+    model.sky = CubemapSky(32, torch.tensor(BLUE), 1e-2)
     x, y, z = model.sky.directions().unbind(dim=1)
     behind = (z > 0.99) & (x.abs() < 0.3) & (y.abs() < 0.2)
     after = filled(model, *[a_view()] * 40)
