@@ -18,7 +18,7 @@ from drivesplat.model.sky import CubemapSky, logit_of
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.training.views import TrainingView
 
-COVERED = 0.5
+COVERED = 0.2
 """Share of a pixel that objects need for the pixel to show them rather than the static scene."""
 MIN_WEIGHT = 0.02
 """Sum of the weights in pixels, over all images, that a Gaussian needs to keep the colour that it has learned."""
@@ -109,7 +109,7 @@ class _TexelColors:
         static = torch.ones_like(alpha)
         for mask in (view.ego_mask, view.moving):
             static = static if mask is None else static * ~mask[..., None]
-        background = static * (1.0 - objects) * (objects < COVERED)
+        background = static * (objects < COVERED)
         colors = self._sky.behind(picture.splats, alpha, seen_from)
         values = torch.cat([static * (1.0 - alpha).square(), background * colors, background], dim=-1)
         found = self._sky.sums(seen_from.rays(), values)
