@@ -37,7 +37,7 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
         source = _cached_source(Path(function.__code__.co_filename), configured)
         function.__code__ = function.__code__.replace(co_filename=str(source))
         numba.config.CACHE_DIR = str(source.parent)
-        return cached_on_disk(numba.njit(**options)(function), function)
+        return cached_on_disk(numba.njit(**options)(function))
     except (OSError, RuntimeError, ResultError):  # no folder is writable
         return numba.njit(**options)(function)
     finally:

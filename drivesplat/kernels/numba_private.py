@@ -4,7 +4,6 @@ checks it.
 There is no public way to choose the class of the cache.
 """
 
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,7 @@ class SharedCache(FunctionCache):
             super().save_overload(sig, data)
 
 
-def cached_on_disk(dispatcher: Any, function: Callable[..., Any]) -> Any:
-    """The compiled `function`, whose machine code is cached on disk. Raises RuntimeError where no folder is
-    writable."""
-    dispatcher._cache = SharedCache(function)
+def cached_on_disk(dispatcher: Any) -> Any:
+    """A compiled function, from now on with a cache on disk. Raises RuntimeError where no folder is writable."""
+    dispatcher._cache = SharedCache(dispatcher.py_func)
     return dispatcher

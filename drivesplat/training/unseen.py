@@ -53,10 +53,12 @@ def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
     weights = torch.zeros(sum(part.row_count for part in model.parts), device=model.parts[0].params["means"].device)
     for view in views:
         picture = model.render(view.view)
-        share, of_view = _objects(model, picture.gaussians, view) if has_objects else (None, 0.0)
-        weights += of_view
+        static = torch.ones_like(picture.alpha, dtype=torch.bool)
+        if has_objects:
+            static, of_view = _static_pixels(model, picture.gaussians, view)
+            weights += of_view
         if texels is not None:
-            texels.add(model, view, picture, torch.zeros_like(picture.alpha) if share is None else share)
+            texels.add(model, view, picture, static)
     if has_objects:
         for part, rows in zip(model.parts, model.rows, strict=True):
             if not part.moves:
@@ -65,22 +67,22 @@ def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
         texels.fill()
 
 
-def _objects(
+def _static_pixels(
     model: SplatModel, gaussians: Gaussians, view: TrainingView
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, " n"]]:
-    """The share of each pixel of a view that shows objects, and the weight of each Gaussian, summed over the pixels
-    that show the static scene.
+) -> tuple[Bool[Tensor, "h w"], Float[Tensor, " n"]]:
+    """The pixels of a view that show the static scene, and the weight of each Gaussian, summed over them.
 
-    The share is the rendering of a value that is 1 for Gaussians of objects. It is linear in the values: its gradient
-    for them are the weights.
+    The share of a pixel that shows objects is the rendering of a value that is 1 for Gaussians of objects. It is linear
+    in the values: its gradient for them are the weights.
     """
     of_parts = [torch.full((part.row_count, 1), float(part.has_objects)) for part in model.parts]
     values = torch.cat(of_parts).to(gaussians.means).requires_grad_()
     with torch.enable_grad():
         share = model.composited(gaussians, values, view.view).image.squeeze((0, 3))
-    static = share.detach() < COVERED if view.ego_mask is None else (share.detach() < COVERED) & ~view.ego_mask
+    static = share.detach() < COVERED
+    static = static if view.ego_mask is None else static & ~view.ego_mask
     (weights,) = torch.autograd.grad(share, values, static.to(share))
-    return share.detach(), weights[:, 0]
+    return static, weights[:, 0]
 
 
 def _recolour(part: Part, hidden: Bool[Tensor, " n"]) -> None:
@@ -103,15 +105,15 @@ class _TexelColors:
         self._through = torch.zeros_like(self._texels[:, :1])
         self._sums = torch.zeros(len(self._texels), 4).to(self._texels)
 
-    def add(self, model: SplatModel, view: TrainingView, picture: Picture, objects: Float[Tensor, "h w"]) -> None:
-        """Adds a view whose pixels show objects in the share `objects`."""
-        alpha, seen_from, objects = picture.alpha[..., None], model.seen_from(view.view), objects[..., None]
-        static = torch.ones_like(alpha)
+    def add(self, model: SplatModel, view: TrainingView, picture: Picture, static: Bool[Tensor, "h w"]) -> None:
+        """Adds a view whose pixels `static` show no object of the model."""
+        alpha, seen_from = picture.alpha[..., None], model.seen_from(view.view)
+        unmasked = torch.ones_like(alpha)
         for mask in (view.ego_mask, view.moving):
-            static = static if mask is None else static * ~mask[..., None]
-        background = static * (objects < COVERED)
+            unmasked = unmasked if mask is None else unmasked * ~mask[..., None]
+        background = unmasked * static[..., None]
         colors = self._sky.behind(picture.splats, alpha, seen_from)
-        values = torch.cat([static * (1.0 - alpha).square(), background * colors, background], dim=-1)
+        values = torch.cat([unmasked * (1.0 - alpha).square(), background * colors, background], dim=-1)
         found = self._sky.sums(seen_from.rays(), values)
         self._through += found[:, :1] / self._texel_area(view)
         self._sums += found[:, 1:]
