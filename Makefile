@@ -51,7 +51,7 @@ lint: setup
 GPU_PYTHON = $(if $(wildcard $(BIN)/python),$(BIN)/python,python3)
 test-gpu:
 	$(GPU_PYTHON) -m pytest -m gpu -rs -v $$(grep -rl --include='*.py' 'pytest\.mark\.gpu' tests)
-	$(GPU_PYTHON) -m pytest -rs -v tests/kernels/test_triton.py tests/kernels/test_triton_tiles.py tests/kernels/test_triton_scans.py
+	$(GPU_PYTHON) -m pytest -rs -v tests/kernels/test_triton*.py
 
 test-slurm: setup
 	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/workflow/test_slurm.py

@@ -147,9 +147,9 @@ def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) 
 
 @torch.no_grad()
 def rendered_with_depth(model: SplatModel, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """The rendering, as of `rendered`, and its depth (h, w) in metres along the camera's axis."""
-    picture = model.render(view, with_depth=True)
-    return picture.image.float().cpu().numpy(), picture.depth.float().cpu().numpy()
+    """The rendering, as of `rendered`, and the depth (h, w) of its surfaces in metres along the camera's axis."""
+    shown = model.gaussians_in(view)
+    return rendered(model, view, shown), model.surface_depth(view, shown).float().cpu().numpy()
 
 
 def lateral_metrics(

@@ -18,7 +18,7 @@ from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.model.view import View, depth_at_lines, where_seen
-from drivesplat.rasterization import Rendering, rasterize
+from drivesplat.rasterization import Rendering, rasterize, rasterize_surface_depth
 
 
 @dataclass(frozen=True)
@@ -196,11 +196,8 @@ class SplatModel(nn.Module):
         shown = concatenate(sets)
         seen_from = self.seen_from(view)
         colors, degree = _colors(shown, seen_from, sh_degree)
-        means, scales = where_seen(shown, seen_from)
         rendering = rasterize(
-            means, shown.quats, scales, shown.opacities, colors,
-            seen_from.viewmat[None], view.K[None], view.width, view.height, sh_degree=degree,
-            antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
+            **self._placed(shown, seen_from), colors=colors, sh_degree=degree, absgrad=absgrad, with_depth=with_depth,
             objects=self._rows_of_objects() if with_objects else None,
         )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
@@ -270,12 +267,21 @@ class SplatModel(nn.Module):
 
     def composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
         """A rendering of `values` of Gaussians in place of their colours, without sky and exposure."""
-        seen_from = self.seen_from(view)
+        return rasterize(**self._placed(gaussians, self.seen_from(view)), colors=values)
+
+    def surface_depth(self, view: View, gaussians: Gaussians | None = None) -> Float[Tensor, "h w"]:
+        """The depth of the surfaces that a view shows, or that `gaussians` show there, in metres along the camera axis;
+        0 where there are none. No gradients: see `drivesplat.rasterization.rasterize_surface_depth`."""
+        seen_from, shown = self.seen_from(view), self.gaussians_in(view) if gaussians is None else gaussians
+        return depth_at_lines(rasterize_surface_depth(**self._placed(shown, seen_from)).squeeze(0), seen_from)
+
+    def _placed(self, gaussians: Gaussians, seen_from: View) -> dict[str, Any]:
+        """The arguments of the rasterizer for Gaussians in a view, without their colours."""
         means, scales = where_seen(gaussians, seen_from)
-        return rasterize(
-            means, gaussians.quats, scales, gaussians.opacities, values,
-            seen_from.viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
-        )  # fmt: skip
+        camera = {"viewmats": seen_from.viewmat[None], "Ks": seen_from.K[None]}
+        size = {"width": seen_from.width, "height": seen_from.height}
+        shapes = {"means": means, "quats": gaussians.quats, "scales": scales, "opacities": gaussians.opacities}
+        return {**shapes, **camera, **size, "antialiased": self.antialiased}
 
 
 def _sets(gaussians: Gaussians | Sequence[Gaussians]) -> Sequence[Gaussians]:

@@ -275,9 +275,8 @@ class Deep(SplatModel):
         super().__init__([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2))
         self._depth_of = depth_of
 
-    def render(self, view: View, *arguments: Any, **options: Any) -> Picture:
-        picture = super().render(view, *arguments, **options)
-        return dataclasses.replace(picture, depth=torch.from_numpy(self._depth_of(view)).float())
+    def surface_depth(self, view: View, gaussians: Gaussians | None = None) -> torch.Tensor:
+        return torch.from_numpy(self._depth_of(view)).float()
 
 
 def depth_figures(known: DriveTruth, depth_of: Callable[[View], np.ndarray]) -> dict[float, dict[str, Any] | None]:

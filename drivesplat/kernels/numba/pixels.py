@@ -65,14 +65,14 @@ def _exp_overload(x):
 
 @njit(nogil=True)
 @no_type_check
-def _at(plane):
+def start_of(plane):
     """The first index of a plane; unsigned, since signed indices are checked for being negative."""
     return np.uint64(plane * PIXELS)
 
 
 @callee
 @no_type_check
-def _rows(shape, x0, y0):
+def reached_rows(shape, x0, y0):
     """First and last pixel (excluded) of the rows of a tile that a Gaussian reaches; the tile begins at `x0`, `y0`."""
     a, b, c = float(shape[layout.CONIC_XX]), float(shape[layout.CONIC_XY]), float(shape[layout.CONIC_YY])
     reach = float(shape[layout.RADIUS_Y])
@@ -98,7 +98,7 @@ def _rows(shape, x0, y0):
 
 @callee
 @no_type_check
-def _begin_tile(s, x0, y0, width, height):
+def begin_tile(s, x0, y0, width, height):
     """Writes the coordinates of the pixels' centres, and transmittance: 1, and 0 outside the image."""
     for p in range(PIXELS):
         x, y = x0 + p % layout.TILE_WIDTH, y0 + p // layout.TILE_WIDTH
@@ -108,11 +108,11 @@ def _begin_tile(s, x0, y0, width, height):
 
 @callee
 @no_type_check
-def _ended(s):
+def ended(s):
     """Whether all rays of the tile have ended."""
     total = s[0] * 0
     for p in range(np.uint64(0), np.uint64(PIXELS)):
-        total += s[_at(TRANSMITTANCE) + p]
+        total += s[start_of(TRANSMITTANCE) + p]
     return total == 0
 
 
@@ -131,7 +131,7 @@ def gaussian_alpha(dx, dy, a, b, c, opacity):
 
 @fast_callee
 @no_type_check
-def _weigh(s, begin, end, shape):
+def weigh(s, begin, end, shape):
     """Advances the transmittance of pixels `begin` to `end` by one Gaussian, and writes its weights.
 
     A ray that has ended has transmittance 0.
@@ -141,20 +141,20 @@ def _weigh(s, begin, end, shape):
     a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     zero, one, max_alpha, min_transmittance = real(0.0), real(1.0), real(MAX_ALPHA), real(MIN_TRANSMITTANCE)
     for p in range(begin, end):
-        alpha = gaussian_alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
+        alpha = gaussian_alpha(s[start_of(X) + p] - mean_x, s[start_of(Y) + p] - mean_y, a, b, c, opacity)
         alpha = alpha if alpha < max_alpha else max_alpha
-        before = s[_at(TRANSMITTANCE) + p]
+        before = s[start_of(TRANSMITTANCE) + p]
         after = before * (one - alpha)
-        s[_at(WEIGHT) + p] = alpha * before if after > min_transmittance else zero
-        s[_at(TRANSMITTANCE) + p] = after if after > min_transmittance else zero
+        s[start_of(WEIGHT) + p] = alpha * before if after > min_transmittance else zero
+        s[start_of(TRANSMITTANCE) + p] = after if after > min_transmittance else zero
 
 
 @fast_callee
 @no_type_check
-def _add(s, begin, end, target, source, factor):
+def add(s, begin, end, target, source, factor):
     """Adds `factor` times plane `source` to plane `target`."""
     for p in range(begin, end):
-        s[_at(target) + p] += factor * s[_at(source) + p]
+        s[start_of(target) + p] += factor * s[start_of(source) + p]
 
 
 @kernel
@@ -165,17 +165,17 @@ def composite_tiles(start, stop, first, offsets, ranks, shapes, values, columns,
     s = np.empty((OUT + 1 + channels) * PIXELS, image.dtype)
     for tile in range(start, stop):
         x0, y0 = (first + tile) % columns * layout.TILE_WIDTH, (first + tile) // columns * layout.TILE_HEIGHT
-        _begin_tile(s, x0, y0, width, height)
+        begin_tile(s, x0, y0, width, height)
         s[OUT * PIXELS :] = 0.0
         for i in range(offsets[tile], offsets[tile + 1]):
-            if (i - offsets[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and _ended(s):
+            if (i - offsets[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and ended(s):
                 break
             r = ranks[i]
-            begin, end = _rows(shapes[r], x0, y0)
-            _weigh(s, begin, end, shapes[r])
-            _add(s, begin, end, OUT, WEIGHT, image.dtype.type(1.0))
+            begin, end = reached_rows(shapes[r], x0, y0)
+            weigh(s, begin, end, shapes[r])
+            add(s, begin, end, OUT, WEIGHT, image.dtype.type(1.0))
             for k in range(channels):
-                _add(s, begin, end, OUT + 1 + k, WEIGHT, values[r, k])
+                add(s, begin, end, OUT + 1 + k, WEIGHT, values[r, k])
         for y in range(y0, min(y0 + layout.TILE_HEIGHT, height)):
             for x in range(x0, min(x0 + layout.TILE_WIDTH, width)):
                 p = (y - y0) * layout.TILE_WIDTH + x - x0
@@ -208,8 +208,10 @@ def _begin_backward(s, begin, end, shape):
     mean_x, mean_y, opacity = shape[layout.MEAN_X], shape[layout.MEAN_Y], shape[layout.OPACITY]
     a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     for p in range(begin, end):
-        s[_at(RAW) + p] = gaussian_alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
-        s[_at(VALUE) + p] = s[_at(GRADIENT) + p]
+        s[start_of(RAW) + p] = gaussian_alpha(
+            s[start_of(X) + p] - mean_x, s[start_of(Y) + p] - mean_y, a, b, c, opacity
+        )
+        s[start_of(VALUE) + p] = s[start_of(GRADIENT) + p]
 
 
 @fast_callee
@@ -222,19 +224,19 @@ def _moments(s, begin, end, shape, out):
     max_alpha, min_transmittance = real(MAX_ALPHA), real(MIN_TRANSMITTANCE)
     m = m_x = m_y = m_xx = m_xy = m_yy = zero
     for p in range(begin, end):
-        dx, dy = s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y
-        raw, before, value = s[_at(RAW) + p], s[_at(TRANSMITTANCE) + p], s[_at(VALUE) + p]
+        dx, dy = s[start_of(X) + p] - mean_x, s[start_of(Y) + p] - mean_y
+        raw, before, value = s[start_of(RAW) + p], s[start_of(TRANSMITTANCE) + p], s[start_of(VALUE) + p]
         alpha = raw if raw < max_alpha else max_alpha
         after = before * (one - alpha)
         continues = after > min_transmittance
         weight = alpha * before if continues else zero
-        rest = s[_at(REST) + p] - weight * value
-        s[_at(REST) + p] = rest
-        s[_at(WEIGHT) + p] = weight
-        s[_at(TRANSMITTANCE) + p] = after if continues else zero
+        rest = s[start_of(REST) + p] - weight * value
+        s[start_of(REST) + p] = rest
+        s[start_of(WEIGHT) + p] = weight
+        s[start_of(TRANSMITTANCE) + p] = after if continues else zero
         v = raw * (before * value - rest / (one - alpha))
         v = v if continues & (raw <= max_alpha) else zero
-        s[_at(RAW) + p] = v
+        s[start_of(RAW) + p] = v
         m += v
         m_x, m_y = m_x + v * dx, m_y + v * dy
         m_xx, m_xy, m_yy = m_xx + v * dx * dx, m_xy + v * dx * dy, m_yy + v * dy * dy
@@ -247,7 +249,7 @@ def _weighted_sum(s, begin, end, plane):
     """The sum of a plane times the weights."""
     total = s.dtype.type(0.0)
     for p in range(begin, end):
-        total += s[_at(WEIGHT) + p] * s[_at(plane) + p]
+        total += s[start_of(WEIGHT) + p] * s[start_of(plane) + p]
     return total
 
 
@@ -259,9 +261,9 @@ def _absolute_sums(s, begin, end, shape):
     a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     total_x = total_y = s.dtype.type(0.0)
     for p in range(begin, end):
-        dx, dy = s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y
-        total_x += abs(s[_at(RAW) + p] * (a * dx + b * dy))
-        total_y += abs(s[_at(RAW) + p] * (b * dx + c * dy))
+        dx, dy = s[start_of(X) + p] - mean_x, s[start_of(Y) + p] - mean_y
+        total_x += abs(s[start_of(RAW) + p] * (a * dx + b * dy))
+        total_y += abs(s[start_of(RAW) + p] * (b * dx + c * dy))
     return total_x, total_y
 
 
@@ -277,16 +279,16 @@ def composite_tiles_backward(
     s = np.empty((GRADIENT + 1 + channels) * PIXELS, image.dtype)
     for tile in range(start, stop):
         x0, y0 = (first + tile) % columns * layout.TILE_WIDTH, (first + tile) // columns * layout.TILE_HEIGHT
-        _begin_tile(s, x0, y0, width, height)
+        begin_tile(s, x0, y0, width, height)
         _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha)
         for i in range(offsets[tile], offsets[tile + 1]):
-            if (i - offsets[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and _ended(s):
+            if (i - offsets[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and ended(s):
                 break
             r, out = ranks[i], sums[slots[i]]
-            begin, end = _rows(shapes[r], x0, y0)
+            begin, end = reached_rows(shapes[r], x0, y0)
             _begin_backward(s, begin, end, shapes[r])
             for k in range(channels):
-                _add(s, begin, end, VALUE, GRADIENT + 1 + k, values[r, k])
+                add(s, begin, end, VALUE, GRADIENT + 1 + k, values[r, k])
             _moments(s, begin, end, shapes[r], out)
             for k in range(channels):
                 out[MOMENTS + k] = _weighted_sum(s, begin, end, GRADIENT + 1 + k)

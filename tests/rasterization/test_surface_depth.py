@@ -1,0 +1,159 @@
+"""The depth of surfaces: against a naive compositing of the whole image, and on surfaces of known depth."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.random_gaussians import Scene, random_scene
+from scipy.spatial.transform import Rotation
+
+from drivesplat.kernels.numba import tiles
+from drivesplat.rasterization import rasterize, rasterize_surface_depth
+
+DILATION = 0.3
+"""Pixels squared that 3DGS adds to the variance of every projected Gaussian."""
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")]),
+]
+WALL, TILT = 6.0, math.radians(60.0)
+
+
+def arguments(scene: Scene) -> dict:
+    return {f.name: getattr(scene, f.name) for f in fields(scene) if f.name != "colors"}
+
+
+def surface_depth(scene: Scene, **options) -> torch.Tensor:
+    return rasterize_surface_depth(**arguments(scene), **options)
+
+
+def naive(scene: Scene, camera: int, antialiased: bool) -> np.ndarray:
+    """Every Gaussian on every pixel, in numpy. The plane of a Gaussian is the mean of depth under the condition of the
+    pixel, by the joint covariance of pixel and depth."""
+    view, k = scene.viewmats[camera].numpy(), scene.Ks[camera].numpy()
+    pixels = np.stack(np.meshgrid(np.arange(scene.width) + 0.5, np.arange(scene.height) + 0.5), axis=-1)
+    in_camera = scene.means.numpy() @ view[:3, :3].T + view[:3, 3]
+    left, ended = np.ones(pixels.shape[:2]), np.zeros(pixels.shape[:2], dtype=bool)
+    weights, depths = [], []
+    for g in np.argsort(in_camera[:, 2]):
+        w, *xyz = scene.quats[g].numpy()
+        turn, at = view[:3, :3] @ Rotation.from_quat([*xyz, w]).as_matrix(), in_camera[g]
+        jacobian = np.eye(3)  # of column, row and depth
+        jacobian[:2, :2] = np.diag(k.diagonal()[:2] / at[2])
+        jacobian[:2, 2] = -k.diagonal()[:2] * at[:2] / at[2] ** 2
+        joint = jacobian @ turn @ np.diag(scene.scales[g].numpy() ** 2) @ turn.T @ jacobian.T
+        shape = joint[:2, :2] + DILATION * np.eye(2)
+        opacity = float(scene.opacities[g])
+        if antialiased:
+            opacity *= math.sqrt(max(0.0, np.linalg.det(joint[:2, :2]) / np.linalg.det(shape)))
+        offset = pixels - (k[:2, :2] @ at[:2] / at[2] + k[:2, 2])
+        along = np.linalg.solve(shape, offset[..., None])[..., 0]
+        alpha = np.minimum(opacity * np.exp(-0.5 * (offset * along).sum(axis=-1)), 0.999)
+        alpha = np.where(alpha < 1.0 / 255.0, 0.0, alpha)
+        ended |= left * (1.0 - alpha) <= 1e-4
+        weights.append(np.where(ended, 0.0, alpha * left))
+        depths.append(at[2] + along @ joint[:2, 2])
+        left = np.where(ended, left, left * (1.0 - alpha))
+    passed = np.cumsum(weights, axis=0)
+    reached = np.argmax(passed >= 0.5 * passed[-1], axis=0)
+    found = np.take_along_axis(np.stack(depths), reached[None], axis=0)[0]
+    return np.where(passed[-1] > 0.0, np.maximum(found, 0.01), 0.0)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_it_is_that_of_a_naive_compositing(antialiased, device):
+    scene = random_scene(3, n=60, width=45, height=34, cameras=2)
+    scene = replace(scene, means=scene.means * torch.tensor([0.5, 0.5, 1.0]))  # inside the projection's limits
+    given = scene if device == "cpu" else scene.float()
+    on_device = {f.name: getattr(given, f.name).to(device) for f in fields(Scene) if f.type is torch.Tensor}
+    found = surface_depth(replace(given, **on_device), antialiased=antialiased).cpu().double().numpy()
+    for camera in range(2):
+        expected = naive(scene, camera, antialiased)
+        differs = np.abs(found[camera] - expected) > (1e-9 if device == "cpu" else 1e-3)
+        assert differs.mean() < (1e-12 if device == "cpu" else 0.01)  # float32 may choose the neighbour of half
+        assert 0.5 < (expected > 0.0).mean() < 1.0
+
+
+def tilted_wall(opacity: float, behind: float | None = None) -> tuple[Scene, torch.Tensor]:
+    """Flat Gaussians in a plane that is turned by TILT about the vertical, WALL metres ahead on the camera's axis, and
+    its depth (h, w). With `behind`, one more Gaussian at that depth fills the image."""
+    across, up = np.meshgrid(np.arange(-9.0, 9.01, 0.25), np.arange(-4.0, 4.01, 0.25))
+    turn = Rotation.from_euler("y", TILT)
+    at = turn.apply(np.stack([across.ravel(), up.ravel(), np.zeros(across.size)], axis=1))
+    at[:, 2] += WALL
+    near = at[:, 2] > 0.5
+    count = near.sum()
+    x, y, z, w = turn.as_quat()
+    means, quats = at[near], np.tile([w, x, y, z], (count, 1))
+    scales, opacities = np.tile([0.25, 0.25, 0.002], (count, 1)), np.full(count, opacity)
+    if behind is not None:
+        means = np.concatenate([means, [[0.0, 0.0, behind]]])
+        quats = np.concatenate([quats, [[1.0, 0.0, 0.0, 0.0]]])
+        scales, opacities = np.concatenate([scales, [[behind] * 3]]), np.append(opacities, 0.99)
+    width, height, focal = 60, 40, 60.0
+    k = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+    arrays = {
+        "means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": np.zeros((len(means), 1)),
+        "viewmats": np.eye(4)[None], "Ks": np.array([k]),
+    }  # fmt: skip
+    scene = Scene(**{name: torch.from_numpy(value) for name, value in arrays.items()}, width=width, height=height)
+    slope = (torch.arange(width) + 0.5 - width / 2) / focal
+    return scene, (WALL / (1.0 + slope * math.tan(TILT))).expand(height, width)
+
+
+def relative_error(found: torch.Tensor, known: torch.Tensor, where: slice) -> float:
+    return float(((found - known).abs() / known)[:, where].median())
+
+
+def test_a_tilted_surface_has_its_own_depth():
+    """Between the centres of its Gaussians, too, which the expected depth of centres does not know."""
+    scene, known = tilted_wall(0.6)
+    right_half = slice(30, 60)
+    expected = rasterize(**arguments(scene), colors=scene.colors, with_depth=True).depth[0, ..., 0]
+    assert relative_error(surface_depth(scene)[0], known, right_half) < 0.01
+    assert relative_error(expected, known, right_half) > 0.02
+
+
+def test_what_shows_through_a_surface_does_not_move_it():
+    (closed, known), (leaking, _) = tilted_wall(0.3), tilted_wall(0.3, behind=200.0)
+    where = slice(30, 60)
+    passes = 1.0 - rasterize(**arguments(closed), colors=closed.colors).alpha[0, :, where].median()
+    assert 0.005 < passes < 0.3
+    expected = rasterize(**arguments(leaking), colors=leaking.colors, with_depth=True).depth[0, ..., 0]
+    assert relative_error(surface_depth(leaking)[0], known, where) < 1e-2
+    assert relative_error(expected, known, where) > 0.1
+
+
+def test_rays_that_meet_nothing_have_depth_zero():
+    scene = random_scene(0, n=3, width=40, height=30)
+    scene = replace(scene, scales=scene.scales * 0.05)
+    alpha = rasterize(**arguments(scene), colors=scene.colors).alpha[0, ..., 0]
+    torch.testing.assert_close(surface_depth(scene)[0] > 0.0, alpha > 0.0)
+    assert 0 < (alpha > 0.0).sum() < alpha.numel() / 2
+    nothing = {name: value[:0] for name, value in vars(scene).items() if name in ("means", "quats", "scales")}
+    assert (surface_depth(replace(scene, **nothing, opacities=scene.opacities[:0])) == 0.0).all()
+
+
+def test_gaussians_behind_the_camera_and_at_its_place_are_left_out():
+    scene = random_scene(1, n=40, width=40, height=30)
+    means = torch.cat([scene.means, torch.tensor([[0.0, 0.0, -3.0], [0.0, 0.0, 0.0]], dtype=torch.float64)])
+    more = {name: torch.cat([getattr(scene, name), getattr(scene, name)[:2]]) for name in ("quats", "scales")}
+    both = replace(scene, means=means, **more, opacities=torch.cat([scene.opacities, torch.ones(2).double()]))
+    at_origin = replace(both, viewmats=torch.eye(4, dtype=torch.float64)[None])
+    alone = replace(scene, viewmats=at_origin.viewmats)
+    torch.testing.assert_close(surface_depth(at_origin), surface_depth(alone), rtol=0.0, atol=0.0)
+
+
+def test_neither_threads_nor_windows_of_lists_change_it(monkeypatch):
+    scene = random_scene(2, n=200, width=70, height=50).float()
+    expected = surface_depth(scene)
+    before = torch.get_num_threads()
+    monkeypatch.setattr(tiles, "MAX_ENTRIES", 50)
+    try:
+        torch.set_num_threads(3)
+        torch.testing.assert_close(surface_depth(scene), expected, rtol=0.0, atol=0.0)
+    finally:
+        torch.set_num_threads(before)
