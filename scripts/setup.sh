@@ -119,15 +119,16 @@ make_venv() {
   stamp_for "$build" > "$stamp"
 }
 
-# What is compiled at its first use otherwise, and waited for then: bytecode, and what trains on processors.
+# What is compiled at its first use otherwise, and waited for then: bytecode, and what trains and makes worlds on
+# processors.
 compile_ahead() {
-  say "compiling what trains on processors; half a minute at most"
+  say "compiling what trains and makes synthetic worlds on processors; a minute at most"
   .venv/bin/python -m compileall -q drivesplat workflow_scripts ||
     say "no bytecode could be kept: is the checkout read-only? Every job will compile it anew"
-  if .venv/bin/python -m drivesplat.training.warm_up; then
+  if .venv/bin/python -m drivesplat.training.warm_up && .venv/bin/python -m drivesplat.demo.warm_up; then
     { : > "$compiled"; } 2>/dev/null || true  # a .venv of somebody else's: the next call does it again
   else
-    say "all packages are in place, but a first training on the processors fails (see above); make doctor says more"
+    say "all packages are in place, but a first training or world on the processors fails (see above); make doctor says more"
   fi
 }
 

@@ -90,10 +90,11 @@ def _doctor(parsed: argparse.Namespace) -> int:
 
 
 def _setup(_: argparse.Namespace) -> int:
+    from drivesplat.demo.warm_up import main as make_tiny_world
     from drivesplat.machine.gsplat_build.__main__ import main as compile_gsplat
-    from drivesplat.training.warm_up import main as compile_ahead
+    from drivesplat.training.warm_up import main as train_briefly
 
-    return compile_gsplat([]) or compile_ahead([])
+    return compile_gsplat([]) or train_briefly() or make_tiny_world()
 
 
 def _config(_: argparse.Namespace) -> int:

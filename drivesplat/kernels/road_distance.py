@@ -67,15 +67,27 @@ def road_distance(
     if len(road.weights) == 0 or len(means) == 0:
         return means.sum() * 0.0
     if triton_support.usable_for(means):
-        from drivesplat.kernels.triton.road_distance import RoadDistance
+        from drivesplat.kernels.triton.road_distance import RoadDistance as OnGpu
 
-        return RoadDistance.apply(means, quats, scales, opacities, road, ROUGHNESS)
+        return OnGpu.apply(means, quats, scales, opacities, road, ROUGHNESS)
+    if not means.is_cuda:
+        from drivesplat.kernels.numba.road_distance import RoadDistance as OnCpu
+
+        return OnCpu.apply(means, quats, scales, opacities, road, ROUGHNESS)
+    return by_torch(means, quats, scales, opacities, road)
+
+
+def by_torch(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    opacities: Float[Tensor, " n"],
+    road: Road,
+) -> Float[Tensor, ""]:
+    """`road_distance` in operations of torch, of at least one Gaussian and one cell."""
     cell, on_road = road.cells.lookup(means[:, :2])
     heights = road.heights(means, cell)
     on_road &= (heights.detach().abs() < road.reach) & (opacities.detach() > 0.0)
-    if not means.is_cuda:  # a GPU would wait for the number of these rows
-        rows = on_road.nonzero()[:, 0]
-        heights, quats, scales, cell, on_road = (values[rows] for values in (heights, quats, scales, cell, on_road))
     weights = road.weights[cell] * on_road
     along = rotated_back(F.normalize(quats, dim=1), road.normals[cell]) * scales
     distance = torch.sqrt(heights.square() + along.square().sum(dim=1) + ROUGHNESS**2) - ROUGHNESS

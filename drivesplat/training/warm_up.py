@@ -1,21 +1,20 @@
-"""`python -m drivesplat.training.warm_up`: a tiny training on the CPU that compiles and caches all CPU kernels.
+"""`python -m drivesplat.training.warm_up`: a tiny training on the CPU, which compiles and caches its CPU kernels.
 
 Kernels are compiled on their first call and cached (`drivesplat.kernels.cache`), which takes some 15 seconds. The
 set-up runs this so that neither trainings nor tests have to.
 """
 
-import argparse
-import logging
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from drivesplat.errors import DriveSplatError
 from drivesplat.kernels.cube_map import face_coordinates
+from drivesplat.kernels.road_distance import Road
+from drivesplat.kernels.sparse_grid import SparseGrid
+from drivesplat.kernels.warm_up import run_warm_up
 from drivesplat.lidar.occlusion import unoccluded
 from drivesplat.model.background import Background
 from drivesplat.model.scans import ScanView
@@ -25,6 +24,7 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import RayGrid
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.geometry_priors import GeometryPriors
 from drivesplat.training.scans import TrainingScan
 from drivesplat.training.train import TrainingFolders, train
 from drivesplat.training.views import TrainingView
@@ -35,13 +35,13 @@ SIZE = 48, 32
 
 
 def warm_up(folder: Path) -> None:
-    """Trains GAUSSIANS and a sky for ITERATIONS on one image, with densification; leaves its files in `folder`. Raises
-    what a training raises."""
+    """Trains GAUSSIANS on a road and a sky for ITERATIONS on one image, with densification, and renders their depth;
+    leaves its files in `folder`. Raises what a training raises."""
     random = np.random.default_rng(0)
     points = random.uniform((-2.0, -1.0, 4.0), (2.0, 1.0, 8.0), (GAUSSIANS, 3))
     settings = TrainSettings(
         iterations=ITERATIONS, cap_max=2 * GAUSSIANS, refine_start=0.0, refine_stop=1.0, sky_bce_weight=0.05,
-        scans=ScanTrainingSettings(per_image=1.0),
+        road_weight=1.0, scans=ScanTrainingSettings(per_image=1.0),
     )  # fmt: skip
     width, height = SIZE
     intrinsics = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
@@ -52,10 +52,17 @@ def warm_up(folder: Path) -> None:
     part = Background.from_points(points, colors, settings.gaussians, extent=5.0, echo=(0.0, 0.0))
     model = SplatModel([part], CubemapSky(settings.sky_resolution, torch.full((3,), 0.5), settings.lr_sky))
     folders = TrainingFolders(folder / "resume", folder / "tensorboard", "", "warm-up")
-    train(model, [view], settings, 0, torch.device("cpu"), folders, scans=[_scan()])
+    train(model, [view], settings, 0, torch.device("cpu"), folders, GeometryPriors(road=_road()), scans=[_scan()])
+    model.surface_depth(view.view)
     face_coordinates(torch.ones(2, 2, 3))
     pixel = np.zeros(1, dtype=np.int64)
     unoccluded(pixel, pixel, np.ones(1), np.ones((1, 2)), (height, width))
+
+
+def _road() -> Road:
+    """A plane of one cell around the Gaussians, one metre below the camera."""
+    cells = SparseGrid(torch.tensor([-50.0, -50.0]), 100.0, (1, 1), torch.zeros(1, dtype=torch.long))
+    return Road(cells, torch.tensor([[0.0, -1.0, 0.0]]), torch.tensor([-1.0]), torch.ones(1), reach=0.5)
 
 
 def _scan() -> TrainingScan:
@@ -70,15 +77,7 @@ def _scan() -> TrainingScan:
 
 def main(arguments: Sequence[str] = ()) -> int:
     """Returns the exit status."""
-    argparse.ArgumentParser("python -m drivesplat.training.warm_up", description=__doc__).parse_args(arguments)
-    logging.disable(logging.INFO)
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            warm_up(Path(folder))
-    except DriveSplatError as error:
-        print(f"drivesplat: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return run_warm_up("drivesplat.training.warm_up", warm_up, arguments)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness
-from drivesplat.kernels.road_distance import Road, road_distance
+from drivesplat.kernels.road_distance import Road, by_torch, road_distance
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.kernels.time_varying_colors import colors_in_world
 from drivesplat.kernels.view_colors import fused_view_colors
@@ -233,7 +233,8 @@ def test_values_of_echoes_and_their_gradients_agree_with_torch(count):
 
 @pytest.mark.parametrize("listed", [1, 37, 64])
 def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed):
-    """A road of one cell, with gaps, and of all cells; Gaussians out of reach, outside and of opacity 0 among them."""
+    """Triton, and without it numba on the CPU. A road of one cell, with gaps, and of all cells; Gaussians out of reach,
+    outside and of opacity 0 among them."""
     torch.manual_seed(listed)
     keys = torch.randperm(64)[:listed].sort().values
     normals = F.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.1 * torch.randn(listed, 3), dim=1)
@@ -245,10 +246,11 @@ def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed):
     opacities = torch.rand(1500, device=DEVICE)
     opacities[::3] = 0.0
     inputs = [values.requires_grad_() for values in (means, quats, scales)]
-    expected, found = both_ways(lambda *given: [road_distance(*given, opacities, road)], *inputs)
+    expected = [by_torch(*inputs, opacities, road)]
     assert float(expected[0].detach()) > 0.0
-    torch.testing.assert_close(found, expected)
-    assert_same_gradients([expected, found], inputs, atol=1e-7, rtol=1e-4)
+    for found in both_ways(lambda *given: [road_distance(*given, opacities, road)], *inputs):
+        torch.testing.assert_close(found, expected)
+        assert_same_gradients([[by_torch(*inputs, opacities, road)], found], inputs, atol=1e-7, rtol=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(4))

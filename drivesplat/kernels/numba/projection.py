@@ -110,7 +110,7 @@ def pinhole(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, 
 
 @callee
 @no_type_check
-def _rotation(quat):
+def rotation_entries(quat):
     """The unit quaternion, the norm of `quat`, and its rotation row by row."""
     w, x, y, z = float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])
     norm = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
@@ -127,7 +127,7 @@ def _rotation(quat):
 @no_type_check
 def _to_camera(mean, quat, scale, camera, at, axes, in_camera):
     """Writes the mean (3,) in the camera, R S (3, 3) to `axes` and W R S (3, 3) to `in_camera`."""
-    r = _rotation(quat)[5:]
+    r = rotation_entries(quat)[5:]
     for j in range(3):
         for i in range(3):
             axes[i, j] = r[3 * i + j] * scale[j]
@@ -274,7 +274,7 @@ def _covariance_backward(t, area, v_conic, v_compensation, v_t):
 @no_type_check
 def _axes_backward(quat, scale, v_axes, v_quat, v_scale):
     """Adds the gradients of R S to those of quaternion and scale."""
-    w, x, y, z, norm, r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(quat)
+    w, x, y, z, norm, r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_entries(quat)
     v_scale[0] += v_axes[0, 0] * r00 + v_axes[1, 0] * r10 + v_axes[2, 0] * r20
     v_scale[1] += v_axes[0, 1] * r01 + v_axes[1, 1] * r11 + v_axes[2, 1] * r21
     v_scale[2] += v_axes[0, 2] * r02 + v_axes[1, 2] * r12 + v_axes[2, 2] * r22
