@@ -9,9 +9,17 @@ import numpy as np
 import torch
 
 from drivesplat.errors import DatasetError
-from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
+from drivesplat.evaluation.metrics import (
+    DepthErrors,
+    FrameErrors,
+    LpipsMap,
+    RegionMetrics,
+    measuring_threads,
+    relative_depth_errors,
+    with_gap,
+)  # fmt: skip
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
-from drivesplat.evaluation.synthetic import rendered_with_depth
+from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.depth import depths_in, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
@@ -65,9 +73,12 @@ def _group_metrics(
 
     def renderings() -> Iterator[tuple[int, np.ndarray]]:
         for index in images:
-            image, metres = rendered_with_depth(model, view_of(record, index, device))
-            if index in depths:
-                depth.add(metres, depths[index])
+            view = view_of(record, index, device)
+            if index not in depths:
+                yield index, rendered(model, view)
+                continue
+            image, metres = rendered_with_depth(model, view)
+            depth.add(relative_depth_errors(metres, depths[index]))
             yield index, image
 
     def measure(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:

@@ -164,16 +164,21 @@ def _difference(static: dict[str, Any] | None, moving: dict[str, Any] | None) ->
     return static["psnr"] - moving["psnr"]
 
 
+def relative_depth_errors(rendered: np.ndarray, known: PixelDepths) -> np.ndarray:
+    """|rendered - known| / known of each known depth (n,) in float32, for a rendered depth image (h, w) in metres."""
+    found = rendered[known.rows, known.columns].astype(np.float64)
+    return (np.abs(found - known.depth) / known.depth).astype(np.float32)
+
+
 class DepthErrors:
-    """Relative errors of rendered depth over a group of images: `add` each with its known depth, then `summary`."""
+    """Relative errors of rendered depth over a group of images: `add` those of each, then `summary`."""
 
     def __init__(self) -> None:
         self._errors: list[np.ndarray] = []
 
-    def add(self, rendered: np.ndarray, known: PixelDepths) -> None:
-        """Adds a rendered depth image (h, w) in metres and its known depth."""
-        found = rendered[known.rows, known.columns].astype(np.float64)
-        self._errors.append(np.abs(found - known.depth) / known.depth)
+    def add(self, errors: np.ndarray) -> None:
+        """Adds the errors of an image (`relative_depth_errors`)."""
+        self._errors.append(errors)
 
     def summary(self) -> dict[str, Any]:
         """`depth`: the median of |rendered - known| / known over all `pixels` of the group with known depth, None if

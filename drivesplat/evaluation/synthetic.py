@@ -12,7 +12,14 @@ import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
 
-from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads
+from drivesplat.evaluation.metrics import (
+    DepthErrors,
+    FrameErrors,
+    LpipsMap,
+    RegionMetrics,
+    measuring_threads,
+    relative_depth_errors,
+)  # fmt: skip
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import unreadable
 from drivesplat.lidar.depth_record import PixelDepths
@@ -175,15 +182,15 @@ def _lateral_view_metrics(
             seen = known.view(index, frame, device)
             yield LateralRendering(index, frame, truth, *rendered_with_depth(model, seen))
 
-    def measure(one: LateralRendering) -> tuple[dict[str, FrameErrors], np.ndarray, PixelDepths]:
+    def measure(one: LateralRendering) -> tuple[dict[str, FrameErrors], np.ndarray]:
         size = recording.size(one.index)
         masks = region_masks(label_image(recording.scene, one.frame, size))
         errors = metrics.measure(one.image, known.image(one.truth.image, size), masks)
-        return errors, one.depth, known.depth(one.truth.depth, size, masks["static"])
+        return errors, relative_depth_errors(one.depth, known.depth(one.truth.depth, size, masks["static"]))
 
-    for errors, rendered_depth, true_depth in prefetch(measure, renderings(), measuring_threads()):
+    for errors, depth_errors in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(errors)
-        depth.add(rendered_depth, true_depth)
+        depth.add(depth_errors)
     return {**metrics.summary(), **depth.summary()} if frames else None
 
 

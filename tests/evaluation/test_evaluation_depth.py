@@ -11,7 +11,7 @@ from helpers.hand_made import looking_at, recording_of, round_gaussians
 from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
 
 from drivesplat.evaluation.image_metrics import evaluate_groups, held_out_depths
-from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, DepthErrors
+from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, DepthErrors, relative_depth_errors
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
@@ -44,7 +44,7 @@ def test_the_figure_is_the_median_over_all_pixels_of_the_group():
         depth, off = random.uniform(3.0, 60.0, count), random.normal(size=count) * spread
         image = np.full((40, 50), np.nan, dtype=np.float32)
         image[places // 50, places % 50] = depth * (1.0 + off)
-        errors.add(image, known(places // 50, places % 50, depth))
+        errors.add(relative_depth_errors(image, known(places // 50, places % 50, depth)))
         expected.append(np.abs(off))
     record = errors.summary()["depth"]
     assert record["median_relative_error"] == pytest.approx(np.median(np.concatenate(expected)), rel=1e-3)
@@ -58,7 +58,7 @@ def test_too_few_pixels_give_null_and_no_sweep_gives_no_entry(count, summary):
     errors = DepthErrors()
     if count is not None:
         columns = np.arange(count)
-        errors.add(np.ones((1, 1000), np.float32), known(0 * columns, columns, np.ones(count)))
+        errors.add(relative_depth_errors(np.ones((1, 1000), np.float32), known(0 * columns, columns, np.ones(count))))
     assert errors.summary() == summary
 
 

@@ -103,7 +103,14 @@ def test_a_good_venv_is_left_alone(machine):
     for name in REQUIREMENTS:
         digest.update((REPOSITORY / name).read_bytes())
     assert machine.stamp.read_text().strip() == digest.hexdigest()
-    assert [line.split()[0] for line in machine.done()] == ["pip", "pip", "gsplat_build", "compileall", "warm_up", "warm_up"]
+    assert [line.split()[0] for line in machine.done()] == [
+        "pip",
+        "pip",
+        "gsplat_build",
+        "compileall",
+        "warm_up",
+        "warm_up",
+    ]
     second = machine.run()
     assert second.returncode == 0 and machine.done() == [] and second.stderr == ""
 
@@ -115,7 +122,11 @@ def test_a_machine_that_cannot_train_is_reported_at_once(machine):
     machine.done()
     assert "a first training" in machine.run(FAKE_WARM_UP_FAILS="1").stderr, "and again, though all packages are there"
     assert [line.split()[0] for line in machine.done()] == ["compileall", "warm_up"]
-    assert machine.run().returncode == 0 and [line.split()[0] for line in machine.done()] == ["compileall", "warm_up", "warm_up"]
+    assert machine.run().returncode == 0 and [line.split()[0] for line in machine.done()] == [
+        "compileall",
+        "warm_up",
+        "warm_up",
+    ]
     assert machine.run().returncode == 0 and machine.done() == []
 
 
