@@ -21,6 +21,8 @@ from drivesplat.provenance.code_digest import code_digest
 OPTIONS = {"nogil": True, "error_model": "numpy"}
 callee = numba.njit(**OPTIONS)
 """Compiles a function that only kernels call; it is cached as part of them."""
+fast_callee = numba.njit(**OPTIONS, fastmath={"reassoc", "contract", "nsz", "arcp"})
+"""As `callee`, for loops that are to be vectorised: sums may be reordered."""
 
 
 def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Callable[..., Any]:

@@ -14,11 +14,11 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
+from numba import njit
 
-from drivesplat.kernels.cache import OPTIONS, callee, kernel
+from drivesplat.kernels.cache import callee, fast_callee, kernel
 from drivesplat.kernels.numba import layout
+from drivesplat.kernels.numba.fast_exp import fast_exp
 from drivesplat.kernels.numba.layout import MOMENTS
 
 MAX_ALPHA = 0.999
@@ -33,34 +33,6 @@ OUT = 4
 """Plane of alpha in the forward pass, which the channels follow."""
 RAW, VALUE, REST, GRADIENT = range(4, 8)
 """Planes of the backward pass; GRADIENT is alpha's, which the channels' follow."""
-fast_callee = njit(**OPTIONS, fastmath={"reassoc", "contract", "nsz", "arcp"})
-
-
-def _exp(x):
-    """exp(x) for -25 <= x <= 0; callable from kernels only."""
-
-
-@overload(_exp)
-@no_type_check
-def _exp_overload(x):
-    if x != types.float32:
-        return lambda x: math.exp(x)
-
-    def single(x):
-        # 2^n 2^f with n whole and |f| <= 1/2, by a Taylor polynomial; relative error 2e-7
-        exponent = x * np.float32(1.4426950408889634)
-        n = np.int32(exponent - np.float32(0.5))
-        f = exponent - np.float32(n)
-        power = np.float32(1.5403530e-4)
-        power = power * f + np.float32(1.3333558e-3)
-        power = power * f + np.float32(9.6181291e-3)
-        power = power * f + np.float32(5.5504109e-2)
-        power = power * f + np.float32(2.4022651e-1)
-        power = power * f + np.float32(6.9314718e-1)
-        power = power * f + np.float32(1.0)
-        return power * np.int32((n + np.int32(127)) << np.int32(23)).view(np.float32)
-
-    return single
 
 
 @njit(nogil=True)
@@ -125,7 +97,7 @@ def gaussian_alpha(dx, dy, a, b, c, opacity):
     exponent = -(half * a * dx + b * dy) * dx - half * c * dy * dy
     limited = exponent if exponent > far else far
     limited = limited if limited < zero else zero
-    alpha = opacity * _exp(limited)
+    alpha = opacity * fast_exp(limited)
     return alpha if (exponent <= zero) & (alpha >= real(layout.MIN_ALPHA)) else zero
 
 

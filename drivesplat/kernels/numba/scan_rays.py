@@ -10,13 +10,12 @@ from typing import no_type_check
 
 import numpy as np
 
-from drivesplat.kernels.cache import callee, kernel
+from drivesplat.kernels.cache import callee, fast_callee, kernel
 from drivesplat.kernels.numba import scan_tiles
 from drivesplat.kernels.numba.pixels import (
     CHECK_EVERY,
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
-    fast_callee,
     gaussian_alpha,
 )
 from drivesplat.kernels.numba.scan_tiles import BEAMS, FIRINGS, SLACK, span, wrap

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drivesplat.kernels.cache import kernel
+from drivesplat.kernels.cache import fast_callee, kernel
 from drivesplat.kernels.numba import layout
 from drivesplat.kernels.numba.compositing import CHUNK
 from drivesplat.kernels.numba.pixels import (
@@ -19,7 +19,6 @@ from drivesplat.kernels.numba.pixels import (
     add,
     begin_tile,
     ended,
-    fast_callee,
     reached_rows,
     start_of,
     weigh,
