@@ -62,3 +62,14 @@ def test_results_do_not_depend_on_the_number_of_threads(one_thread):
         results.append([found.detach(), alpha.grad, sky.params["texels"].grad])
     for one, two in zip(*results, strict=True):
         assert torch.equal(one, two)
+
+
+def test_texels_that_are_nan_or_extreme_show_as_such():
+    """NaN must reach the loss, where a training notices it."""
+    view, sky = a_view(1, False), CubemapSky(9, torch.tensor([0.3, 0.5, 0.7]), 1e-2)
+    clear = torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH, 1)
+    with torch.no_grad():
+        sky.params["texels"][:, 0], sky.params["texels"][:, 1], sky.params["texels"][:, 2] = torch.nan, 1e6, -1e6
+        shown = sky.behind(*clear, view)
+    assert shown[..., 0].isnan().all()
+    torch.testing.assert_close(shown[..., 1:], torch.tensor([1.0, 0.0]).expand(HEIGHT, WIDTH, 2), atol=1e-6, rtol=0.0)

@@ -104,14 +104,15 @@ def _weights(u, v, real):
 @fast_callee
 @no_type_check
 def _to_colors(logits):
-    """Replaces the logits (n,) by colours in [0, 1]."""
+    """Replaces the logits (n,) by colours in [0, 1]; NaN stays NaN."""
     real = logits.dtype.type
     one, far = real(1.0), real(25.0)
     for p in range(np.uint64(len(logits))):
         x = logits[p]
         near = abs(x) if abs(x) < far else far
         decay = fast_exp(-near)
-        logits[p] = (one if x > real(0.0) else decay) / (one + decay)
+        color = (one if x > real(0.0) else decay) / (one + decay)
+        logits[p] = color if x == x else x
 
 
 @kernel
