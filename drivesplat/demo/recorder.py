@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from drivesplat.demo.optics.imaging import DemoCamera, Picture, geometry, render, to_bytes
@@ -13,19 +12,19 @@ from drivesplat.demo.optics.lidar import Scan, ScanPattern, returns, scan, scan_
 from drivesplat.demo.optics.lighting import Light, daylight, lamplight
 from drivesplat.demo.optics.raycast import RayCaster, Rays, StreetSnapshot
 from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time, recording_sensors
+from drivesplat.demo.shapes.surface_points import SurfacePoints
 from drivesplat.demo.street.edited import Variation, edited
 from drivesplat.demo.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject
 from drivesplat.demo.street.street import build_street
 from drivesplat.demo.tokens import instance_token
 from drivesplat.scene.images import project
-from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.world import WorldSettings
 
 STREET_TO_GLOBAL = rigid(Rotation.from_euler("z", 0.62).as_matrix(), np.array([812.4, 1437.9, 0.0]))
 """Far from the origin, as in nuScenes."""
 NIGHT_NOISE = 0.012
-SURFACE_POINTS = 60
 
 
 @dataclass(frozen=True)
@@ -149,6 +148,11 @@ class Recorder:
         times = time_us * 1e-6 + self.pattern.moments[0]
         return times, self.ego_to_street(times, view) @ sensor.sensor_to_ego
 
+    @cached_property
+    def _surfaces(self) -> dict[int, SurfacePoints]:
+        """Points on the surfaces of the objects that may have boxes, by their numbers."""
+        return {n: SurfacePoints.of(item.body.pieces) for n, item in enumerate(self.objects) if item.category}
+
     def visible_fractions(self, index: int) -> np.ndarray:
         """The visible fraction of each object (objects,) within the images of key frame `index`, of all six cameras
         whether they record or not."""
@@ -162,11 +166,11 @@ class Recorder:
     def _count_points(self, camera: DemoCamera, seconds: float, visible: np.ndarray, inside: np.ndarray) -> None:
         """Adds the number of surface points of each object that lie inside the image, and of those that are visible."""
         time, center = np.array([seconds]), camera.pose[:3, 3]
-        numbers = [number for number, item in enumerate(self.objects) if item.category]
+        numbers = list(self._surfaces)
         if not numbers:
             return
-        points = np.concatenate([surface_points(self.objects[number], time) for number in numbers])
-        owner = np.repeat(numbers, SURFACE_POINTS)
+        points = np.concatenate([own.at(self.objects[n].piece_poses(time)[0]) for n, own in self._surfaces.items()])
+        owner = np.repeat(numbers, [len(points) for points in self._surfaces.values()])
         pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
         limit = np.array([camera.width, camera.height]) - 0.5
         chosen = (depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)
@@ -199,11 +203,3 @@ class Recorder:
     def _random(self, *name: str | int) -> np.random.Generator:
         words = [n if isinstance(n, int) else sum(ord(c) * 31**i for i, c in enumerate(n)) for n in name]
         return np.random.default_rng([self.world.random_seed, *(w % 2**32 for w in words)])
-
-
-def surface_points(item: StreetObject, time: np.ndarray) -> np.ndarray:
-    """Points (SURFACE_POINTS, 3) on the surface of an object in the street frame, at `time` (1,)."""
-    poses, meshes = item.piece_poses(time)[0], item.body.pieces
-    triangles = np.concatenate([apply(p, m.triangles.reshape(-1, 3)) for p, m in zip(poses, meshes, strict=True)])
-    mesh = trimesh.Trimesh(triangles, np.arange(len(triangles)).reshape(-1, 3), process=False)
-    return trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0]
