@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.cache import callee, kernel
+from drivesplat.kernels.numba.rotations import quat_gradient, rotation_entries
 from drivesplat.kernels.numba.threads import parallel_for
 
 EPS2D = 0.3
@@ -106,21 +107,6 @@ def pinhole(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, 
     limits = np.stack([-principal / focal - margin, (size - principal) / focal + margin], axis=1)
     view = viewmat.detach().double().numpy()
     return np.concatenate([view[:3, :3].ravel(), view[:3, 3], k[:2].ravel(), limits.ravel(), size])
-
-
-@callee
-@no_type_check
-def rotation_entries(quat):
-    """The unit quaternion, the norm of `quat`, and its rotation row by row."""
-    w, x, y, z = float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3])
-    norm = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    return (
-        w, x, y, z, norm,
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
-    )  # fmt: skip
 
 
 @callee
@@ -281,12 +267,8 @@ def _axes_backward(quat, scale, v_axes, v_quat, v_scale):
     v00, v01, v02 = v_axes[0, 0] * scale[0], v_axes[0, 1] * scale[1], v_axes[0, 2] * scale[2]
     v10, v11, v12 = v_axes[1, 0] * scale[0], v_axes[1, 1] * scale[1], v_axes[1, 2] * scale[2]
     v20, v21, v22 = v_axes[2, 0] * scale[0], v_axes[2, 1] * scale[1], v_axes[2, 2] * scale[2]
-    v_w = 2.0 * (x * (v21 - v12) + y * (v02 - v20) + z * (v10 - v01))
-    v_x = 2.0 * (w * (v21 - v12) + y * (v01 + v10) + z * (v02 + v20) - 2.0 * x * (v11 + v22))
-    v_y = 2.0 * (w * (v02 - v20) + x * (v01 + v10) + z * (v12 + v21) - 2.0 * y * (v00 + v22))
-    v_z = 2.0 * (w * (v10 - v01) + x * (v02 + v20) + y * (v12 + v21) - 2.0 * z * (v00 + v11))
-    along = w * v_w + x * v_x + y * v_y + z * v_z
-    v_quat[0] += (v_w - w * along) / norm
-    v_quat[1] += (v_x - x * along) / norm
-    v_quat[2] += (v_y - y * along) / norm
-    v_quat[3] += (v_z - z * along) / norm
+    v_w, v_x, v_y, v_z = quat_gradient(w, x, y, z, norm, (v00, v01, v02), (v10, v11, v12), (v20, v21, v22))
+    v_quat[0] += v_w
+    v_quat[1] += v_x
+    v_quat[2] += v_y
+    v_quat[3] += v_z

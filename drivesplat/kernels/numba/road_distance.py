@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.cache import callee, kernel
-from drivesplat.kernels.numba.projection import arrays, rotation_entries
+from drivesplat.kernels.numba.projection import arrays
+from drivesplat.kernels.numba.rotations import quat_gradient, rotation_entries
 from drivesplat.kernels.numba.threads import parallel_for
 
 CHUNK = 2048
@@ -88,30 +89,15 @@ def _distances(
         v_scales[g, 0] += along0 * own0
         v_scales[g, 1] += along1 * own1
         v_scales[g, 2] += along2 * own2
-        along0, along1, along2 = along0 * s0, along1 * s1, along2 * s2
-        v_w, v_x, v_y, v_z = _quat_gradient(w, x, y, z, n0, n1, n2, along0, along1, along2)
-        v_quats[g, 0] += v_w / norm
-        v_quats[g, 1] += v_x / norm
-        v_quats[g, 2] += v_y / norm
-        v_quats[g, 3] += v_z / norm
+        v0, v1, v2 = along0 * s0, along1 * s1, along2 * s2  # of the normal in the Gaussian's own axes
+        rows = (n0 * v0, n0 * v1, n0 * v2), (n1 * v0, n1 * v1, n1 * v2), (n2 * v0, n2 * v1, n2 * v2)
+        v_w, v_x, v_y, v_z = quat_gradient(w, x, y, z, norm, rows[0], rows[1], rows[2])
+        v_quats[g, 0] += v_w
+        v_quats[g, 1] += v_x
+        v_quats[g, 2] += v_y
+        v_quats[g, 3] += v_z
     sums[start // CHUNK, 0] = total
     sums[start // CHUNK, 1] = weight_sum
-
-
-@callee
-@no_type_check
-def _quat_gradient(w, x, y, z, n0, n1, n2, v0, v1, v2):
-    """The gradient of a unit quaternion, given that (v0, v1, v2) of the normal (n0, n1, n2) in its own axes; without
-    its part along the quaternion."""
-    v_w = 2.0 * (x * (n2 * v1 - n1 * v2) + y * (n0 * v2 - n2 * v0) + z * (n1 * v0 - n0 * v1))
-    v_x = 2.0 * (w * (n2 * v1 - n1 * v2) + y * (n0 * v1 + n1 * v0) + z * (n0 * v2 + n2 * v0))
-    v_y = 2.0 * (w * (n0 * v2 - n2 * v0) + x * (n0 * v1 + n1 * v0) + z * (n1 * v2 + n2 * v1))
-    v_z = 2.0 * (w * (n1 * v0 - n0 * v1) + x * (n0 * v2 + n2 * v0) + y * (n1 * v2 + n2 * v1))
-    v_x -= 4.0 * x * (n1 * v1 + n2 * v2)
-    v_y -= 4.0 * y * (n0 * v0 + n2 * v2)
-    v_z -= 4.0 * z * (n0 * v0 + n1 * v1)
-    along = w * v_w + x * v_x + y * v_y + z * v_z
-    return v_w - w * along, v_x - x * along, v_y - y * along, v_z - z * along
 
 
 @callee
