@@ -7,8 +7,8 @@ which rays are transformed with the pose of the piece at their time. No scene is
 import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import no_type_check
+from functools import cache, partial
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -80,14 +80,26 @@ class EmbreePiece:
         return self.scene.run(origins.astype(np.float32), directions.astype(np.float32), query="OCCLUDED") == 0
 
 
+class Sphere(NamedTuple):
+    """A sphere around what it bounds: `center` (3,) in metres, and radius."""
+
+    center: np.ndarray
+    radius: float
+
+    def centers(self, poses: np.ndarray) -> np.ndarray:
+        """The centres (m, 3) of the sphere at `poses` (m, 4, 4)."""
+        return poses[:, :3, :3] @ self.center + poses[:, :3, 3]
+
+
 @dataclass(frozen=True)
 class MovingObject:
-    """A moving object: its pieces, and a sphere in its own frame that its pieces never leave."""
+    """A moving object: its pieces, a sphere around each in the piece's frame, and one in the object's own frame that
+    the pieces never leave."""
 
     item: StreetObject
     pieces: tuple[EmbreePiece, ...]
-    center: np.ndarray
-    radius: float
+    spheres: tuple[Sphere, ...]
+    sphere: Sphere
 
 
 class RayCaster:
@@ -108,7 +120,8 @@ class RayCaster:
             if item.moves:
                 pieces = zip(item.body.pieces, firsts, strict=True)
                 scenes = tuple(EmbreePiece([mesh], [number], [first]) for mesh, first in pieces)
-                self._moving.append(MovingObject(item, scenes, *_bounding_sphere(item)))
+                spheres = tuple(_bounding_sphere(mesh) for mesh in item.body.pieces)
+                self._moving.append(MovingObject(item, scenes, spheres, _sphere_around(item, spheres)))
             else:
                 poses = item.piece_poses(np.zeros(1))[0]
                 placed = (mesh.transformed(pose) for mesh, pose in zip(item.body.pieces, poses, strict=True))
@@ -147,8 +160,7 @@ class StreetSnapshot:
         for moving in caster._moving:
             if moving.item.name not in without:
                 poses = moving.item.poses(seconds)
-                centers = poses[:, :3, :3] @ moving.center + poses[:, :3, 3]
-                self._moving.append((moving, centers, poses[:, None] @ moving.item.limb_poses(seconds)))
+                self._moving.append((moving, poses, poses[:, None] @ moving.item.limb_poses(seconds)))
 
     def cast(self, rays: Rays) -> RayHits:
         """The first hit of each ray."""
@@ -159,11 +171,11 @@ class StreetSnapshot:
         )  # fmt: skip
         if self.caster._static is not None:
             static = self.caster._static
-            _keep_nearer(hits, static, static.intersect(rays.starts(), rays.directions), np.arange(count), None)
+            _keep_nearer(hits, static, static.intersect(rays.starts(), rays.directions), np.arange(count))
         for piece, poses, chosen in self._near(rays.directions, rays.moment, rays.origins, per_ray=False):
             start, at = rays.origins[rays.moment[chosen]], rays.moment[chosen]
             origins, toward = _in_frame(poses[:, :3, :3], poses[:, :3, 3], at, start, rays.directions[chosen])
-            _keep_nearer(hits, piece, piece.intersect(origins, toward), chosen, poses[at])
+            _keep_nearer(hits, piece, piece.intersect(origins, toward), chosen, (poses, at))
         return hits
 
     def unoccluded(self, points: np.ndarray, direction: np.ndarray, moment: np.ndarray) -> np.ndarray:
@@ -184,47 +196,65 @@ class StreetSnapshot:
     ) -> Iterator[tuple[EmbreePiece, np.ndarray, np.ndarray]]:
         """Each moving piece that rays may hit, with its poses (m, 4, 4) to the street and the indices of these rays.
         `origins` are those of moments (m, 3), or of rays (n, 3) where `per_ray`."""
-        for moving, centers, poses in self._moving:
-            chosen = _passing(directions, moment, origins, per_ray, centers, moving.radius**2)
-            if len(chosen):
-                for number, piece in enumerate(moving.pieces):
-                    yield piece, poses[:, number], chosen
+        passing = partial(_passing, directions, moment, origins, per_ray)
+        every = np.arange(len(directions))
+        for moving, of_object, of_pieces in self._moving:
+            near = passing(every, moving.sphere.centers(of_object), moving.sphere.radius**2)
+            if not len(near):
+                continue
+            for number, (piece, sphere) in enumerate(zip(moving.pieces, moving.spheres, strict=True)):
+                poses = of_pieces[:, number]
+                chosen = passing(near, sphere.centers(poses), sphere.radius**2)
+                if len(chosen):
+                    yield piece, poses, chosen
 
 
-def _bounding_sphere(item: StreetObject) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of a sphere in an object's frame around all its pieces, at the times sampled."""
+def _bounding_sphere(mesh: ColoredMesh) -> Sphere:
+    """A sphere around a mesh, with room for rounding."""
+    center, radius = mesh.bounding_sphere
+    return Sphere(center, 1.001 * radius + 1e-3)
+
+
+def _sphere_around(item: StreetObject, spheres: Sequence[Sphere]) -> Sphere:
+    """A sphere in an object's frame around the `spheres` of all its pieces, at the times sampled."""
     center = np.array([0.0, 0.0, item.size[2] / 2])
     poses = item.body.poses(np.linspace(0.0, 6.0, SAMPLED_TIMES), np.linspace(0.0, 10.0, SAMPLED_TIMES))
     radius = 0.0
-    for number, mesh in enumerate(item.body.pieces):
-        middle, extent = mesh.bounding_sphere
-        places = poses[:, number, :3, :3] @ middle + poses[:, number, :3, 3]
-        radius = max(radius, float(np.linalg.norm(places - center, axis=1).max()) + extent)
-    return center, 1.02 * radius
+    for number, sphere in enumerate(spheres):
+        places = sphere.centers(poses[:, number])
+        radius = max(radius, float(np.linalg.norm(places - center, axis=1).max()) + sphere.radius)
+    return Sphere(center, 1.02 * radius)
 
 
 def _keep_nearer(
-    hits: RayHits, piece: EmbreePiece, found: dict[str, np.ndarray], chosen: np.ndarray, poses: np.ndarray | None
+    hits: RayHits,
+    piece: EmbreePiece,
+    found: dict[str, np.ndarray],
+    chosen: np.ndarray,
+    to_street: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
-    """Enters Embree's hits of the rays `chosen` (k,) that are nearer than those known. `poses` (k, 4, 4): the piece's
-    frame to street; None if that is the same."""
+    """Enters Embree's hits of the rays `chosen` (k,) that are nearer than those known. `to_street`: poses (m, 4, 4) of
+    the piece's frame in the street, and which of them (k,) each ray meets; None if both frames are the same."""
     nearer = np.flatnonzero((found["geomID"] >= 0) & (found["tfar"] < hits.distance[chosen]))
     rows, geometry = chosen[nearer], found["geomID"][nearer]
     hits.distance[rows] = found["tfar"][nearer]
     hits.object[rows] = piece.owners[geometry]
     hits.face[rows] = found["primID"][nearer] + piece.first_faces[geometry]
     normals = found["Ng"][nearer]
-    hits.normal[rows] = normals if poses is None else np.einsum("nij,nj->ni", poses[nearer, :3, :3], normals)
+    if to_street is not None:
+        poses, at = to_street
+        normals = np.einsum("nij,nj->ni", poses[at[nearer], :3, :3], normals)
+    hits.normal[rows] = normals
     hits.weights[rows, 0], hits.weights[rows, 1] = found["u"][nearer], found["v"][nearer]
 
 
 @kernel
 @no_type_check
-def _passing(directions, moment, origins, per_ray, centers, squared_radius):
-    """The indices of the rays that pass a sphere; its centre (m, 3) depends on the ray's moment."""
-    chosen = np.empty(len(directions), np.int64)
+def _passing(directions, moment, origins, per_ray, among, centers, squared_radius):
+    """Those of the rays `among` (k,), by index, that pass a sphere; its centre (m, 3) depends on the ray's moment."""
+    chosen = np.empty(len(among), np.int64)
     count = 0
-    for i in range(len(directions)):
+    for i in among:
         m = moment[i]
         source = i if per_ray else m
         x, y, z = (

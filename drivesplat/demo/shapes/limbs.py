@@ -7,6 +7,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from drivesplat.demo.shapes.mesh import Color, ColoredMesh, Material, uniform
+from drivesplat.demo.shapes.vectors import cross
 
 Ring = tuple[float, float, float, float]
 """A horizontal ellipse with its centre at y = 0: z, x of the centre, semi-axis along x, semi-axis along y (metres)."""
@@ -64,9 +65,9 @@ def links(start: np.ndarray, end: np.ndarray, left: np.ndarray) -> np.ndarray:
     y axes as nearly to `left` (..., 3) as possible."""
     z = start - end
     z = z / np.linalg.norm(z, axis=-1, keepdims=True)
-    x = np.cross(np.broadcast_to(left, z.shape), z)
+    x = cross(np.broadcast_to(left, z.shape), z)
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
-    return transforms(np.stack([x, np.cross(z, x), z], axis=-1), start)
+    return transforms(np.stack([x, cross(z, x), z], axis=-1), start)
 
 
 def transforms(rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
@@ -109,7 +110,7 @@ def mean_size(poses: np.ndarray, pieces: Sequence[ColoredMesh], share: float = 0
     corners = [placed(poses[:, i], mesh.vertices)[:, mesh.faces] for i, mesh in enumerate(pieces)]
     triangles = np.concatenate(corners, axis=1)
     first, second, third = np.moveaxis(triangles[0], 1, 0)
-    areas = np.linalg.norm(np.cross(second - first, third - first), axis=-1)
+    areas = np.linalg.norm(cross(second - first, third - first), axis=-1)
     offsets = np.abs(triangles.mean(axis=2)[..., :2])
     order = np.argsort(offsets, axis=1)
     inside = np.cumsum(areas[order], axis=1) < share * areas.sum()

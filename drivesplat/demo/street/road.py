@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivesplat.demo.shapes.mesh import ColoredMesh
+from drivesplat.demo.shapes.vectors import cross
 
 VERTICAL_CURVE = 30.0
 """Length in metres over which the slope changes from level to its grade."""
@@ -70,10 +71,10 @@ class Road:
         up = np.stack([-slope * np.cos(heading), -slope * np.sin(heading), np.ones_like(slope)], axis=-1)
         up /= np.linalg.norm(up, axis=-1, keepdims=True)
         forward = np.stack([np.cos(heading + yaw), np.sin(heading + yaw), np.zeros_like(heading)], axis=-1)
-        left = np.cross(up, forward)
+        left = cross(up, forward)
         left /= np.linalg.norm(left, axis=-1, keepdims=True)
         poses = np.tile(np.eye(4), (len(s), 1, 1))
-        poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = np.cross(left, up), left, up
+        poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = cross(left, up), left, up
         poses[:, :3, 3] = self.points(np.stack([s, t, np.zeros_like(s)], axis=-1))
         return poses
 
