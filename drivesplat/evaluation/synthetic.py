@@ -155,8 +155,9 @@ def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) 
 @torch.no_grad()
 def rendered_with_depth(model: SplatModel, view: View) -> tuple[np.ndarray, np.ndarray]:
     """The rendering, as of `rendered`, and the depth (h, w) of its surfaces in metres along the camera's axis."""
-    shown = model.gaussians_in(view)
-    return rendered(model, view, shown), model.surface_depth(view, shown).float().cpu().numpy()
+    picture = model.render(view, with_surface_depth=True)
+    assert picture.surface_depth is not None
+    return picture.image.float().cpu().numpy(), picture.surface_depth.float().cpu().numpy()
 
 
 def lateral_metrics(

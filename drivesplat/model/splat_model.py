@@ -18,7 +18,7 @@ from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.model.view import View, depth_at_lines, where_seen
-from drivesplat.rasterization import Rendering, rasterize, rasterize_surface_depth
+from drivesplat.rasterization import Rendering, rasterize
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ class Picture:
     """A rendering of `gaussians`, which are `sets` one after the other: `image` with sky and the exposure of the view's
     camera; `splats` without sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or
     None; `objects_alpha`, the alpha of the parts with objects alone, None where it needs a second rendering. What is
-    opaque may hide objects behind it in `objects_alpha`.
+    opaque may hide objects behind it in `objects_alpha`. `surface_depth`, in metres or None, is that of the surfaces
+    shown, 0 where there are none; it has no gradient (`drivesplat.rasterization.rasterize`).
     """
 
     gaussians: Gaussians
@@ -37,6 +38,7 @@ class Picture:
     depth: Float[Tensor, "h w"] | None
     info: dict[str, Any]
     objects_alpha: Float[Tensor, "h w"] | None = None
+    surface_depth: Float[Tensor, "h w"] | None = None
 
 
 class SplatModel(nn.Module):
@@ -185,6 +187,7 @@ class SplatModel(nn.Module):
         absgrad: bool = False,
         with_depth: bool = False,
         with_objects: bool = False,
+        with_surface_depth: bool = False,
     ) -> Picture:
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
@@ -198,7 +201,7 @@ class SplatModel(nn.Module):
         colors, degree = _colors(shown, seen_from, sh_degree)
         rendering = rasterize(
             **self._placed(shown, seen_from), colors=colors, sh_degree=degree, absgrad=absgrad, with_depth=with_depth,
-            objects=self._rows_of_objects() if with_objects else None,
+            objects=self._rows_of_objects() if with_objects else None, with_surface_depth=with_surface_depth,
         )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
         image = splats
@@ -208,7 +211,9 @@ class SplatModel(nn.Module):
             image = self.exposure.applied(image, view.camera)
         depth = None if rendering.depth is None else depth_at_lines(rendering.depth.squeeze((0, 3)), seen_from)
         alone = None if rendering.objects_alpha is None else rendering.objects_alpha.squeeze((0, 3))
-        return Picture(shown, sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone)
+        surfaces = rendering.surface_depth
+        surfaces = None if surfaces is None else depth_at_lines(surfaces.squeeze(0), seen_from)
+        return Picture(shown, sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone, surfaces)
 
     def scan(
         self,
@@ -268,12 +273,6 @@ class SplatModel(nn.Module):
     def composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
         """A rendering of `values` of Gaussians in place of their colours, without sky and exposure."""
         return rasterize(**self._placed(gaussians, self.seen_from(view)), colors=values)
-
-    def surface_depth(self, view: View, gaussians: Gaussians | None = None) -> Float[Tensor, "h w"]:
-        """The depth of the surfaces that a view shows, or that `gaussians` show there, in metres along the camera axis;
-        0 where there are none. No gradients: see `drivesplat.rasterization.rasterize_surface_depth`."""
-        seen_from, shown = self.seen_from(view), self.gaussians_in(view) if gaussians is None else gaussians
-        return depth_at_lines(rasterize_surface_depth(**self._placed(shown, seen_from)).squeeze(0), seen_from)
 
     def _placed(self, gaussians: Gaussians, seen_from: View) -> dict[str, Any]:
         """The arguments of the rasterizer for Gaussians in a view, without their colours."""

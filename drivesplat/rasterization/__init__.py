@@ -2,7 +2,6 @@
 
 from drivesplat.rasterization.rasterization import Rendering, rasterize
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
-from drivesplat.rasterization.surface_depth import rasterize_surface_depth
 
 __all__ = [
     "RayGrid",
@@ -11,5 +10,4 @@ __all__ = [
     "ScanRendering",
     "rasterize",
     "rasterize_scan",
-    "rasterize_surface_depth",
 ]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from drivesplat.kernels.compositing import composite
 from drivesplat.kernels.projection import project
+from drivesplat.kernels.surface_depth import surface_depth
 from drivesplat.kernels.view_colors import view_colors
 
 
@@ -20,6 +21,7 @@ class Rendering:
     the camera axis, or None. `info` holds what gsplat's strategies read: `means2d`, `radii`, `depths`, `conics`,
     `opacities`, `width`, `height`, `n_cameras` and `gaussian_ids`. `objects_alpha` is the alpha of the
     Gaussians `objects` alone, None where it needs a second rendering. Opaque Gaussians before an object may hide it.
+    `surface_depth` is the depth of surfaces in metres along the camera axis, 0 where a ray meets no Gaussian; or None.
     """
 
     image: Float[Tensor, "c h w channels"]
@@ -27,6 +29,7 @@ class Rendering:
     depth: Float[Tensor, "c h w 1"] | None
     info: dict[str, Any]
     objects_alpha: Float[Tensor, "c h w 1"] | None = None
+    surface_depth: Float[Tensor, "c h w"] | None = None
 
 
 def rasterize(
@@ -45,12 +48,18 @@ def rasterize(
     absgrad: bool = False,
     with_depth: bool = False,
     objects: slice | None = None,
+    with_surface_depth: bool = False,
 ) -> Rendering:
     """Renders n 3D Gaussians in c pinhole cameras.
 
     The projection is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023). Tensors on a
     GPU are rendered by gsplat and Triton in float32, others by numba in float32 or float64, in as many threads as torch
     uses and with results that do not depend on their number. Gradients reach all tensors but `Ks`.
+
+    There are two depths. The expected depth is the mean depth of Gaussians' centres. It has a gradient, but lies behind
+    a surface where a little of what is far behind it shows through. The depth of surfaces is that at which a ray has
+    passed half of what it sees: half of the final alpha. Up to there it follows the planes of the Gaussians, on which
+    rays meet them where they are densest (RaDe-GS: Zhang et al. 2024, arXiv 2406.01467). It has no gradient.
 
     Args:
         means: Centres in world coordinates, metres.
@@ -67,10 +76,12 @@ def rasterize(
         absgrad: Let the backward pass write `info["means2d"].absgrad` (c, n, 2), as gsplat's strategies need it.
         with_depth: Also render the expected depth.
         objects: Rows of Gaussians. Their alpha alone is computed, too, where this needs no second rendering.
+        with_surface_depth: Also compute the depth of surfaces.
 
     Returns:
         A `Rendering`: image (c, h, w, channels), premultiplied by alpha; alpha (c, h, w, 1); depth (c, h, w, 1) in
-        metres or None; info for gsplat's strategies; the alpha of `objects` (c, h, w, 1) or None.
+        metres or None; info for gsplat's strategies; the alpha of `objects` (c, h, w, 1) or None; the depth of surfaces
+        (c, h, w) in metres or None.
 
     Raises:
         ValueError: On a CPU, for an `sh_degree` above 3 or too few coefficients.
@@ -93,12 +104,27 @@ def rasterize(
         True
         >>> round(rendering.alpha[0, 12, 16].item(), 3), round(rendering.depth[0, 12, 16].item(), 3)
         (0.8, 2.0)
+
+        A flat one at the same place, turned by 45 degrees about the vertical, before a transparent one: the depth of
+        surfaces at the centre of the image, and 4 pixels to the right.
+
+        >>> import math
+        >>> means = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 20.0]])
+        >>> turned = [math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0]
+        >>> quats = torch.tensor([turned, [1.0, 0.0, 0.0, 0.0]])
+        >>> scales = torch.tensor([[1.0, 1.0, 0.01], [1.0, 1.0, 1.0]])
+        >>> opacities, colors = torch.tensor([0.9, 0.1]), torch.ones(2, 1)
+        >>> shapes = (means, quats, scales, opacities)
+        >>> depth = rasterize(*shapes, colors, viewmats, Ks, 32, 24, with_surface_depth=True).surface_depth
+        >>> tuple(depth.shape), round(depth[0, 12, 16].item(), 2), round(depth[0, 12, 20].item(), 2)
+        ((1, 24, 32), 2.0, 1.84)
     """
     cameras = len(viewmats)
     if means.is_cuda and len(means) == 0:  # gsplat's kernels need at least one Gaussian
         size = (cameras, height, width)
         channels = colors.shape[-1] + with_depth
-        return assembled(means.new_zeros(*size, channels), means.new_zeros(*size, 1), with_depth)
+        empty = assembled(means.new_zeros(*size, channels), means.new_zeros(*size, 1), with_depth)
+        return replace(empty, surface_depth=means.new_zeros(size) if with_surface_depth else None)
     gaussians = project(means, quats, scales, opacities, viewmats, Ks, width, height, antialiased)
     if sh_degree is not None:
         values = view_colors(means, colors, viewmats, gaussians.radii, sh_degree)
@@ -107,7 +133,11 @@ def rasterize(
     if with_depth:
         values = torch.cat([values, gaussians.depths[..., None]], dim=-1)
     image, alpha, alone = composite(gaussians, values, width, height, absgrad, objects)
-    return replace(assembled(image, alpha, with_depth, **gaussians._asdict()), objects_alpha=alone)
+    surfaces = None
+    if with_surface_depth:
+        surfaces = surface_depth(means, quats, scales, gaussians, alpha.squeeze(-1), viewmats, Ks)
+    rendering = assembled(image, alpha, with_depth, **gaussians._asdict())
+    return replace(rendering, objects_alpha=alone, surface_depth=surfaces)
 
 
 def assembled(

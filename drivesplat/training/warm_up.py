@@ -53,7 +53,7 @@ def warm_up(folder: Path) -> None:
     model = SplatModel([part], CubemapSky(settings.sky_resolution, torch.full((3,), 0.5), settings.lr_sky))
     folders = TrainingFolders(folder / "resume", folder / "tensorboard", "", "warm-up")
     train(model, [view], settings, 0, torch.device("cpu"), folders, GeometryPriors(road=_road()), scans=[_scan()])
-    model.surface_depth(view.view)
+    model.render(view.view, with_surface_depth=True)
     face_coordinates(torch.ones(2, 2, 3))
     pixel = np.zeros(1, dtype=np.int64)
     unoccluded(pixel, pixel, np.ones(1), np.ones((1, 2)), (height, width))

@@ -275,8 +275,9 @@ class Deep(SplatModel):
         super().__init__([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2))
         self._depth_of = depth_of
 
-    def surface_depth(self, view: View, gaussians: Gaussians | None = None) -> torch.Tensor:
-        return torch.from_numpy(self._depth_of(view)).float()
+    def render(self, view: View, *args: Any, **options: Any) -> Picture:
+        depth = torch.from_numpy(self._depth_of(view)).float()
+        return dataclasses.replace(super().render(view, *args, **options), surface_depth=depth)
 
 
 def depth_figures(known: DriveTruth, depth_of: Callable[[View], np.ndarray]) -> dict[float, dict[str, Any] | None]:

@@ -9,7 +9,9 @@ import torch
 pytest.importorskip("triton", reason="Triton is not there for this system")
 from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses
 
+from drivesplat.kernels.compositing import composite
 from drivesplat.kernels.numba.surface_depth import surface_depth as on_cpu
+from drivesplat.kernels.projection import ProjectedGaussians
 from drivesplat.kernels.triton.surface_depth import surface_depth
 from drivesplat.kernels.triton.tiles import tile_lists
 
@@ -20,12 +22,13 @@ def test_it_is_that_of_the_cpu(cameras):
     slopes = torch.randn(cameras, 80, 2, generator=torch.Generator().manual_seed(0)).to(DEVICE)
     gaussians = gaussians._replace(values=torch.cat([depths[..., None], 0.05 * slopes], dim=-1))
     lists = tile_lists(gaussians, radii, depths, WIDTH, HEIGHT)
-    found = surface_depth(gaussians, lists, WIDTH, HEIGHT).cpu()
-    assert found.shape == (cameras, HEIGHT, WIDTH)
     means, conics, planes, opacities = (values.cpu() for values in gaussians)
+    projected = ProjectedGaussians(means, depths.cpu(), conics, radii.cpu(), opacities)
+    alpha = composite(projected, planes, WIDTH, HEIGHT, absgrad=False).alpha.squeeze(-1)
+    found = surface_depth(gaussians, lists, alpha.to(DEVICE)).cpu()
+    assert found.shape == (cameras, HEIGHT, WIDTH)
     for c in range(cameras):
-        by_camera = (means, depths.cpu(), conics, radii.cpu(), opacities, planes)
-        expected = on_cpu(*(values[c] for values in by_camera), WIDTH, HEIGHT)
+        expected = on_cpu(*(values[c] for values in (*projected, planes, alpha)))
         differs = (found[c] - expected).abs() > 1e-3
         assert differs.float().mean() < 0.01  # rounding may choose the neighbour of half
         assert (expected > 0.0).float().mean() > 0.9
@@ -34,4 +37,4 @@ def test_it_is_that_of_the_cpu(cameras):
 def test_an_image_without_gaussians_has_depth_zero():
     gaussians, radii, depths = ellipses(1, 5, WIDTH, HEIGHT)
     lists = tile_lists(gaussians, torch.zeros_like(radii), depths, WIDTH, HEIGHT)
-    assert (surface_depth(gaussians, lists, WIDTH, HEIGHT) == 0.0).all()
+    assert (surface_depth(gaussians, lists, torch.zeros(1, HEIGHT, WIDTH, device=DEVICE)) == 0.0).all()

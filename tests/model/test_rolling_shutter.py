@@ -126,7 +126,14 @@ def test_the_depth_is_that_at_the_time_of_each_line():
     alphas = [wall.render(view(readout)).alpha for readout in (DOWN, None)]
     dense = (alphas[0] > 0.9) & (alphas[1] > 0.9)
     assert dense.sum() > 300
-    for depth_of in (lambda seen: wall.render(seen, with_depth=True).depth, wall.surface_depth):
+
+    def expected_depth(seen: View) -> torch.Tensor:
+        return wall.render(seen, with_depth=True).depth
+
+    def surface_depth(seen: View) -> torch.Tensor:
+        return wall.render(seen, with_surface_depth=True).surface_depth
+
+    for depth_of in (expected_depth, surface_depth):
         expected = torch.zeros(HEIGHT, WIDTH)
         for row in range(HEIGHT):
             after = ((row + 0.5) / HEIGHT - 0.5) * DOWN[1] + DOWN[2]

@@ -10,7 +10,7 @@ from helpers.random_gaussians import Scene, random_scene
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.numba import tiles
-from drivesplat.rasterization import rasterize, rasterize_surface_depth
+from drivesplat.rasterization import rasterize
 
 DILATION = 0.3
 """Pixels squared that 3DGS adds to the variance of every projected Gaussian."""
@@ -26,7 +26,7 @@ def arguments(scene: Scene) -> dict:
 
 
 def surface_depth(scene: Scene, **options) -> torch.Tensor:
-    return rasterize_surface_depth(**arguments(scene), **options)
+    return rasterize(**arguments(scene), colors=scene.colors, with_surface_depth=True, **options).surface_depth
 
 
 def naive(scene: Scene, camera: int, antialiased: bool) -> np.ndarray:
@@ -134,13 +134,15 @@ def test_rays_that_meet_nothing_have_depth_zero():
     torch.testing.assert_close(surface_depth(scene)[0] > 0.0, alpha > 0.0)
     assert 0 < (alpha > 0.0).sum() < alpha.numel() / 2
     nothing = {name: value[:0] for name, value in vars(scene).items() if name in ("means", "quats", "scales")}
-    assert (surface_depth(replace(scene, **nothing, opacities=scene.opacities[:0])) == 0.0).all()
+    empty = replace(scene, **nothing, opacities=scene.opacities[:0], colors=scene.colors[:0])
+    assert (surface_depth(empty) == 0.0).all() and surface_depth(empty).shape == (1, 30, 40)
 
 
 def test_gaussians_behind_the_camera_and_at_its_place_are_left_out():
     scene = random_scene(1, n=40, width=40, height=30)
     means = torch.cat([scene.means, torch.tensor([[0.0, 0.0, -3.0], [0.0, 0.0, 0.0]], dtype=torch.float64)])
     more = {name: torch.cat([getattr(scene, name), getattr(scene, name)[:2]]) for name in ("quats", "scales")}
+    more["colors"] = torch.cat([scene.colors, scene.colors[:2]])
     both = replace(scene, means=means, **more, opacities=torch.cat([scene.opacities, torch.ones(2).double()]))
     at_origin = replace(both, viewmats=torch.eye(4, dtype=torch.float64)[None])
     alone = replace(scene, viewmats=at_origin.viewmats)

@@ -2,6 +2,7 @@
 
 from typing import no_type_check
 
+import torch
 import triton
 import triton.language as tl
 from jaxtyping import Float
@@ -12,12 +13,12 @@ from drivesplat.kernels.triton.tiles import MIN_ALPHA, TILE, Footprints, TileLis
 MAX_ALPHA, MIN_TRANSMITTANCE, NEAR_PLANE = tl.constexpr(0.999), tl.constexpr(1e-4), tl.constexpr(0.01)
 
 
-def surface_depth(gaussians: Footprints, lists: TileLists, width: int, height: int) -> Float[Tensor, "c h w"]:
-    """The depth in metres at which rays have passed half of what they see; 0 where they meet nothing. The values of
+def surface_depth(gaussians: Footprints, lists: TileLists, alpha: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
+    """The depth in metres at which rays have passed half of `alpha`; 0 where they meet nothing. The values of
     `gaussians` are their depth planes."""
-    given = [values.contiguous() for values in gaussians]
-    cameras, down, across = lists.tiles
-    found = given[0].new_zeros(cameras, height, width)
+    given = [values.contiguous() for values in (*gaussians, alpha)]
+    (cameras, down, across), (height, width) = lists.tiles, alpha.shape[1:]
+    found = torch.zeros_like(alpha)
     _surface_depths[(cameras * down * across,)](
         *given, lists.ids, lists.order, lists.offsets, found, width, height, across, down * across
     )
@@ -26,29 +27,26 @@ def surface_depth(gaussians: Footprints, lists: TileLists, width: int, height: i
 
 @triton.jit(do_not_specialize=["width", "height", "across", "per_camera"])
 @no_type_check
-def _surface_depths(means, conics, planes, opacities, ids, order, offsets, found, width, height, across, per_camera):
-    """Writes the depths of a tile: first the final alpha, then where half of it is reached."""
+def _surface_depths(
+    means, conics, planes, opacities, alpha, ids, order, offsets, found, width, height, across, per_camera
+):
+    """Writes the depths of a tile."""
     tile = tl.program_id(0)
     camera, within = tile // per_camera, tile % per_camera
     pixel = tl.arange(0, TILE * TILE)
     x, y = within % across * TILE + pixel % TILE, within // across * TILE + pixel // TILE
-    start, end = tl.load(offsets + tile), tl.load(offsets + tile + 1)
-    total, left = tl.zeros((TILE * TILE,), tl.float32), tl.zeros((TILE * TILE,), tl.float32) + 1.0
-    for entry in range(start, end):
-        i = tl.load(ids + tl.load(order + entry)).to(tl.int64)
-        weight, left, _, _ = _weigh(means, conics, opacities, i, x, y, left)
-        total += weight
+    to, inside = (camera.to(tl.int64) * height + y) * width + x, (x < width) & (y < height)
+    half = 0.5 * tl.load(alpha + to, mask=inside, other=0.0)
     depth, passed = tl.zeros((TILE * TILE,), tl.float32), tl.zeros((TILE * TILE,), tl.float32)
     left = tl.zeros((TILE * TILE,), tl.float32) + 1.0
-    for entry in range(start, end):
+    for entry in range(tl.load(offsets + tile), tl.load(offsets + tile + 1)):
         i = tl.load(ids + tl.load(order + entry)).to(tl.int64)
         weight, left, over_x, over_y = _weigh(means, conics, opacities, i, x, y, left)
         at = tl.load(planes + 3 * i) + tl.load(planes + 3 * i + 1) * over_x + tl.load(planes + 3 * i + 2) * over_y
-        reached = (passed < 0.5 * total) & (passed + weight >= 0.5 * total)
+        reached = (passed < half) & (passed + weight >= half)
         depth = tl.where(reached, tl.maximum(at, NEAR_PLANE), depth)
         passed += weight
-    to = (camera.to(tl.int64) * height + y) * width + x
-    tl.store(found + to, depth, mask=(x < width) & (y < height))
+    tl.store(found + to, depth, mask=inside)
 
 
 @triton.jit
