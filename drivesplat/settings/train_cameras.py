@@ -33,7 +33,7 @@ class ExposureSettings(Settings):
     """Exposure of each camera. Cameras of one rig set exposure and white balance independently, which causes seams
     where their images overlap."""
 
-    kind: Literal["none", "affine"] = "none"
+    kind: Literal["none", "affine"] = "affine"
     """'affine': a gain and an offset per colour channel for every camera but eval_camera, which is the reference. They
     are initialised from surfaces that several cameras recorded, then learned. No effect with one camera."""
     sigma_gain: float = Field(0.1, gt=0)

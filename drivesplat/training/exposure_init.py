@@ -5,10 +5,13 @@ exposure.
 """
 
 import logging
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import visible
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.training.views import TrainingView
@@ -17,55 +20,109 @@ log = logging.getLogger(__name__)
 
 MIN_SHARED_POINTS = 50
 """Minimum number of points shared with other cameras for an estimate."""
+MAX_POINTS = 100_000
+"""More seed points are thinned evenly to at most so many."""
+DISTANCE_STEP = 0.1
+"""Natural logarithm of the ratio of distances from which on a point counts as another surface."""
 VALID_LEVELS = (8, 247)
 """Levels between which a pixel is neither clipped nor noise."""
 ROUNDS = 8
 """Number of passes over all cameras; three connect a rig of six."""
 
 
+class Sightings(NamedTuple):
+    """m sightings of points by a camera: `point` (m,), the index of each, `distance` (m,) in metres, and `color` (m, 3)
+    in levels of 0 to 255."""
+
+    point: np.ndarray
+    distance: np.ndarray
+    color: np.ndarray
+
+
 def initial_gains(
     record: TrainingRecord, views: Sequence[TrainingView], cameras: Sequence[str], reference: str
 ) -> dict[str, np.ndarray]:
     """The gains (3,) of the colour channels of each of `cameras` relative to the reference camera, by the seed points
-    on surfaces; 1 for a camera that shares too few points. `views` are the training images."""
+    on surfaces; 1 for a camera that shares too few points. `views` are the training images.
+
+    Colours are compared between images that show a point from about the same distance, since haze brightens what is far
+    away: a camera that looks ahead sees a facade from farther away than one that looks aside, whose gain would come out
+    too small. Cameras that share too few such points are compared at any distance.
+    """
     surfaces = record.points[: len(record.points) - record.seed.far]
-    observed = log_colors(surfaces, views, [reference, *cameras])
-    gains = np.exp(log_gains(observed))
-    for camera, gain in zip(cameras, gains[1:], strict=True):
+    surfaces = surfaces[:: max(1, math.ceil(len(surfaces) / MAX_POINTS))].astype(np.float64)
+    seen = sightings(surfaces, views, [reference, *cameras])
+    gains = np.full((1 + len(cameras), 3), np.nan)
+    gains[0] = 0.0
+    for step in (DISTANCE_STEP, math.inf):
+        gains = log_gains(log_colors(seen, step), gains)
+    found = np.exp(np.nan_to_num(gains))
+    for camera, gain in zip(cameras, found[1:], strict=True):
         log.info("%s: gains of %.2f, %.2f, %.2f over %s", camera, *gain, reference)
-    return dict(zip(cameras, gains[1:], strict=True))
+    return dict(zip(cameras, found[1:], strict=True))
 
 
-def log_colors(points: np.ndarray, views: Sequence[TrainingView], cameras: Sequence[str]) -> np.ndarray:
-    """The logarithm of the mean colour (c, n, 3) that each of `cameras` recorded of world points (n, 3); NaN where a
-    camera did not see a point, or not between VALID_LEVELS. Pixels of the ego vehicle are ignored."""
-    sums, counts = np.zeros((len(cameras), len(points), 3)), np.zeros((len(cameras), len(points), 1))
-    for view in (view for view in views if view.view.camera in cameras):
-        camera, shape = cameras.index(view.view.camera), (view.view.height, view.view.width)
+def sightings(points: np.ndarray, views: Sequence[TrainingView], cameras: Sequence[str]) -> list[Sightings]:
+    """What each of `cameras` saw of world points (n, 3). Pixels of the ego vehicle and those outside VALID_LEVELS are
+    left out."""
+
+    def seen_in(view: TrainingView) -> Sightings:
         at = view.view.viewmat.double().cpu().numpy(), view.view.K.double().cpu().numpy()
-        index, rows, columns, _ = visible(points.astype(np.float64), *at, shape)
+        index, rows, columns, _ = visible(points, *at, (view.view.height, view.view.width))
         colors = view.pixels.cpu().numpy()[rows, columns]
         valid = ((colors > VALID_LEVELS[0]) & (colors < VALID_LEVELS[1])).all(axis=1)
         if view.ego_mask is not None:
             valid &= ~view.ego_mask.cpu().numpy()[rows, columns]
-        sums[camera, index[valid]] += colors[valid]
-        counts[camera, index[valid]] += 1
-    return np.log(np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0) / 255.0)
+        position = view.view.camera_to_world[:3, 3].double().cpu().numpy()
+        distances = np.linalg.norm(points[index[valid]] - position, axis=1)
+        return Sightings(index[valid], distances, colors[valid])
+
+    found: dict[str | None, list[Sightings]] = {camera: [] for camera in cameras}
+    chosen = [view for view in views if view.view.camera in found]
+    for view, own in zip(chosen, prefetch(seen_in, chosen), strict=True):
+        found[view.view.camera].append(own)
+    nothing = Sightings(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
+    return [Sightings(*(np.concatenate(values) for values in zip(nothing, *found[c], strict=True))) for c in cameras]
 
 
-def log_gains(observed: np.ndarray) -> np.ndarray:
-    """The log gain (c, 3) of each camera relative to the first, where `observed` log colours (c, n, 3) are those of the
-    surface plus the log gain of the camera. Iterates over cameras: the median difference to the mean of the cameras
-    known so far. 0 where too few points are shared."""
-    gains = np.full((len(observed), 3), np.nan)
-    gains[0] = 0.0
+def log_colors(seen: Sequence[Sightings], step: float) -> np.ndarray:
+    """The logarithm of the mean colour (c, n, 3) that each of c cameras recorded of the n surfaces that several of them
+    saw; NaN where a camera did not see one. A point counts as another surface where distances differ by a factor of
+    exp(`step`)."""
+    intervals = [np.floor(np.log(np.maximum(own.distance, 1.0)) / step).astype(np.int64) for own in seen]
+    count = 1 + max((int(of_camera.max(initial=0)) for of_camera in intervals), default=0)
+    means = [_means_by_key(own.point * count + at, own.color) for own, at in zip(seen, intervals, strict=True)]
+    keys, cameras = np.unique(np.concatenate([own for own, _ in means]), return_counts=True)
+    shared = keys[cameras > 1]
+    found = np.full((len(seen), len(shared), 3), np.nan)
+    for row, (own, colors) in zip(found, means, strict=True):
+        also = np.isin(own, shared)
+        row[np.searchsorted(shared, own[also])] = np.log(colors[also] / 255.0)
+    return found
+
+
+def _means_by_key(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different keys, in order, and the mean (k, 3) of the values (m, 3) of each."""
+    unique, at = np.unique(keys, return_inverse=True)
+    sums = [np.bincount(at, weights=column, minlength=len(unique)) for column in values.T]
+    return unique, np.stack(sums, axis=1) / np.bincount(at, minlength=len(unique))[:, None]
+
+
+def log_gains(observed: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The log gain (c, 3) of each camera, where `observed` log colours (c, n, 3) are those of the surface plus the log
+    gain of the camera. `known` (c, 3) are those known before, which are kept; NaN for the others.
+
+    Iterates over cameras: the median difference to the mean of the cameras known so far. NaN where too few points are
+    shared.
+    """
+    gains, wanted = known.copy(), np.flatnonzero(np.isnan(known[:, 0]))
     for _ in range(ROUNDS):
-        for camera in range(1, len(observed)):
+        for camera in wanted:
             others = [i for i in range(len(observed)) if i != camera and np.isfinite(gains[i, 0])]
             surfaces = observed[others] - gains[others, None]
             seen = np.isfinite(surfaces[..., 0])
-            known = np.where(seen[..., None], surfaces, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
+            of_surface = np.where(seen[..., None], surfaces, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
             shared = seen.any(axis=0) & np.isfinite(observed[camera, :, 0])
             if shared.sum() >= MIN_SHARED_POINTS:
-                gains[camera] = np.median(observed[camera, shared] - known[shared], axis=0)
-    return np.nan_to_num(gains)
+                gains[camera] = np.median(observed[camera, shared] - of_surface[shared], axis=0)
+    return gains

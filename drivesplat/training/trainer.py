@@ -38,8 +38,8 @@ from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import TrainingScan, scan_index, scan_terms
 from drivesplat.training.views import TrainingView
 
-MEASURED_SCANS, MEASURED_IMAGES = 8, 16
-"""Iterations with scans or images before one is captured: they measure the entries that the lists of any need."""
+MEASURED_SCANS = 8
+"""Iterations with scans before one is captured: they measure the entries that the lists of any need."""
 
 
 @dataclass
@@ -138,8 +138,7 @@ class Trainer:
             alone = Recording("image", (factor, number, self._has_entropy))
             return self._captured(alone, lambda: self._learn(view, step, rates)[0], layout)
         inputs = self.graphs.retry_without_graphs(lambda: self.image_inputs.load(view, states))
-        runs = min(MEASURED_IMAGES, len(self.images.views))
-        image = Recording("image", (inputs.number, self._has_entropy), runs)
+        image = Recording("image", (inputs.number, self._has_entropy), self.image_inputs.measured)
         return self._captured(image, lambda: self._learn(inputs.view, step, rates, inputs.states)[0], layout)
 
     def _fit_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:

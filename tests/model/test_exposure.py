@@ -39,7 +39,7 @@ from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.settings.train_cameras import ExposureSettings
-from drivesplat.training.exposure_init import initial_gains, log_gains
+from drivesplat.training.exposure_init import DISTANCE_STEP, Sightings, initial_gains, log_colors, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
@@ -215,9 +215,31 @@ def test_gains_of_a_rig_are_estimated_from_shared_surfaces():
     shades[1, rng.random(900) < 0.2] += 1.5  # in some places something else stands before the surface
     for camera, (first, last) in enumerate(((0, 400), (300, 700), (600, 800), (800, 900))):
         shades[camera, :first], shades[camera, last:] = np.nan, np.nan
-    found = log_gains(shades)
+    unknown = np.full((4, 3), np.nan)
+    unknown[0] = 0.0
+    found = log_gains(shades, unknown)
     np.testing.assert_allclose(found[:3], true[:3], atol=0.06)
-    assert not found[3].any()
+    assert np.isnan(found[3]).all()
+    kept = unknown.copy()
+    kept[1] = [0.5, 0.5, 0.5]
+    np.testing.assert_array_equal(log_gains(shades, kept)[:2], kept[:2])
+
+
+def test_colors_are_compared_from_equal_distances():
+    """Haze brightens what is far. The first camera sees points from both distances, the second from nearby alone."""
+    points, dark = np.arange(200), np.full((200, 3), 50.0)
+    near, far = np.full(200, 10.0), np.full(200, 40.0)
+    first = Sightings(np.tile(points, 2), np.concatenate([near, far]), np.concatenate([dark, dark + 20.0]))
+    second = Sightings(points, 1.01 * near, dark)
+    np.testing.assert_allclose(np.diff(log_colors([first, second], DISTANCE_STEP), axis=0), 0.0)
+    mixed = log_colors([first, second], math.inf)
+    np.testing.assert_allclose(mixed[1] - mixed[0], np.log(50.0 / 60.0))
+
+
+def test_surfaces_that_one_camera_sees_are_left_out():
+    seen = [Sightings(np.array(own), np.full(len(own), 5.0), np.full((len(own), 3), 100.0)) for own in ([3, 7], [7, 9])]
+    found = log_colors(seen, DISTANCE_STEP)
+    np.testing.assert_allclose(found, np.full((2, 1, 3), np.log(100.0 / 255.0)))
 
 
 @pytest.fixture(scope="module")

@@ -167,3 +167,14 @@ def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
     for eager, mine in zip(*losses, strict=True):
         assert mine == pytest.approx(eager, rel=1e-3)
     assert sum(losses[0][-1].values()) < sum(losses[0][0].values())
+
+
+@pytest.mark.parametrize(
+    ("cameras", "images", "by_camera", "measured"),
+    [(1, 40, True, 16), (6, 40, False, 16), (6, 40, True, 4), (2, 40, True, 8), (3, 2, True, 2), (3, 1, True, 1)],
+)
+def test_cameras_with_their_own_graphs_share_the_images_that_are_measured(cameras, images, by_camera, measured):
+    one = guided_views()[0]
+    views = [dataclasses.replace(one.view, camera=f"CAM_{c}") for c in range(cameras) for _ in range(images)]
+    shared = inputs_for([dataclasses.replace(one, view=view) for view in views], by_camera)
+    assert shared.measured == measured

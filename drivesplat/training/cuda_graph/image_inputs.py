@@ -7,6 +7,7 @@ of LiDAR scans do (`scan_inputs`), into which the image of each iteration is cop
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,6 +17,10 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.time_states import TimeStates
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.views import LidarDepth, TrainingView
+
+MEASURED, MEASURED_OF_CAMERA = 16, 4
+"""Iterations with images before one is captured: they measure the entries that the lists of any need. Where each camera
+has graphs of its own, a camera's share of the first, but no fewer than the second."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,12 @@ class SharedImageInputs:
     images: TrainingImages
     by_camera: bool
     _by_shape: dict[Hashable, ImageInputs] = field(default_factory=dict)
+
+    @cached_property
+    def measured(self) -> int:
+        """The number of iterations before one is captured."""
+        cameras = len({image.view.camera for image in self.images.views}) if self.by_camera else 1
+        return max(1, min(max(MEASURED // cameras, MEASURED_OF_CAMERA), len(self.images.views) // cameras))
 
     def load(self, image: TrainingView, states: TimeStates) -> ImageInputs:
         """The inputs of this shape, which hold an image and its time states from now on."""
