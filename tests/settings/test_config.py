@@ -360,10 +360,10 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
 @pytest.mark.parametrize(
     ("change", "readers"),
     [
-        (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car evaluate"),
+        (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car train evaluate"),
         (
             {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
-            "extract own_car evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer truth_film",
+            "extract own_car train evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer truth_film",
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate"),
@@ -371,7 +371,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
         (
             at("cameras", ["CAM_FRONT", "CAM_BACK"]) | at("holdout.cameras", ["CAM_BACK"]),
-            "extract own_car lidar_seed parser masks actors lidar_depth free_space scans evaluate film",
+            "extract own_car lidar_seed parser masks actors lidar_depth free_space scans train evaluate film",
         ),
         (at("holdout.last_block", 0), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
         (at("extract.on_missing", "warn"), "extract"),
@@ -397,7 +397,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("train.iterations", 9), "train"),
         (at("train.mcmc.noise_lr", 9), "train"),
         (at("train.gaussians.sh_degree", 2), "train"),
-        (at("train.exposure.kind", "affine"), "train"),
+        (at("train.exposure.kind", "none"), "train"),
         (at("methods.vanilla.overrides", {"train": {"iterations": 9}}), "train"),
         (at("methods.another.overrides", {"train": {"iterations": 9}}), "export_viewer"),
         (at("random_seed", 1), "lidar_seed actors train"),
