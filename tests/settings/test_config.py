@@ -363,7 +363,8 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car train evaluate"),
         (
             {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
-            "extract own_car train evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer truth_film",
+            "extract own_car train evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer "
+            "truth_film",
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate"),
