@@ -23,7 +23,7 @@ MIN_SHARED_POINTS = 50
 MAX_POINTS = 100_000
 """More seed points are thinned evenly to at most so many."""
 DISTANCE_STEP = 0.1
-"""Natural logarithm of the ratio of distances from which on a point counts as another surface."""
+"""Width of the intervals of distance within which colours are compared (natural logarithm)."""
 VALID_LEVELS = (8, 247)
 """Levels between which a pixel is neither clipped nor noise."""
 ROUNDS = 8
@@ -55,7 +55,8 @@ def initial_gains(
     gains = np.full((1 + len(cameras), 3), np.nan)
     gains[0] = 0.0
     for step in (DISTANCE_STEP, math.inf):
-        gains = log_gains(log_colors(seen, step), gains)
+        if np.isnan(gains).any():
+            gains = log_gains(log_colors(seen, step), gains)
     found = np.exp(np.nan_to_num(gains))
     for camera, gain in zip(cameras, found[1:], strict=True):
         log.info("%s: gains of %.2f, %.2f, %.2f over %s", camera, *gain, reference)
@@ -87,8 +88,8 @@ def sightings(points: np.ndarray, views: Sequence[TrainingView], cameras: Sequen
 
 def log_colors(seen: Sequence[Sightings], step: float) -> np.ndarray:
     """The logarithm of the mean colour (c, n, 3) that each of c cameras recorded of the n surfaces that several of them
-    saw; NaN where a camera did not see one. A point counts as another surface where distances differ by a factor of
-    exp(`step`)."""
+    saw; NaN where a camera did not see one. A point counts as one surface in each interval of distance: intervals have
+    the width `step` in the natural logarithm of the distance."""
     intervals = [np.floor(np.log(np.maximum(own.distance, 1.0)) / step).astype(np.int64) for own in seen]
     count = 1 + max((int(of_camera.max(initial=0)) for of_camera in intervals), default=0)
     means = [_means_by_key(own.point * count + at, own.color) for own, at in zip(seen, intervals, strict=True)]

@@ -160,7 +160,8 @@ class StreetSnapshot:
         for moving in caster._moving:
             if moving.item.name not in without:
                 poses = moving.item.poses(seconds)
-                self._moving.append((moving, poses, poses[:, None] @ moving.item.limb_poses(seconds)))
+                centers = moving.sphere.centers(poses)
+                self._moving.append((moving, centers, poses[:, None] @ moving.item.limb_poses(seconds)))
 
     def cast(self, rays: Rays) -> RayHits:
         """The first hit of each ray."""
@@ -198,8 +199,8 @@ class StreetSnapshot:
         `origins` are those of moments (m, 3), or of rays (n, 3) where `per_ray`."""
         passing = partial(_passing, directions, moment, origins, per_ray)
         every = np.arange(len(directions))
-        for moving, of_object, of_pieces in self._moving:
-            near = passing(every, moving.sphere.centers(of_object), moving.sphere.radius**2)
+        for moving, centers, of_pieces in self._moving:
+            near = passing(every, centers, moving.sphere.radius**2)
             if not len(near):
                 continue
             for number, (piece, sphere) in enumerate(zip(moving.pieces, moving.spheres, strict=True)):
