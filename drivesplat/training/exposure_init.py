@@ -116,14 +116,25 @@ def log_gains(observed: np.ndarray, known: np.ndarray) -> np.ndarray:
     Iterates over cameras: the median difference to the mean of the cameras known so far. NaN where too few points are
     shared.
     """
-    gains, wanted = known.copy(), np.flatnonzero(np.isnan(known[:, 0]))
+    gains, seen = known.copy(), np.isfinite(observed[..., 0])
+    surfaces = [np.flatnonzero(of_camera) for of_camera in seen]
+    colors = [own[of_camera] for own, of_camera in zip(observed, surfaces, strict=True)]
+    sums, counts = np.zeros(observed.shape[1:]), np.zeros(observed.shape[1], dtype=np.int64)
+    for camera in np.flatnonzero(np.isfinite(known[:, 0])):
+        sums[surfaces[camera]] += colors[camera] - gains[camera]
+        counts[surfaces[camera]] += 1
     for _ in range(ROUNDS):
-        for camera in wanted:
-            others = [i for i in range(len(observed)) if i != camera and np.isfinite(gains[i, 0])]
-            surfaces = observed[others] - gains[others, None]
-            seen = np.isfinite(surfaces[..., 0])
-            of_surface = np.where(seen[..., None], surfaces, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
-            shared = seen.any(axis=0) & np.isfinite(observed[camera, :, 0])
+        for camera in np.flatnonzero(np.isnan(known[:, 0])):
+            at, own, has_gain = surfaces[camera], colors[camera], np.isfinite(gains[camera, 0])
+            if has_gain:
+                sums[at] -= own - gains[camera]
+                counts[at] -= 1
+            shared = counts[at] > 0
             if shared.sum() >= MIN_SHARED_POINTS:
-                gains[camera] = np.median(observed[camera, shared] - of_surface[shared], axis=0)
+                of_others = sums[at[shared]] / counts[at[shared], None]
+                gains[camera] = np.median(own[shared] - of_others, axis=0)
+                has_gain = True
+            if has_gain:
+                sums[at] += own - gains[camera]
+                counts[at] += 1
     return gains

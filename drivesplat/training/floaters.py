@@ -3,6 +3,7 @@ road hides it."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,6 +16,10 @@ LARGEST_STEP = 15.0
 """Maximum distance in metres between consecutive positions that a path connects."""
 PAIRS = 2**21
 """Number of pairs of points and segments per batch: 25 MB an array."""
+MIN_EDGE = 0.5
+"""Metres: the minimum edge of the cells around a path."""
+ROUNDING = 0.01
+"""Metres, more than the rounding of world coordinates in single precision."""
 
 
 def sensor_path(centers: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
@@ -43,25 +48,66 @@ def near_path(
 
 
 @dataclass(frozen=True)
-class EmptySpace:
-    """Space in which nothing is seen: within `radius` metres (0: none) of the path of sensors from `starts` to `ends`
-    (m, 3), the cells of `free` in world metres (None: none), and below the `road` (None: unknown)."""
+class SensorPath:
+    """The space within `radius` metres of the path of sensors, from `starts` to `ends` (m, 3). Its `cells` hold all of
+    it, and little else: only points in them are compared with the segments."""
 
     starts: Float[Tensor, "m 3"]
     ends: Float[Tensor, "m 3"]
     radius: float
+    cells: SparseGrid
+
+    @classmethod
+    def of(cls, centers: Float[Tensor, "n 3"], radius: float) -> "SensorPath":
+        """Around the path through the positions of sensors (metres), in time order; `radius` is greater than 0."""
+        starts, ends = sensor_path(centers)
+        cells = cells_around(starts.double().cpu().numpy(), ends.double().cpu().numpy(), radius)
+        return cls(starts, ends, radius, cells.to(centers.device))
+
+    def holds(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """The mask of points within it."""
+        held = self.cells.lookup(points)[1]
+        candidates = held.nonzero()[:, 0]
+        held[candidates] = near_path(points[candidates], self.starts, self.ends, self.radius)
+        return held
+
+
+def cells_around(starts: Float[np.ndarray, "m 3"], ends: Float[np.ndarray, "m 3"], radius: float) -> SparseGrid:
+    """Cells that hold all points within `radius` metres of any of the segments; on the CPU."""
+    edge = max(radius, MIN_EDGE)
+    counts = 1 + np.ceil(np.linalg.norm(ends - starts, axis=1) / (0.5 * edge)).astype(np.int64)
+    segment = np.repeat(np.arange(len(starts)), counts)
+    number = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
+    fraction = (number / np.maximum(counts[segment] - 1, 1))[:, None]
+    samples = starts[segment] + fraction * (ends - starts)[segment]
+    reach = radius + 0.25 * edge + ROUNDING  # each place of a segment is at most a quarter of an edge from a sample
+    lower = samples.min(axis=0) - reach
+    first, last = (np.floor((samples + side - lower) / edge).astype(np.int64) for side in (-reach, reach))
+    shape = last.max(axis=0) + 1
+    offsets = np.stack(np.meshgrid(*[np.arange((last - first).max() + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.minimum(first[:, None] + offsets, last[:, None]).reshape(-1, 3)
+    return SparseGrid.from_numpy(lower, edge, shape, np.unique(np.ravel_multi_index(cells.T, shape)))
+
+
+@dataclass(frozen=True)
+class EmptySpace:
+    """Space in which nothing is seen: along the `path` of sensors, the cells of `free` in world metres, and below the
+    `road`; each None where it is unknown or not wanted."""
+
+    path: SensorPath | None = None
     free: SparseGrid | None = None
     road: Road | None = None
 
     @property
     def known(self) -> bool:
         """Whether any space is known to be empty."""
-        return self.radius > 0 or self.free is not None or self.road is not None
+        return self.path is not None or self.free is not None or self.road is not None
 
     def holds(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """The mask of points in empty space."""
-        segments = (self.starts, self.ends) if self.radius > 0 else (self.starts[:0], self.ends[:0])
-        held = near_path(points, *segments, self.radius)
+        held = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        if self.path is not None:
+            held = held | self.path.holds(points)
         if self.free is not None:
             held = held | self.free.lookup(points)[1]
         return held if self.road is None else held | self.road.is_above(points)

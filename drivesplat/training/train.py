@@ -20,7 +20,7 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
-from drivesplat.training.floaters import EmptySpace, fade_floaters, sensor_path
+from drivesplat.training.floaters import EmptySpace, SensorPath, fade_floaters
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor
 from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
@@ -205,7 +205,8 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     sensors = trainer.sensor_positions
     below = trainer.priors.road if settings.floaters.below_road else None
-    empty = EmptySpace(*sensor_path(sensors), settings.floaters.radius, trainer.priors.free, below)
+    driven = SensorPath.of(sensors, settings.floaters.radius) if settings.floaters.radius else None
+    empty = EmptySpace(driven, trainer.priors.free, below)
     reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
     while trainer.step < trainer.iterations:
         with trainer.clock.stage(ITERATION):

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from drivesplat.kernels.morton import morton_order
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
 from drivesplat.model.sky import CubemapSky, logit_of
@@ -138,11 +139,17 @@ class _TexelColors:
 def _nearest_means(
     places: Float[Tensor, "n 3"], values: Float[Tensor, "n v"], wanted: Float[Tensor, "m 3"], neighbours: int
 ) -> Float[Tensor, "m v"]:
-    """The means of the `values` of the nearest of `places`, by inverse square distance, at the places `wanted`."""
-    tree = cKDTree(places.cpu().numpy(), compact_nodes=False, balanced_tree=False)
+    """The means of the `values` of the nearest of `places`, by inverse square distance, at the places `wanted`.
+
+    Both are searched in Morton order: what is near is then near in memory, too.
+    """
+    of_places, of_wanted = morton_order(places), morton_order(wanted)
+    tree = cKDTree(places[of_places].cpu().numpy(), compact_nodes=False, balanced_tree=False)
     count = np.arange(1, min(neighbours, len(places)) + 1)
-    distances, nearest = tree.query(wanted.cpu().numpy(), k=count, workers=torch.get_num_threads())
+    distances, nearest = tree.query(wanted[of_wanted].cpu().numpy(), k=count, workers=torch.get_num_threads())
     weights = 1.0 / (distances**2 + 1e-6)
     weights /= weights.sum(axis=1, keepdims=True)
-    found = (weights[..., None] * values.cpu().numpy()[nearest]).sum(axis=1)
-    return torch.from_numpy(found).to(values)
+    means = (weights[..., None] * values[of_places].cpu().numpy()[nearest]).sum(axis=1)
+    found = torch.empty(len(wanted), values.shape[1], dtype=values.dtype, device=values.device)
+    found[of_wanted] = torch.from_numpy(means).to(values)
+    return found

@@ -10,7 +10,7 @@ from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.model.background import Background
 from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
 from drivesplat.settings.train_geometry import RoadSettings
-from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, fade_floaters, near_path, sensor_path
+from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, SensorPath, fade_floaters, near_path, sensor_path
 from drivesplat.training.road import driven_road
 
 
@@ -58,11 +58,26 @@ def test_a_lone_position_is_a_path():
     assert near_path(torch.tensor([[1.2, 2.0, 3.0], [2.2, 2.0, 3.0]]), starts, ends, 0.5).tolist() == [True, False]
 
 
+@pytest.mark.parametrize("radius", [0.05, 0.7, 1.0, 4.0])
+def test_cells_around_a_path_hold_all_that_is_near(radius):
+    """The points lie around a path whose positions are up to 20 m apart, many of them on its border."""
+    rng = np.random.default_rng(1)
+    centers = np.array([1000.0, -2000.0, 30.0]) + rng.uniform(-12, 12, (30, 3)).cumsum(axis=0)
+    at, towards = centers[rng.integers(0, 30, 20_000)], rng.normal(size=(20_000, 3))
+    distances = radius * rng.choice([0.3, 0.999, 1.001, 1.5], 20_000) / np.linalg.norm(towards, axis=1)
+    along = rng.uniform(-0.2, 1.2, (20_000, 1)) * rng.uniform(-12, 12, (20_000, 3))
+    points = torch.from_numpy(np.concatenate([at + distances[:, None] * towards, at + along])).float()
+    centers = torch.from_numpy(centers).float()
+    held = SensorPath.of(centers, radius).holds(points)
+    assert torch.equal(held, near_path(points, *sensor_path(centers), radius))
+    assert held.any() and not held.all()
+
+
 def test_only_floaters_near_the_path_fade_and_the_rest_stays():
     positions = np.array([[0.0, 0.3, 0.0], [2.0, 0.0, 0.5], [2.0, 3.0, 0.0], [9.0, 0.0, 0.0]])
     part = Background.from_points(positions, np.full((4, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     before = {name: value.detach().clone() for name, value in part.params.items()}
-    fade_floaters(part, EmptySpace(*sensor_path(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])), 1.0))
+    fade_floaters(part, EmptySpace(SensorPath.of(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), 1.0)))
     opacities = part.at(0.0).opacities.detach()
     assert (opacities[:2] < 1e-3).all()
     torch.testing.assert_close(opacities[2:], torch.tensor([0.6, 0.6]))
@@ -72,7 +87,7 @@ def test_only_floaters_near_the_path_fade_and_the_rest_stays():
 
 def test_a_faded_gaussian_is_under_what_the_strategies_take_for_dead():
     part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
-    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 1.0))
+    fade_floaters(part, EmptySpace(SensorPath.of(torch.zeros(1, 3), 1.0)))
     opacity = float(part.at(0.0).opacities.detach())
     assert opacity < min(McmcSettings().min_opacity, DefaultSettings().prune_opacity)
 
@@ -81,14 +96,14 @@ def test_fading_never_brightens():
     part = Background.from_points(np.zeros((2, 3)), np.full((2, 3), 0.5), GaussianSettings(), 1.0)
     with torch.no_grad():
         part.params["opacities"].copy_(torch.tensor([-30.0, 2.0]))
-    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 1.0))
+    fade_floaters(part, EmptySpace(SensorPath.of(torch.zeros(1, 3), 1.0)))
     assert float(part.params["opacities"].detach()[0]) == -30.0
 
 
 def test_a_faded_parameter_can_still_learn():
     part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
     before = part.params["opacities"]
-    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 1.0))
+    fade_floaters(part, EmptySpace(SensorPath.of(torch.zeros(1, 3), 1.0)))
     assert part.params["opacities"] is before and before.requires_grad and before.is_leaf
 
 
@@ -106,7 +121,8 @@ def test_gaussians_fade_whose_centres_lie_in_space_proven_empty(radius, faded):
     part = Background.from_points(positions, np.full((5, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     with torch.no_grad():
         part.params["scales"][3:] += 5.0
-    fade_floaters(part, EmptySpace(*sensor_path(torch.tensor([[0.0, 0.0, 0.0]])), radius, free_cells()))
+    path = SensorPath.of(torch.tensor([[0.0, 0.0, 0.0]]), radius) if radius else None
+    fade_floaters(part, EmptySpace(path, free_cells()))
     opacities = part.at(0.0).opacities.detach()
     assert (opacities < 1e-3).nonzero()[:, 0].tolist() == faded
 
@@ -120,12 +136,11 @@ def test_gaussians_fade_that_the_road_hides():
         [[8.0, 5.0, 0.4], [8.0, 5.0, 0.6], [1.0, 1.0, -4.0], [8.0, 5.0, 3.0], [-1.0, 5.0, -4.0], [5.0, 5.0, -6.0]]
     )
     part = Background.from_points(positions, np.full((6, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
-    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 0.0, road=road))
+    fade_floaters(part, EmptySpace(road=road))
     assert (part.at(0.0).opacities.detach() < 1e-3).nonzero()[:, 0].tolist() == [0, 2]
 
 
 def test_nothing_is_known_to_be_empty_without_a_radius_and_free_space():
-    path = sensor_path(torch.zeros(1, 3))
-    assert not EmptySpace(*path, 0.0).known
-    assert EmptySpace(*path, 1.0).known and EmptySpace(*path, 0.0, free_cells()).known
-    assert EmptySpace(*path, 0.0, road=driven_road(np.eye(4)[None], RoadSettings())).known
+    assert not EmptySpace().known
+    assert EmptySpace(SensorPath.of(torch.zeros(1, 3), 1.0)).known and EmptySpace(free=free_cells()).known
+    assert EmptySpace(road=driven_road(np.eye(4)[None], RoadSettings())).known
