@@ -13,7 +13,7 @@ MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
     "train": {
-        "iterations": 1_000,
+        "iterations": 800,
         "cap_max": 40_000,
         "checkpoint_apart_s": 10.0,
         "image_every": 250,

@@ -38,7 +38,8 @@ Parts = Annotated[
 
 
 class GaussianSettings(Settings):
-    """Initial values and learning rates of Gaussians. Learning rates are those of gsplat's example trainer."""
+    """Initial values and learning rates of Gaussians. Learning rates are those of gsplat's example trainer, those of
+    scales and rotations twice as high (docs/measured.md)."""
 
     sh_degree: int = Field(1, ge=0, le=3)
     """Degree of the spherical harmonics of the colours. A drive shows objects from few directions; degree 3 gives the
@@ -50,9 +51,9 @@ class GaussianSettings(Settings):
     Small and faint seeds give higher PSNR where LiDAR is dense."""
     lr_means: float = Field(1.6e-4, gt=0)
     """Learning rate of positions, in units of the scene scale. Decays exponentially to a hundredth."""
-    lr_scales: float = Field(5e-3, gt=0)
+    lr_scales: float = Field(1e-2, gt=0)
     """Learning rate of log scales."""
-    lr_quats: float = Field(1e-3, gt=0)
+    lr_quats: float = Field(2e-3, gt=0)
     """Learning rate of rotations."""
     lr_opacities: float = Field(5e-2, gt=0)
     """Learning rate of opacity logits."""
