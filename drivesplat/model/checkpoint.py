@@ -19,9 +19,6 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 
 RULE = "train"
-MAX_SCALE = 0.1
-"""Maximum standard deviation of Gaussians in renderings of trained models, as a fraction of their distance from the
-camera: docs/off_the_lane.md."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +61,7 @@ def trained_model(checkpoint: TrainedCheckpoint) -> SplatModel:
 
 
 def open_model(checkpoint: TrainedCheckpoint, device_settings: DeviceSettings) -> tuple[SplatModel, torch.device]:
-    """The model in a checkpoint, without gradients, on the device that the settings choose. Its renderings limit the
-    size of Gaussians to MAX_SCALE.
+    """The model in a checkpoint, without gradients, on the device that the settings choose.
 
     Raises DeviceError where that device is missing or its memory is exhausted.
 
@@ -80,6 +76,5 @@ def open_model(checkpoint: TrainedCheckpoint, device_settings: DeviceSettings) -
     """
     device = choose_device(device_settings, min_free_gb=0.0)
     model = trained_model(checkpoint)
-    model.max_scale = MAX_SCALE
     with explain_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device

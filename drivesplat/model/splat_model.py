@@ -17,7 +17,7 @@ from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
-from drivesplat.model.view import View, depth_at_lines, limited_scales, where_seen
+from drivesplat.model.view import View, depth_at_lines, where_seen
 from drivesplat.rasterization import Rendering, rasterize
 
 
@@ -44,9 +44,6 @@ class Picture:
 class SplatModel(nn.Module):
     """Parts, a sky (None: black), exposures of cameras (None: all alike), pose corrections (None: recorded poses).
     Without `rolling_shutter`, views are rendered as if they had a global shutter."""
-
-    max_scale: float | None = None
-    """Renderings limit the size of Gaussians (`limited_scales`); None, as in training: they do not."""
 
     def __init__(
         self,
@@ -279,11 +276,10 @@ class SplatModel(nn.Module):
 
     def _placed(self, gaussians: Gaussians, seen_from: View) -> dict[str, Any]:
         """The arguments of the rasterizer for Gaussians in a view, without their colours."""
-        shown = where_seen(gaussians, seen_from)
-        scales = shown.scales if self.max_scale is None else limited_scales(shown, seen_from, self.max_scale)
+        means, scales = where_seen(gaussians, seen_from)
         camera = {"viewmats": seen_from.viewmat[None], "Ks": seen_from.K[None]}
         size = {"width": seen_from.width, "height": seen_from.height}
-        shapes = {"means": shown.means, "quats": gaussians.quats, "scales": scales, "opacities": gaussians.opacities}
+        shapes = {"means": means, "quats": gaussians.quats, "scales": scales, "opacities": gaussians.opacities}
         return {**shapes, **camera, **size, "antialiased": self.antialiased}
 
 
