@@ -78,6 +78,7 @@ def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, sett
         _exposures(init.exposed, settings),
         _camera_poses(init.posed, settings),
         settings.rolling_shutter,
+        settings.max_scale,
     )
 
 
@@ -106,6 +107,7 @@ def rebuild_model(
         _exposures(exposed, settings),
         _camera_poses(posed, settings),
         settings.rolling_shutter,
+        settings.max_scale,
     )
     model.load_state_dict(state)
     return model

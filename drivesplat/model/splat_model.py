@@ -17,7 +17,7 @@ from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
-from drivesplat.model.view import View, depth_at_lines, where_seen
+from drivesplat.model.view import View, depth_at_lines, limited_scales, where_seen
 from drivesplat.rasterization import Rendering, rasterize
 
 
@@ -43,7 +43,8 @@ class Picture:
 
 class SplatModel(nn.Module):
     """Parts, a sky (None: black), exposures of cameras (None: all alike), pose corrections (None: recorded poses).
-    Without `rolling_shutter`, views are rendered as if they had a global shutter."""
+    Without `rolling_shutter`, views are rendered as if they had a global shutter. With `max_scale` above 0, Gaussians
+    in images have `limited_scales`."""
 
     def __init__(
         self,
@@ -53,6 +54,7 @@ class SplatModel(nn.Module):
         exposure: Exposures | None = None,
         camera_poses: CameraPoses | None = None,
         rolling_shutter: bool = True,
+        max_scale: float = 0.0,
     ):
         super().__init__()
         self.parts = nn.ModuleList(parts)
@@ -61,6 +63,7 @@ class SplatModel(nn.Module):
         self.camera_poses = camera_poses
         self.antialiased = antialiased
         self.rolling_shutter = rolling_shutter
+        self.max_scale = max_scale
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
@@ -276,10 +279,11 @@ class SplatModel(nn.Module):
 
     def _placed(self, gaussians: Gaussians, seen_from: View) -> dict[str, Any]:
         """The arguments of the rasterizer for Gaussians in a view, without their colours."""
-        means, scales = where_seen(gaussians, seen_from)
+        shown = where_seen(gaussians, seen_from)
+        scales = limited_scales(shown, seen_from, self.max_scale) if self.max_scale else shown.scales
         camera = {"viewmats": seen_from.viewmat[None], "Ks": seen_from.K[None]}
         size = {"width": seen_from.width, "height": seen_from.height}
-        shapes = {"means": means, "quats": gaussians.quats, "scales": scales, "opacities": gaussians.opacities}
+        shapes = {"means": shown.means, "quats": gaussians.quats, "scales": scales, "opacities": gaussians.opacities}
         return {**shapes, **camera, **size, "antialiased": self.antialiased}
 
 

@@ -131,6 +131,16 @@ def where_seen(gaussians: Gaussians, view: View) -> Shown:
     return Shown(gaussians.means + displacement, gaussians.scales * factor)
 
 
+def limited_scales(shown: Shown, view: View, max_scale: float) -> Float[Tensor, "n 3"]:
+    """The standard deviations of Gaussians in a view, at most `max_scale` times their distance from its camera.
+
+    Splatting linearises the projection at the centre of a Gaussian, and sorts by the depth of its centre. Where it is
+    large for its distance, its image is wrong: a disc on the road rises above the road and hides what stands on it.
+    """
+    distances = (shown.means.detach() - view.camera_to_world[:3, 3]).norm(dim=1, keepdim=True)
+    return torch.minimum(shown.scales, max_scale * distances)
+
+
 def depth_at_lines(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w"]:
     """The depth of resting surfaces at the time of each line, of their depth at the view's timestamp; 0 stays 0."""
     if view.shutter is None or view.turning_by_line is None:

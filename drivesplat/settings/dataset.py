@@ -18,6 +18,7 @@ DEMO_OVERRIDES = {
         "checkpoint_apart_s": 10.0,
         "image_every": 250,
         "psnr_every": 200,
+        "max_scale": 0.1,
     },
     "render": {"fps": 12, "width": 576, "height": 324, "compare": False},
     "device": {"min_free_gb": 1.0},

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.deformable import FieldName, GaitSettings, LatticeSettings, NetworkSettings
 from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train_cameras import CameraPoseSettings, ExposureSettings
@@ -129,21 +130,6 @@ class DeformableSettings(ActorSettings):
         return super().for_scene(cap, objects, views).model_copy(update={"lattice": lattice})
 
 
-class CoarseToFineSettings(Settings):
-    """Trains with reduced images and fewer Gaussians at first, so that early iterations are faster (after DashGaussian,
-    Chen et al. 2025, arXiv 2503.18402)."""
-
-    quarter_until: float = Field(0.2, ge=0, le=1)
-    """Fraction of the iterations that use images of a quarter of the width and height."""
-    half_until: float = Field(0.7, ge=0, le=1)
-    """Fraction of the iterations after which images have full size. Before it they have half the width and height."""
-    least_height: int = Field(225, ge=16)
-    """Minimum number of rows of a reduced image. 900 rows are reduced to 225; images of 640x360 are not reduced."""
-    share: float = Field(0.6, gt=0, le=1)
-    """Fraction of the Gaussian limit that applies while images are reduced, with strategy: mcmc. The full limit
-    applies early enough for the number of Gaussians to reach it before densification stops."""
-
-
 class McmcSettings(Settings):
     """strategy: mcmc. 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024), gsplat's
     MCMCStrategy."""
@@ -250,6 +236,9 @@ class TrainSettings(Settings):
     """Learning rate of the sky's colours (logits)."""
     antialiased: bool = False
     """Use Mip-Splatting's 2D filter instead of the dilation of 3DGS."""
+    max_scale: float = Field(0.0, ge=0)
+    """Maximum standard deviation of Gaussians in images, as a fraction of their distance from the camera: larger ones
+    are rendered as smaller ones. 0 = no limit. For few Gaussians; it may open holes (docs/off_the_lane.md)."""
     rolling_shutter: bool = True
     """Render the rolling shutter of cameras whose dataset states its readout time and direction: each Gaussian where
     it is at the time of its line. false: as if all lines were recorded at the image's timestamp."""

@@ -231,18 +231,19 @@ def test_concatenating_one_set_copies_nothing():
 
 
 @pytest.mark.parametrize("sh_degree", [0, 2])
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(("antialiased", "max_scale"), [(False, 0.0), (True, 0.0), (False, 0.05)])
 @pytest.mark.parametrize("sky", ["none", "mask", "cubemap"])
-def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, sh_degree):
-    settings = TrainSettings(
-        antialiased=antialiased, sky_resolution=4, gaussians=GaussianSettings(sh_degree=sh_degree, init_scale=0.5)
-    )
+def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, max_scale, sh_degree):
+    gaussians = GaussianSettings(sh_degree=sh_degree, init_scale=0.5)
+    settings = TrainSettings(antialiased=antialiased, max_scale=max_scale, sky_resolution=4, gaussians=gaussians)
     model = shaken(build_model(model_init(parser_record(40)), ("background",), sky, settings))
     rebuilt = rebuild_model(model.state_dict(), definitions(model), sky, settings)
     picture, again = (m.render(a_view(), sh_degree, with_depth=True) for m in (model, rebuilt))
     assert float(picture.alpha.detach().max()) > 0.3
     assert torch.equal(again.image, picture.image) and torch.equal(again.depth, picture.depth)
     assert rebuilt.parts[0].learning_rates() == model.parts[0].learning_rates()
+    unlimited = SplatModel([*model.parts], model.sky, antialiased).render(a_view(), sh_degree)
+    assert torch.equal(unlimited.image, picture.image) == (not max_scale)
 
 
 def a_track(name: str = "it", start: float = 0.0) -> ActorTrack:
@@ -491,3 +492,28 @@ def test_a_model_is_initialised_with_at_most_its_cap():
 def test_gaussians_are_capped_by_the_training_pixels(cap_max, pixels_per_gaussian, expected):
     settings = TrainSettings(cap_max=cap_max, pixels_per_gaussian=pixels_per_gaussian)
     assert gaussian_cap(parser_record(5), settings) == expected
+
+
+def test_with_a_limit_a_large_gaussian_is_shown_as_a_smaller_one_and_others_stay():
+    """Three Gaussians of 2 m, 5, 20 and 103 m away: with 0.1 the first is limited to 0.5 m."""
+    places, view = (
+        [[5.0, 0.0, 0.0], [20.0, 4.0, 0.0], [100.0, -25.0, 0.0]],
+        looking_at([1.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+    )
+    full = SplatModel([round_gaussians(places, [2.0, 2.0, 2.0])], None)
+    limited = SplatModel([round_gaussians(places, [2.0, 2.0, 2.0])], None, max_scale=0.1)
+    smaller = SplatModel([round_gaussians(places, [0.5, 2.0, 2.0])], None)
+    with torch.no_grad():
+        shown, expected = (model.render(view, with_surface_depth=True) for model in (limited, smaller))
+        assert float((full.render(view).alpha - shown.alpha).max()) > 0.3
+    torch.testing.assert_close(shown.alpha, expected.alpha)
+    torch.testing.assert_close(shown.surface_depth, expected.surface_depth)
+    assert torch.equal(shown.gaussians.scales, limited.gaussians_in(view).scales), "the model itself stays as it is"
+
+
+def test_a_limited_gaussian_has_a_gradient_for_its_colour_and_none_for_its_size():
+    model = SplatModel([round_gaussians([[5.0, 0.0, 0.0], [20.0, 4.0, 0.0]], [2.0, 1.0])], None, max_scale=0.1)
+    model.render(looking_at([1.0, 0.0, 0.0], [0.0, 0.0, 0.0])).image.sum().backward()
+    scales, colors = (model.parts[0].params[name].grad for name in ("scales", "sh0"))
+    assert float(scales[0].abs().max()) == 0.0 and float(scales[1].abs().max()) > 0.0
+    assert float(colors[0].abs().max()) > 0.0
