@@ -22,7 +22,7 @@ def test_defaults_are_not_reported():
 
 def test_a_setting_that_a_dataset_overrides_is_reported_once_with_its_place():
     assert sentences(DEMO, train={"iterations": 3000}) == [
-        "train.iterations: 3000 does not hold for dataset demo, where datasets.demo.overrides.train.iterations is 1000"
+        "train.iterations: 3000 does not hold for dataset demo, where datasets.demo.overrides.train.iterations is 800"
     ]
     assert sentences(REAL, train={"iterations": 3000}) == [], "no scene of the demo takes part"
 
@@ -43,7 +43,7 @@ def test_a_setting_given_where_it_applies_is_not_reported(dataset):
 def test_a_setting_overridden_by_dataset_and_method_is_reported_for_both():
     overrides = {"methods": {"vanilla": {"overrides": {"train": {"iterations": 500}}}}}
     found = sentences(DEMO, train={"iterations": 3000}, **overrides)
-    assert [line.rsplit(" ", 1)[1] for line in found] == ["1000", "500"], "the demo's, and that method's"
+    assert [line.rsplit(" ", 1)[1] for line in found] == ["800", "500"], "the demo's, and that method's"
 
 
 def test_variants_of_an_ablation_differ_on_purpose():
