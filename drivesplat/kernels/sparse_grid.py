@@ -43,3 +43,14 @@ class SparseGrid:
             key = key * count + torch.where(inside, cell[:, axis], 0.0).long()
         index = torch.searchsorted(self.keys, key).clamp(max=len(self.keys) - 1)
         return index, within & (self.keys[index] == key)
+
+
+def dilated(cells: Int[np.ndarray, "n d"], shape: Int[np.ndarray, " d"], reach: int) -> Int[np.ndarray, "m d"]:
+    """The `cells` of a grid of a shape, and all others whose index along every axis is within `reach` of that of one of
+    them, in row-major order."""
+    steps = np.arange(-reach, reach + 1)
+    for axis, count in enumerate(shape):
+        moved = np.repeat(cells, len(steps), axis=0)
+        moved[:, axis] = np.clip(moved[:, axis] + np.tile(steps, len(cells)), 0, count - 1)
+        cells = np.stack(np.unravel_index(np.unique(np.ravel_multi_index(moved.T, shape)), shape), axis=1)
+    return cells

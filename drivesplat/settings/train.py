@@ -238,7 +238,7 @@ class TrainSettings(Settings):
     """Use Mip-Splatting's 2D filter instead of the dilation of 3DGS."""
     max_scale: float = Field(0.0, ge=0)
     """Maximum standard deviation of Gaussians in images, as a fraction of their distance from the camera: larger ones
-    are rendered as smaller ones. 0 = no limit. For few Gaussians; it may open holes (docs/off_the_lane.md)."""
+    are rendered as smaller ones. 0 = no limit. A limit may open holes (docs/off_the_lane.md)."""
     rolling_shutter: bool = True
     """Render the rolling shutter of cameras whose dataset states its readout time and direction: each Gaussian where
     it is at the time of its line. false: as if all lines were recorded at the image's timestamp."""

@@ -120,21 +120,22 @@ def log_gains(observed: np.ndarray, known: np.ndarray) -> np.ndarray:
     surfaces = [np.flatnonzero(of_camera) for of_camera in seen]
     colors = [own[of_camera] for own, of_camera in zip(observed, surfaces, strict=True)]
     sums, counts = np.zeros(observed.shape[1:]), np.zeros(observed.shape[1], dtype=np.int64)
-    for camera in np.flatnonzero(np.isfinite(known[:, 0])):
-        sums[surfaces[camera]] += colors[camera] - gains[camera]
-        counts[surfaces[camera]] += 1
+
+    def count_in(camera: int, times: int) -> None:
+        """Adds (1) or subtracts (-1) the colours of a camera with a known gain, without this gain."""
+        if np.isfinite(gains[camera, 0]):
+            sums[surfaces[camera]] += times * (colors[camera] - gains[camera])
+            counts[surfaces[camera]] += times
+
+    for camera in range(len(observed)):
+        count_in(camera, 1)
     for _ in range(ROUNDS):
-        for camera in np.flatnonzero(np.isnan(known[:, 0])):
-            at, own, has_gain = surfaces[camera], colors[camera], np.isfinite(gains[camera, 0])
-            if has_gain:
-                sums[at] -= own - gains[camera]
-                counts[at] -= 1
+        for camera in np.flatnonzero(np.isnan(known[:, 0])).tolist():
+            count_in(camera, -1)
+            at = surfaces[camera]
             shared = counts[at] > 0
             if shared.sum() >= MIN_SHARED_POINTS:
                 of_others = sums[at[shared]] / counts[at[shared], None]
-                gains[camera] = np.median(own[shared] - of_others, axis=0)
-                has_gain = True
-            if has_gain:
-                sums[at] += own - gains[camera]
-                counts[at] += 1
+                gains[camera] = np.median(colors[camera][shared] - of_others, axis=0)
+            count_in(camera, 1)
     return gains

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from drivesplat.kernels.road_distance import Road
-from drivesplat.kernels.sparse_grid import SparseGrid
+from drivesplat.kernels.sparse_grid import SparseGrid, dilated
 from drivesplat.model.part import Part
 
 LARGEST_STEP = 15.0
@@ -80,13 +80,12 @@ def cells_around(starts: Float[np.ndarray, "m 3"], ends: Float[np.ndarray, "m 3"
     number = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
     fraction = (number / np.maximum(counts[segment] - 1, 1))[:, None]
     samples = starts[segment] + fraction * (ends - starts)[segment]
-    reach = radius + 0.25 * edge + ROUNDING  # each place of a segment is at most a quarter of an edge from a sample
-    lower = samples.min(axis=0) - reach
-    first, last = (np.floor((samples + side - lower) / edge).astype(np.int64) for side in (-reach, reach))
-    shape = last.max(axis=0) + 1
-    offsets = np.stack(np.meshgrid(*[np.arange((last - first).max() + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    cells = np.minimum(first[:, None] + offsets, last[:, None]).reshape(-1, 3)
-    return SparseGrid.from_numpy(lower, edge, shape, np.unique(np.ravel_multi_index(cells.T, shape)))
+    # each place of a segment is at most a quarter of an edge from a sample
+    reach = int(np.ceil((radius + 0.25 * edge + ROUNDING) / edge))
+    lower = samples.min(axis=0) - reach * edge
+    shape = np.floor((samples.max(axis=0) - lower) / edge).astype(np.int64) + reach + 1
+    cells = dilated(np.floor((samples - lower) / edge).astype(np.int64), shape, reach)
+    return SparseGrid.from_numpy(lower, edge, shape, np.ravel_multi_index(cells.T, shape))
 
 
 @dataclass(frozen=True)

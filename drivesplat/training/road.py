@@ -9,11 +9,11 @@ import logging
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from drivesplat.kernels.road_distance import Road
-from drivesplat.kernels.sparse_grid import SparseGrid
+from drivesplat.kernels.sparse_grid import SparseGrid, dilated
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train_geometry import RoadSettings
@@ -69,7 +69,8 @@ def lidar_road(points: Float[np.ndarray, "n 3"], settings: RoadSettings) -> Road
         return Road(nothing, torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), settings.reach)
     lower = np.floor((planes.places.min(axis=0) - NEAR_PLANE) / LIDAR_CELL) * LIDAR_CELL
     shape = np.ceil((planes.places.max(axis=0) + NEAR_PLANE - lower) / LIDAR_CELL).astype(np.int64)
-    cells = _cells_around(np.floor((planes.places - lower) / LIDAR_CELL).astype(np.int64), shape)
+    reach = int(NEAR_PLANE / LIDAR_CELL + 0.5)
+    cells = dilated(np.floor((planes.places - lower) / LIDAR_CELL).astype(np.int64), shape, reach)
     centres = lower + (cells + 0.5) * LIDAR_CELL
     distances, nearest = cKDTree(planes.places).query(centres, distance_upper_bound=NEAR_PLANE)
     near = np.isfinite(distances)
@@ -78,18 +79,6 @@ def lidar_road(points: Float[np.ndarray, "n 3"], settings: RoadSettings) -> Road
     return Road(
         SparseGrid.from_numpy(lower, LIDAR_CELL, shape, keys), normals, offsets, torch.ones(len(keys)), settings.reach
     )
-
-
-def _cells_around(cells: Int[np.ndarray, "n 2"], shape: Int[np.ndarray, "2"]) -> Int[np.ndarray, "m 2"]:
-    """The `cells` of a grid of a shape, and all others whose row and column are within NEAR_PLANE of those of one of
-    them, in row-major order."""
-    reach = int(NEAR_PLANE / LIDAR_CELL + 0.5)
-    steps = np.arange(-reach, reach + 1)
-    for axis, count in enumerate(shape):
-        moved = np.repeat(cells, len(steps), axis=0)
-        moved[:, axis] = np.clip(moved[:, axis] + np.tile(steps, len(cells)), 0, count - 1)
-        cells = np.stack(np.unravel_index(np.unique(np.ravel_multi_index(moved.T, shape)), shape), axis=1)
-    return cells
 
 
 def _cells_near(
