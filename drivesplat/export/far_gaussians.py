@@ -32,8 +32,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.reach import INSIDE, reach_of
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import View, where_seen
-from drivesplat.rasterization import rasterize
+from drivesplat.model.view import View
 
 log = logging.getLogger(__name__)
 
@@ -168,15 +167,10 @@ def _visibility(
 def _contributions(model: SplatModel, view: View) -> Float[Tensor, " n"]:
     """The sum over a view's pixels of each Gaussian's weight in the compositing: the gradient of the summed image by
     the Gaussians' values."""
-    shown, seen_from = model.gaussians_in(view), model.seen_from(view)
+    shown = model.gaussians_in(view)
+    values = shown.means.new_zeros(len(shown), 1).requires_grad_()
     with torch.enable_grad():
-        values = shown.means.new_zeros(len(shown), 1).requires_grad_()
-        means, scales = where_seen(shown, seen_from)
-        rendering = rasterize(
-            means.detach(), shown.quats.detach(), scales.detach(), shown.opacities.detach(), values,
-            seen_from.viewmat.detach()[None], view.K[None], view.width, view.height, antialiased=model.antialiased,
-        )  # fmt: skip
-        (gradient,) = torch.autograd.grad(rendering.image.sum(), values)
+        (gradient,) = torch.autograd.grad(model.composited(shown, values, view).image.sum(), values)
     return gradient[:, 0]
 
 
