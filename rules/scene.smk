@@ -161,6 +161,7 @@ rule masks:
         "<benchmarks>/{scene}/masks.tsv"
     conda:
         "../envs/drivesplat.yaml"
+    threads: 8
     resources:
         mem_mb=4000,
         runtime=30,

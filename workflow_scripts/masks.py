@@ -11,5 +11,6 @@ from drivesplat.settings.masks import MaskJob
 
 with job(snakemake, dataset=("images", "sweeps", "classes")) as current:
     scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
-    record = make_masks(scene, current.settings(MaskJob), Path(current.output.masks).parent, ego_mask)
+    folder = Path(current.output.masks).parent
+    record = make_masks(scene, current.settings(MaskJob), folder, ego_mask, current.threads)
     write_json(current.output.masks, {**vars(record), "provenance": current.provenance(scene.provenance, upstream)})

@@ -1,7 +1,8 @@
 """Point colours from the images that see the points."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 
@@ -26,6 +27,33 @@ class ColorView:
         """Resting world points (n, 3) moved as `drivesplat.scene.shutter.where_seen` does."""
         height, width = self.pixels.shape[:2]
         return where_seen(points, self.shutter, inverse(self.world_to_camera), self.intrinsics, (width, height))
+
+
+KEPT_BYTES = 2**30
+"""Bytes of images that `KeptViews` keeps in memory."""
+
+
+class KeptViews:
+    """Views that are read by their index. The first of them, up to KEPT_BYTES, stay in memory and are read once.
+    Threads may share them."""
+
+    def __init__(self, read: Callable[[int], ColorView]):
+        self._read = read
+        self._kept: dict[int, ColorView] = {}
+        self._free = KEPT_BYTES
+        self._lock = Lock()
+
+    def __getitem__(self, index: int) -> ColorView:
+        kept = self._kept.get(index)
+        if kept is not None:
+            return kept
+        view = self._read(index)
+        size = view.pixels.nbytes + view.usable.nbytes
+        with self._lock:
+            if size <= self._free:
+                self._free -= size
+                self._kept[index] = view
+        return view
 
 
 CELL = 4

@@ -27,7 +27,7 @@ from skimage.measure import approximate_polygon, find_contours
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
 from drivesplat.scene.ego_mask import Outline, enclosed
-from drivesplat.scene.images import continuous_intrinsics, pixel_rays, read_image
+from drivesplat.scene.images import continuous_intrinsics, read_image, upward_rays
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import training_images
@@ -199,7 +199,7 @@ def below_ego_horizon(drive: ComparedImages) -> np.ndarray:
     """The pixels (h, w) bool whose rays point downwards in the ego frame."""
     frame = drive.frames[0]
     camera_to_ego = inverse(frame.ego_to_world) @ frame.camera_to_world
-    return pixel_rays(drive.size, continuous_intrinsics(frame, drive.size), camera_to_ego)[..., 2] < 0.0
+    return upward_rays(drive.size, continuous_intrinsics(frame, drive.size), camera_to_ego) < 0.0
 
 
 def lidar_images(drive: ComparedImages) -> list[np.ndarray]:

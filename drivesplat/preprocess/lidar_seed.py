@@ -18,7 +18,7 @@ from plyfile import PlyParseError
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud, read_positions
 from drivesplat.io.prefetch import prefetch
-from drivesplat.lidar.coloring import ColorView, color_by_visibility, in_image
+from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility, in_image
 from drivesplat.lidar.sweeps import outside_boxes, thin, world_returns
 from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.readers.sweeps import sweep_fault
@@ -66,13 +66,13 @@ def seed_points(
     }
     positions, times = (np.concatenate(columns) for columns in zip(*sources.values(), strict=True))
     source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
-    views = prefetch(lambda frame: color_view(scene, frame, job.images, ego_mask), frames)  # all exceed memory
-    colors, seen = color_by_visibility(positions, times, views)
+    views = KeptViews(lambda i: color_view(scene, frames[i], job.images, ego_mask))
+    colors, seen = color_by_visibility(positions, times, prefetch(views.__getitem__, range(len(frames))))
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
     positions, colors, source = positions[kept], colors[kept], source[kept]
-    far, far_colors = _far_points(scene, frames, positions, job, ego_mask, random)
+    far, far_colors = _far_points(frames, views, positions, job, random)
     note = {
         **{name: int((source == i).sum()) for i, name in enumerate(sources)},
         "far": len(far),
@@ -158,34 +158,30 @@ def color_view(scene: Scene, frame: Frame, images: ImageSettings, ego_mask: EgoM
 
 
 def _far_points(
-    scene: Scene,
-    frames: list[Frame],
-    covered: np.ndarray,
-    job: SeedJob,
-    ego_mask: EgoMask,
-    random: np.random.Generator,
+    frames: list[Frame], views: KeptViews, covered: np.ndarray, job: SeedJob, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
+    ground = [float(frame.ego_to_world[2, 3]) for frame in frames]
 
-    def view_of(frame: Frame) -> tuple[ColorView, float, Uncovered]:
-        view, ground_z = color_view(scene, frame, job.images, ego_mask), float(frame.ego_to_world[2, 3])
-        return view, ground_z, uncovered(view, covered, ground_z)
+    def view_of(i: int) -> tuple[int, ColorView, Uncovered]:
+        return i, views[i], uncovered(views[i], covered, ground[i])
 
     settings = job.lidar_seed
     positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
     shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
-    for (view, ground_z, candidates), count in zip(prefetch(view_of, frames), shares, strict=True):
-        p, c = far_points(view, ground_z, candidates, count, settings.far_depths, random)
+    for i, view, candidates in prefetch(view_of, range(len(frames))):
+        p, c = far_points(view, ground[i], candidates, shares[i], settings.far_depths, random)
         positions.append(p)
         colors.append(c)
     return np.concatenate(positions), np.concatenate(colors)
 
 
 class Uncovered(NamedTuple):
-    """Pixels of a view that no seed point covers: their flat row-major indices, and the depths along the axis (metres)
-    at which something upright may continue to them from the seed points below them; inf where there is none."""
+    """Pixels of a view that no seed point covers: their flat row-major indices, and by cell of COVERAGE_CELL pixels the
+    depths along the axis (metres) at which something upright may continue to it from the seed points below; inf where
+    there is none."""
 
     pixels: Int[np.ndarray, " m"]
-    upright: Float[np.ndarray, " m"]
+    upright: Float[np.ndarray, "rows columns"]
 
 
 def uncovered(view: ColorView, points: Float[np.ndarray, "n 3"], ground_z: float) -> Uncovered:
@@ -209,9 +205,7 @@ def uncovered(view: ColorView, points: Float[np.ndarray, "n 3"], ground_z: float
     for row in range(shape[0] - 2, -1, -1):
         upright[row] = np.where(covered[row], upright[row], upright[row + 1])
     filled = covered.repeat(COVERAGE_CELL, axis=0).repeat(COVERAGE_CELL, axis=1)[:height, :width]
-    pixels = np.flatnonzero(view.usable & ~filled)
-    rows, columns = np.divmod(pixels, width)
-    return Uncovered(pixels, upright[rows // COVERAGE_CELL, columns // COVERAGE_CELL])
+    return Uncovered(np.flatnonzero(view.usable & ~filled), upright)
 
 
 def far_points(
@@ -234,7 +228,8 @@ def far_points(
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
     rays = pixels @ np.linalg.inv(view.intrinsics).T @ camera_to_world[:3, :3].T
     center = camera_to_world[:3, 3]
-    anywhere, upright = np.exp(random.uniform(*np.log(depths), size=len(rows))), candidates.upright[chosen]
+    anywhere = np.exp(random.uniform(*np.log(depths), size=len(rows)))
+    upright = candidates.upright[rows // COVERAGE_CELL, columns // COVERAGE_CELL]
     depth = np.where(np.isfinite(upright), upright, anywhere)
     with np.errstate(divide="ignore"):
         to_ground = np.where(rays[:, 2] < 0, (ground_z - center[2]) / rays[:, 2], np.inf)

@@ -13,18 +13,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import (
     continuous_intrinsics,
-    pixel_rays,
     project,
     read_image,
     read_mask,
     target_size,
+    upward_rays,
     write_png,
 )
 from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name
@@ -37,6 +36,8 @@ log = logging.getLogger(__name__)
 
 MIN_ELEVATION = np.sin(np.radians(1.0))
 """Sine of the minimum elevation of sky, one degree above the horizon."""
+WHITE = 3 * 255
+"""Sum of the channels of a white pixel."""
 MIN_BRIGHTNESS = 0.35
 """Minimum brightness of sky with a blue tint, in [0, 1]."""
 BRIGHT = 0.7
@@ -53,9 +54,12 @@ NO_SKY = (
 )
 
 
-def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_EGO_MASK) -> MasksRecord:
-    """Writes the masks of every image below `folder`; returns the record for masks.json. The ego vehicle's body is a
-    region of its own, neither sky nor of any class. The sky of training images depends on training sweeps only.
+def make_masks(
+    scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_EGO_MASK, threads: int | None = None
+) -> MasksRecord:
+    """Writes the masks of every image below `folder`, in `threads` threads (None: more than processors); returns the
+    record for masks.json. The ego vehicle's body is a region of its own, neither sky nor of any class. The sky of
+    training images depends on training sweeps only.
 
     Raises DatasetError naming the file where a user's mask is missing, unreadable, in colours or of another aspect
     ratio than its image, ConfigError where a user's folder is the output.
@@ -74,7 +78,7 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
         write_png(folder / mask_name("regions", frame.camera, frame.timestamp), labels)
         return float(sky.mean()), _semantic(scene, frame, job, body, folder), bool(body.any())
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(threads) as pool:
         sky_shares, classes, bodies = zip(*pool.map(one, scene.frames, groups), strict=True)
     seeing = {frame.camera for frame, body in zip(scene.frames, bodies, strict=True) if body}
     labelled = sum(frame.classes_path is not None for frame in scene.frames)
@@ -193,12 +197,15 @@ def sky_mask(
     """
     height, width = pixels.shape[:2]
     scale = width / 640.0
-    smoothed = cv2.GaussianBlur(pixels, (0, 0), max(0.6, scale)).astype(np.float64) / 255.0
-    brightness = smoothed.mean(axis=2)
-    gradient = np.hypot(ndimage.sobel(brightness, axis=0), ndimage.sobel(brightness, axis=1)) / 8.0 * scale
-    blue = smoothed[..., 2] >= smoothed[..., 0]
-    candidate = (brightness > MIN_BRIGHTNESS) & (blue | (brightness > BRIGHT)) & (gradient < SMOOTH)
-    candidate &= pixel_rays((width, height), intrinsics, camera_to_world)[..., 2] > MIN_ELEVATION
+    red, green, blue = cv2.split(cv2.GaussianBlur(pixels, (0, 0), max(0.6, scale)))
+    brightness = cv2.add(cv2.add(red, green, dtype=cv2.CV_16S), blue, dtype=cv2.CV_16S)  # of at most WHITE
+    across, down = (
+        cv2.Sobel(brightness, cv2.CV_32F, *direction, borderType=cv2.BORDER_REFLECT) for direction in ((1, 0), (0, 1))
+    )
+    gradient = cv2.magnitude(across, down) / (8.0 * WHITE)
+    candidate = (brightness > MIN_BRIGHTNESS * WHITE) & ((blue >= red) | (brightness > BRIGHT * WHITE))
+    candidate &= gradient < SMOOTH / scale
+    candidate &= upward_rays((width, height), intrinsics, camera_to_world) > MIN_ELEVATION
     if lidar is not None:
         candidate &= ~_near_returns(
             lidar, np.linalg.inv(camera_to_world), intrinsics, (height, width), max(1, round(LIDAR_REACH * scale))
@@ -207,9 +214,11 @@ def sky_mask(
         candidate &= ~solid
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     candidate = cv2.morphologyEx(candidate.astype(np.uint8), cv2.MORPH_OPEN, cross, iterations=max(1, round(scale)))
-    labels, _ = ndimage.label(candidate)
-    at_top = np.unique(labels[: max(1, round(2 * scale))])
-    return np.isin(labels, at_top[at_top > 0])
+    count, labels = cv2.connectedComponents(candidate, connectivity=4)
+    at_top = np.zeros(count, dtype=bool)
+    at_top[labels[: max(1, round(2 * scale))]] = True
+    at_top[0] = False
+    return at_top[labels]
 
 
 def _near_returns(

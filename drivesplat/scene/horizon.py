@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivesplat.scene.images import pixel_rays
+from drivesplat.scene.images import upward_rays
 
 MARGIN = math.radians(1.0)
 """Minimum angle in radians of a ray below the horizontal plane. Allows for errors of recorded poses."""
@@ -23,4 +23,4 @@ def below_horizon(
     >>> below_horizon(K, level, (1, 6))[:, 0].tolist()  # pixels of 0.57 degrees
     [False, False, False, False, True, True]
     """
-    return pixel_rays(size, K, camera_to_world)[..., 2] < -math.sin(MARGIN)
+    return upward_rays(size, K, camera_to_world) < -math.sin(MARGIN)

@@ -127,3 +127,16 @@ def pixel_rays(size: tuple[int, int], intrinsics: np.ndarray, camera_to_world: n
     x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(intrinsics).T @ camera_to_world[:3, :3].T
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def upward_rays(size: tuple[int, int], intrinsics: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:
+    """The z components (h, w) of the `pixel_rays`: sines of the elevation where the world's z points up."""
+    x, y = np.arange(size[0]) + 0.5, np.arange(size[1])[:, None] + 0.5
+    to_ray = np.linalg.inv(intrinsics)
+    up, square = camera_to_world[2, :3] @ to_ray, to_ray.T @ to_ray
+    length = np.sqrt(
+        (square[0, 0] * x + 2.0 * square[0, 2]) * x
+        + (square[1, 1] * y + 2.0 * (square[1, 2] + square[0, 1] * x)) * y
+        + square[2, 2]
+    )
+    return (up[0] * x + (up[1] * y + up[2])) / length

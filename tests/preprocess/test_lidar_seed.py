@@ -14,7 +14,9 @@ from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud
-from drivesplat.lidar.coloring import ColorView, color_by_visibility
+from drivesplat.io.prefetch import prefetch
+from drivesplat.lidar import coloring
+from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility
 from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import color_view, far_points, lidar_points, seed_points, uncovered
@@ -250,6 +252,16 @@ def test_empty_points_and_views_are_accepted():
     colors, seen = color_by_visibility(np.empty((0, 3)), np.empty(0), [view(RED, 0)])
     assert colors.shape == (0, 3) and seen.shape == (0,)
     assert color_by_visibility(np.ones((2, 3)), np.zeros(2), [])[1].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(("kept_bytes", "read"), [(2**30, 4), (6000, 7), (0, 8)])
+def test_kept_views_are_read_once_as_far_as_memory_allows(monkeypatch, kept_bytes, read):
+    monkeypatch.setattr(coloring, "KEPT_BYTES", kept_bytes)
+    requested: list[int] = []
+    views = KeptViews(lambda i: requested.append(i) or view(RED, i, size=(50, 20)))  # 4000 bytes
+    for _ in range(2):
+        assert [found.timestamp for found in prefetch(views.__getitem__, range(4))] == [0, 1, 2, 3]
+    assert len(requested) == read and set(requested) == {0, 1, 2, 3}
 
 
 def test_pixels_of_moving_objects_are_not_usable_and_those_of_parked_ones_are(tiny_scene):

@@ -7,7 +7,15 @@ import pytest
 from PIL import Image
 
 from drivesplat.errors import DatasetError
-from drivesplat.scene.images import continuous_intrinsics, pixel_rays, project, read_image, read_mask, target_size
+from drivesplat.scene.images import (
+    continuous_intrinsics,
+    pixel_rays,
+    project,
+    read_image,
+    read_mask,
+    target_size,
+    upward_rays,
+)
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.images import ImageSettings
@@ -170,3 +178,11 @@ def test_a_point_along_a_pixels_ray_projects_to_that_pixels_centre(skew):
     x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(24) + 0.5)
     np.testing.assert_allclose(pixels, np.stack([x.ravel(), y.ravel()], axis=1), atol=1e-9)
     assert (depth > 0).all()
+
+
+@pytest.mark.parametrize("skew", [0.0, 3.0])
+def test_upward_rays_are_the_z_components_of_the_pixels_rays(skew):
+    k = np.array([[100.0, skew, 20.0], [0.0, 120.0, 11.0], [0.0, 0.0, 1.0]])
+    up = upward_rays((40, 24), k, camera())
+    np.testing.assert_allclose(up, pixel_rays((40, 24), k, camera())[..., 2], atol=1e-14)
+    assert up.min() < 0.0 < up.max()
