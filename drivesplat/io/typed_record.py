@@ -8,7 +8,6 @@ from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import jaxtyped
 
 R = TypeVar("R")
 _hints = cache(typing.get_type_hints)
@@ -37,10 +36,11 @@ def typed_record(kind: type[R], values: Any, json: bool = False) -> R:
     if json and values.keys() - hints.keys():
         raise ValueError(f"it has another key {min(values.keys() - hints.keys())!r}")
     known = {name: _value(hints[name], values[name], json) for name in hints if name in values}
-    with jaxtyped("context"):  # which another checked function, called from here, would not see
-        for name, value in known.items():
-            if not isinstance(value, _classes(hints[name])):
-                raise ValueError(f"{name} is {_described(value)}, not {getattr(hints[name], '__name__', hints[name])}")
+    sizes: dict[str, int] = {}
+    for name, value in known.items():
+        classes = _classes(hints[name])
+        if not isinstance(value, classes) or not _fits(value, classes, sizes):
+            raise ValueError(f"{name} is {_described(value)}, not {getattr(hints[name], '__name__', hints[name])}")
     return kind(**known)
 
 
@@ -68,6 +68,16 @@ def _classes(hint: Any) -> tuple[type, ...]:
     """The classes that values of an annotation may have."""
     members = (typing.get_origin(member) or member for member in _members(hint))
     return tuple(member if isinstance(member, type) else object for member in members)
+
+
+def _fits(value: Any, classes: tuple[type, ...], sizes: dict[str, int]) -> bool:
+    """Whether the named dimensions of an array of one of the `classes` have the `sizes` known so far; adds new ones.
+    jaxtyping's `jaxtyped` would compare them, too, but imports jax where it is installed, which takes a second."""
+    for kind in classes:
+        if hasattr(kind, "dim_str") and isinstance(value, kind):
+            named = zip(kind.dim_str.split(), value.shape, strict=True)
+            return all(sizes.setdefault(dim, size) == size for dim, size in named if dim.isidentifier())
+    return True
 
 
 def _described(value: Any) -> str:

@@ -55,7 +55,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
 
 def write_image(path: str | Path, colors: np.ndarray) -> None:
     """Writes colours (h, w, 3) in [0, 1] as a PNG. Raises ResultError that names the path on failure."""
-    write_png(path, (colors.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
+    write_png(path, (colors.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8), level=1)
 
 
 def write_png(path: str | Path, pixels: np.ndarray, level: int = 6) -> None:

@@ -114,8 +114,8 @@ class DeformableSettings(ActorSettings):
     with the distance walked and with time (docs/street.md)."""
 
     sh_degree: int = Field(0, ge=0, le=3)
-    """Degree of the spherical harmonics of their colours. 0 = the same colour from all directions. Higher degrees overfit
-    (docs/measured.md)."""
+    """Degree of the spherical harmonics of their colours. 0 = the same colour from all directions. Higher degrees
+    overfit (docs/measured.md)."""
     fourier: int = Field(1, ge=1, le=16)
     """Number of Fourier coefficients over time of every colour coefficient, and of shapes beside the gait. 1 = colours
     are constant in time, and shapes change with the gait alone, so that who stands does not move. More of them overfit
