@@ -163,7 +163,8 @@ def _far_points(
     ground = [float(frame.ego_to_world[2, 3]) for frame in frames]
 
     def view_of(i: int) -> tuple[int, ColorView, Uncovered]:
-        return i, views[i], uncovered(views[i], covered, ground[i])
+        view = views[i]
+        return i, view, uncovered(view, covered, ground[i])
 
     settings = job.lidar_seed
     positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
