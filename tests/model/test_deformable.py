@@ -124,7 +124,7 @@ def test_roughness_is_the_mean_squared_difference_between_neighbours_and_has_its
 
 def test_without_displacements_it_is_a_rigid_actor():
     tracks = walker(), walker("other", -2.0)
-    part = people_of(*tracks, fourier=5)
+    part = people_of(*tracks, fourier=5, sh_degree=1)
     rigid = actors_of(*tracks, count=40, shaken=False)
     with torch.no_grad():
         part.shared["lattice"].zero_()
