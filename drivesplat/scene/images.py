@@ -122,15 +122,10 @@ def project(points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndar
     return pixels, depth
 
 
-def pixel_rays(size: tuple[int, int], intrinsics: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:
-    """The unit viewing directions (h, w, 3) of the pixel centres, in world coordinates."""
-    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(intrinsics).T @ camera_to_world[:3, :3].T
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
 def upward_rays(size: tuple[int, int], intrinsics: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:
-    """The z components (h, w) of the `pixel_rays`: sines of the elevation where the world's z points up."""
+    """The z components (h, w), in world coordinates, of the unit viewing directions of the pixel centres of an image of
+    `size` (width, height): sines of the elevation where the world's z points up. `intrinsics` (3, 3) are in the
+    continuous convention."""
     x, y = np.arange(size[0]) + 0.5, np.arange(size[1])[:, None] + 0.5
     to_ray = np.linalg.inv(intrinsics)
     up, square = camera_to_world[2, :3] @ to_ray, to_ray.T @ to_ray

@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers.hand_made import actor_record, actors_of, looking_at, motion_through, round_gaussians, track_of
 from helpers.records import training_record_of
+from helpers.reference_rays import pixel_rays
 from scipy.spatial.transform import Rotation
 from torch import nn
 
@@ -24,7 +25,6 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.actor_record import ActorRecord
-from drivesplat.scene.images import pixel_rays
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainJob, TrainSettings
 

@@ -4,18 +4,11 @@ import io
 
 import numpy as np
 import pytest
+from helpers.reference_rays import pixel_rays
 from PIL import Image
 
 from drivesplat.errors import DatasetError
-from drivesplat.scene.images import (
-    continuous_intrinsics,
-    pixel_rays,
-    project,
-    read_image,
-    read_mask,
-    target_size,
-    upward_rays,
-)
+from drivesplat.scene.images import continuous_intrinsics, project, read_image, read_mask, target_size, upward_rays
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.images import ImageSettings
