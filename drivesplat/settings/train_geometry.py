@@ -23,11 +23,11 @@ class FloaterSettings(Settings):
 class RoadSettings(Settings):
     """Selection of the background Gaussians that train.road_weight acts on."""
 
-    surface: Literal["path", "lidar"] = "path"
+    surface: Literal["path", "lidar", "lidar_or_path"] = "path"
     """'path': the road under the path of the vehicle, which follows from its poses. 'lidar': the ground wherever LiDAR
-    seed points show it."""
+    seed points show it. 'lidar_or_path': the latter, and where no LiDAR point shows the ground, the former."""
     half_width: float = Field(1.2, gt=0, le=10)
-    """Maximum lateral distance from the path of the vehicle's centre (metres), with `surface: path`. The weight falls
-    with this distance, since kerbs and grass may begin beside the vehicle."""
+    """Maximum lateral distance from the path of the vehicle's centre (metres) of the road under the path. The weight
+    falls with this distance, since kerbs and grass may begin beside the vehicle."""
     reach: float = Field(0.3, gt=0, le=2)
     """Maximum height of a centre above or below the road surface (metres)."""

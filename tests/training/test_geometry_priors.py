@@ -27,7 +27,7 @@ from drivesplat.training.geometry_priors import (
     geometry_terms,
     road_loss,
 )
-from drivesplat.training.road import CELL, driven_road, lidar_road, road_of
+from drivesplat.training.road import CELL, LIDAR_CELL, driven_road, lidar_road, road_of
 
 WIDE = RoadSettings(half_width=1.2, reach=0.3)
 
@@ -239,6 +239,53 @@ def test_without_lidar_points_the_road_by_lidar_has_no_effect_and_this_is_logged
         road = road_of(record, BY_LIDAR)
     assert "train.road_weight has no effect" in caplog.text
     assert float(road_loss(round_at(torch.ones(4, 3)), road)) == 0.0
+
+
+EITHER = RoadSettings(surface="lidar_or_path", half_width=3.0, reach=0.3)
+
+
+def driven_from(start: tuple[float, float, float]) -> np.ndarray:
+    """Ego poses of a straight road that begins at a place."""
+    poses = straight(40.0)
+    poses[:, :3, 3] += start
+    return poses
+
+
+def either(poses: np.ndarray, points: np.ndarray, lidar: int) -> Road:
+    """The road of a record with these poses and seed points, the first of which are LiDAR returns."""
+    seed, colors = SeedInfo(lidar=lidar, far=len(points) - lidar), np.zeros(points.shape, np.uint8)
+    record = training_record_of(len(poses), ego_to_world=poses, points=points, points_rgb=colors, seed=seed)
+    return road_of(record, EITHER)
+
+
+@pytest.mark.parametrize("start", [(10.0, 3.0, 1.5), (-60.0, 7.3, 1.5)])
+def test_by_lidar_or_path_the_path_counts_where_no_lidar_point_shows_the_ground(start):
+    """The ground that LiDAR shows ends after 20 m; the path leads in or out of it, 1.5 m higher."""
+    poses = driven_from(start)
+    road, alone = either(poses, ground_points(), 6000), lidar_road(ground_points(), EITHER)
+    random = np.random.default_rng(11)
+    places = np.column_stack([random.uniform(-60.0, 50.0, 3000), random.uniform(0.0, 10.0, 3000)])
+    means = torch.from_numpy(np.column_stack([places, np.zeros(3000)])).float()
+    cell, known = road.cells.lookup(means[:, :2])
+    of_lidar, by_lidar = alone.cells.lookup(means[:, :2])
+    by_path = driven_road(poses, EITHER, LIDAR_CELL).cells.lookup(means[:, :2])[1]
+    assert torch.equal(known, by_lidar | by_path) and (by_lidar & by_path).any() and (by_path & ~by_lidar).any()
+    torch.testing.assert_close(road.offsets[cell[by_lidar]], alone.offsets[of_lidar[by_lidar]], rtol=0.0, atol=0.0)
+    assert (road.weights[cell[by_lidar]] == 1.0).all()
+    path_alone = by_path & ~by_lidar
+    torch.testing.assert_close(road.offsets[cell[path_alone]], torch.full((int(path_alone.sum()),), 1.5))
+    beside = (means[path_alone, 1] - start[1]).abs()
+    assert (road.weights[cell[path_alone]] < 1.0 - ((beside - LIDAR_CELL).clamp(min=0.0) / 3.0) ** 2 + 1e-6).all()
+    assert (road.cells.keys.diff() > 0).all()
+
+
+def test_by_lidar_or_path_without_lidar_the_road_is_that_under_the_path():
+    poses = driven_from((0.0, 0.0, 0.0))
+    road = either(poses, np.ones((50, 3), np.float32), 0)
+    alone = driven_road(poses, EITHER, LIDAR_CELL)
+    torch.testing.assert_close((road.cells.keys, road.offsets), (alone.cells.keys, alone.offsets), rtol=0.0, atol=0.0)
+    means = on_road(poses, np.array([5.1, 20.3]), np.array([0.2, -1.4]), np.array([0.1, -0.05]))
+    torch.testing.assert_close(distance(road, means), torch.tensor([0.1, -0.05]))
 
 
 # ---- the terms
