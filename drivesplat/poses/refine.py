@@ -68,20 +68,27 @@ def refine_poses(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_M
 def refine_from_matches(
     images: RigImages, start: pycolmap.Reconstruction, database: Path, job: RefinePosesJob, threads: int = 1
 ) -> Refinement:
-    """Refines recorded poses, with images and features in `start` and matches in `database`."""
+    """Refines recorded poses, with images and features in `start` and matches in `database`. Where refined poses are
+    not better than the recorded ones, these and points that fit them are kept; where they cannot be trusted, no
+    points."""
     scene, priors = images.scene, priors_of(images, job.refine_poses)
     rolling = RollingFeatures.of(images, start)
     unadjusted, reconstruction = _adjust_in_rounds(start, rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
     corrections = _corrections(images, observations, poses_of(reconstruction))
     trial = _trial(unadjusted, priors, job, threads) if len(observations.positions) else None
-    changes = corrections.at(images.timestamps)
-    reason = rejection_reason(images, observations, changes, trial, job.refine_poses.limits)
+    changes, limits = corrections.at(images.timestamps), job.refine_poses.limits
+    flaw = unusable(images, observations, changes, trial, limits)
+    reason = flaw or no_gain(trial, limits)
     record = {**record_header(scene, job, reason), **_record(images, observations, changes, trial)}
-    if reason is not None:
-        log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
+    if reason is None:
+        points = triangulated_points(images.indices, observations)
+        return Refinement(apply_corrections(scene, corrections), record, points)
+    log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
+    if flaw is not None:
         return Refinement(scene, record, no_points())
-    return Refinement(apply_corrections(scene, corrections), record, triangulated_points(images.indices, observations))
+    at_given = _fitted(unadjusted, priors.given, job, threads)
+    return Refinement(scene, record, triangulated_points(images.indices, at_given))
 
 
 def estimate_from_matches(
@@ -149,22 +156,29 @@ def _trial(start: pycolmap.Reconstruction, priors: Priors, job: RefinePosesJob, 
     bundle_adjust(reduced, priors, settings.robust_pixels, threads)
     medians = []
     for poses in (priors.given, poses_of(reduced)):
-        fitted = with_poses(start, poses)
-        bundle_adjust(fitted, None, settings.robust_pixels, threads)
-        observations = observations_of(fitted)
+        observations = _fitted(start, poses, job, threads)
         errors = observations.error[np.isin(observations.numbers[observations.point], withheld)]
         medians.append(_median(errors))
     return WithheldTrial(len(withheld), len(errors), *medians)
 
 
-def rejection_reason(
+def _fitted(
+    reconstruction: pycolmap.Reconstruction, poses: np.ndarray, job: RefinePosesJob, threads: int
+) -> Observations:
+    """The points of a reconstruction, fitted to other poses (n, 4, 4), ego_to_world, of its images."""
+    fitted = with_poses(reconstruction, poses)
+    bundle_adjust(fitted, None, job.refine_poses.robust_pixels, threads)
+    return observations_of(fitted)
+
+
+def unusable(
     images: RigImages,
     observations: Observations,
     changes: np.ndarray,
     trial: WithheldTrial | None,
     limits: LimitSettings,
 ) -> str | None:
-    """Why a refinement is rejected, None where it is accepted. `changes` (n, 4, 4): corrections of the images."""
+    """Why a refinement cannot be trusted, None where it can. `changes` (n, 4, 4): corrections of the images."""
     constrained = np.bincount(observations.image, minlength=len(images)) >= limits.min_points
     if trial is None or constrained.mean() < limits.min_images:
         return (
@@ -175,6 +189,11 @@ def rejection_reason(
     for largest, limit, unit in ((shift.max(), limits.max_shift, "m"), (turn.max(), limits.max_turn, "degrees")):
         if not largest <= limit:
             return f"one of them would be moved by {largest:.2f} {unit}, more than {limit:g}"
+    return None
+
+
+def no_gain(trial: WithheldTrial, limits: LimitSettings) -> str | None:
+    """Why refined poses are not better than the given ones, None where they are."""
     if not trial.after < (1.0 - limits.min_gain) * trial.before:
         return (
             f"the error of withheld points is {trial.after:.2f} pixels with refined poses and {trial.before:.2f} with "

@@ -20,13 +20,14 @@ from helpers.hand_made_views import (
     write_database,
 )  # fmt: skip
 from PIL import Image
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.io.storage import canonical_json
 from drivesplat.poses import refine
 from drivesplat.poses.adjustment import bundle_adjust, priors_of, triangulate
-from drivesplat.poses.refine import WithheldTrial, refine_from_matches, refine_poses, rejection_reason
+from drivesplat.poses.refine import WithheldTrial, no_gain, refine_from_matches, refine_poses, unusable
 from drivesplat.poses.refinement import refine_or_keep
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
@@ -104,7 +105,7 @@ def shift(metres: float) -> np.ndarray:
 def test_each_limit_has_its_sentence(points, changes, trial, words):
     if np.isnan(changes).any():
         changes = moved(1, np.block([[np.eye(3), np.full((3, 1), np.nan)], [np.zeros((1, 3)), np.ones((1, 1))]]))
-    reason = rejection_reason(FOUR, seen_of(points), changes, trial, LimitSettings())
+    reason = unusable(FOUR, seen_of(points), changes, trial, LimitSettings()) or no_gain(trial, LimitSettings())
     assert reason is None if words is None else words in reason and "\n" not in reason
 
 
@@ -146,6 +147,20 @@ def test_a_refinement_that_only_fits_feature_noise_is_rejected(tmp_path):
     refined = refined_of(tmp_path, drive, 150, 2.0, feature_noise=0.05, robust_pixels=5.0, withheld=0.3)
     assert "the error of withheld points is" in refined.record["kept_because"]
     assert refined.record["trial"]["after_px"] > refined.record["trial"]["before_px"] > 0
+
+
+@pytest.mark.parametrize("min_gain", [0.05, 0.999])
+def test_with_the_given_poses_the_points_that_fit_them_are_kept(tmp_path, min_gain):
+    """Exact poses, which no refinement improves, and poses that are off, whose refinement does not suffice."""
+    poses_are_exact = min_gain == 0.05
+    errors = {"ego_path": flat, "error": exact} if poses_are_exact else {}
+    drive, images_of_two = drive_of(10, **errors), np.arange(2, 8)
+    refined = refined_of(tmp_path, drive, rounds=1, limits={"min_gain": min_gain})
+    assert "a gain of less than" in refined.record["kept_because"] and refined.scene is drive.scene
+    found = refined.points
+    assert len(found.points) > 80 and found.seen_in(images_of_two).any()
+    distance = cKDTree(street_points(400)).query(found.points)[0]
+    assert (np.median(distance) < 0.1) == poses_are_exact, "they fit the given poses, not the true ones"
 
 
 def test_withheld_points_take_no_part_in_the_trial_adjustment(tmp_path, monkeypatch):
