@@ -2,9 +2,9 @@
 
 The sources are static LiDAR returns of the training sweeps, without the ego vehicle and thinned; points triangulated by
 pose refinement that two training images see; points of a file, if given; and far points along pixels that none of these
-cover. Above points that are higher than the ground far points have the depth of these, elsewhere a random one. Colours
-come from training images, and points that none of them sees are left out. Held-out images and sweeps contribute neither
-LiDAR positions nor colours.
+cover. Above points that are higher than the ground far points have the depth of these, elsewhere a random one, or that
+of points that are near in the image. Colours come from training images, and points that none of them sees are left out.
+Held-out images and sweeps contribute neither LiDAR positions nor colours.
 """
 
 import logging
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from plyfile import PlyParseError
+from scipy.spatial import cKDTree
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud, read_positions
@@ -39,6 +40,10 @@ COVERAGE_CELL = 8
 """Edge length in pixels of the image cell that a seed point covers."""
 RAISED = 1.0
 """Minimum height in metres, above the ground under the ego vehicle, of a seed point that counts as upright."""
+NEAR_CELLS, NEAREST, SPREAD = 12, 4, 0.05
+"""Of far points at depths of what is near in the image: the maximum distance in cells; the number of nearest covered
+cells of which the farthest point counts, since points in front of a surface veil it; and the relative standard
+deviation of depths around it."""
 
 
 def seed_points(
@@ -170,19 +175,36 @@ def _far_points(
     positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
     shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
     for i, view, candidates in prefetch(view_of, range(len(frames))):
-        p, c = far_points(view, ground[i], candidates, shares[i], settings.far_depths, random)
+        p, c = far_points(view, ground[i], candidates, shares[i], settings.far_depths, random, settings.far_near)
         positions.append(p)
         colors.append(c)
     return np.concatenate(positions), np.concatenate(colors)
 
 
 class Uncovered(NamedTuple):
-    """Pixels of a view that no seed point covers: their flat row-major indices, and by cell of COVERAGE_CELL pixels the
-    depths along the axis (metres) at which something upright may continue to it from the seed points below; inf where
-    there is none."""
+    """Pixels of a view that no seed point covers: their flat row-major indices; and by cell of COVERAGE_CELL pixels
+    depths along the axis (metres), inf where there is none: `nearest`, that of the nearest seed point, and `upright`,
+    at which something upright may continue to the cell from the seed points below."""
 
     pixels: Int[np.ndarray, " m"]
+    nearest: Float[np.ndarray, "rows columns"]
     upright: Float[np.ndarray, "rows columns"]
+
+    def depths_near(
+        self, rows: Int[np.ndarray, " k"], columns: Int[np.ndarray, " k"], random: np.random.Generator
+    ) -> Float[np.ndarray, " k"]:
+        """The depths (metres) of seed points near pixels in the image, with noise; inf where none is near."""
+        cells = np.argwhere(np.isfinite(self.nearest))
+        if not len(cells):
+            return np.full(len(rows), np.inf)
+        places = np.column_stack([rows, columns]) / COVERAGE_CELL - 0.5
+        number = np.arange(1, min(NEAREST, len(cells)) + 1)
+        distances, found = cKDTree(cells).query(places, number, distance_upper_bound=NEAR_CELLS)
+        there = np.isfinite(distances)
+        at = cells[np.where(there, found, 0)]
+        farthest = np.where(there, self.nearest[at[..., 0], at[..., 1]], 0.0).max(axis=1)
+        noise = np.exp(random.normal(0.0, SPREAD, len(rows)))
+        return np.where(there.any(axis=1), farthest * noise, np.inf)
 
 
 def uncovered(view: ColorView, points: Float[np.ndarray, "n 3"], ground_z: float) -> Uncovered:
@@ -206,7 +228,7 @@ def uncovered(view: ColorView, points: Float[np.ndarray, "n 3"], ground_z: float
     for row in range(shape[0] - 2, -1, -1):
         upright[row] = np.where(covered[row], upright[row], upright[row + 1])
     filled = covered.repeat(COVERAGE_CELL, axis=0).repeat(COVERAGE_CELL, axis=1)[:height, :width]
-    return Uncovered(np.flatnonzero(view.usable & ~filled), upright)
+    return Uncovered(np.flatnonzero(view.usable & ~filled), nearest, upright)
 
 
 def far_points(
@@ -216,12 +238,14 @@ def far_points(
     count: int,
     depths: tuple[float, float],
     random: np.random.Generator,
+    near: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """At most `count` random points on the rays of pixels drawn from `candidates`.
 
-    Their depth is that of something upright, or log-uniform between `depths` (metres). A point below the ground plane
-    at height `ground_z` is moved along its ray onto the plane. Returns world positions (m, 3) and the colours (m, 3)
-    uint8 of the pixels.
+    Their depth is that of something upright; otherwise, of a fraction `near` of them, that of seed points near in the
+    image where there are any, and of the rest log-uniform between `depths` (metres). A point below the ground plane at
+    height `ground_z` is moved along its ray onto the plane. Returns world positions (m, 3) and the colours (m, 3) uint8
+    of the pixels.
     """
     chosen = random.choice(len(candidates.pixels), size=min(count, len(candidates.pixels)), replace=False)
     rows, columns = np.divmod(candidates.pixels[chosen], view.pixels.shape[1])
@@ -230,6 +254,9 @@ def far_points(
     rays = pixels @ np.linalg.inv(view.intrinsics).T @ camera_to_world[:3, :3].T
     center = camera_to_world[:3, 3]
     anywhere = np.exp(random.uniform(*np.log(depths), size=len(rows)))
+    if near:
+        beside = candidates.depths_near(rows, columns, random)
+        anywhere = np.where((random.uniform(size=len(rows)) < near) & np.isfinite(beside), beside, anywhere)
     upright = candidates.upright[rows // COVERAGE_CELL, columns // COVERAGE_CELL]
     depth = np.where(np.isfinite(upright), upright, anywhere)
     with np.errstate(divide="ignore"):

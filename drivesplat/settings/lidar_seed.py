@@ -35,6 +35,9 @@ class LidarSeedSettings(Settings):
     far_depths: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (3.0, 300.0)
     """Minimum and maximum depth of all other far points (metres), log-uniformly distributed and never below the road.
     """
+    far_near: float = Field(0.0, ge=0, le=1)
+    """Fraction of these other far points that have about the depth of seed points near in the image instead. 0.6 helps
+    drives with little LiDAR (docs/off_the_lane.md)."""
 
     @field_validator("far_depths")
     @classmethod

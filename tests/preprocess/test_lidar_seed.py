@@ -18,6 +18,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar import coloring
 from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility
 from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
+from drivesplat.preprocess import lidar_seed
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import color_view, far_points, lidar_points, seed_points, uncovered
 from drivesplat.readers.sweeps import read_returns
@@ -291,9 +292,9 @@ def far_view(seed: int = 0) -> ColorView:
 GROUND = 3.0
 
 
-def some_far_points(count: int, covered: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def some_far_points(count: int, covered: np.ndarray, seed: int = 0, near: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     candidates = uncovered(far_view(), covered, GROUND)
-    return far_points(far_view(), GROUND, candidates, count, (3.0, 300.0), np.random.default_rng(seed))
+    return far_points(far_view(), GROUND, candidates, count, (3.0, 300.0), np.random.default_rng(seed), near)
 
 
 def test_far_points_have_distinct_pixels_with_their_colours_and_depths_in_range():
@@ -340,13 +341,13 @@ def test_far_points_skip_covered_cells():
     assert len(positions) == 60 * 44 - 64 - 64 - 4 * 4
 
 
-def above(covered: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
+def above(covered: np.ndarray, near: float = 0.0) -> dict[tuple[int, int], np.ndarray]:
     """The depths of far points along all pixels, by cell (x, y), where LiDAR met the points `covered` (n, 3): columns
     and rows in pixels, and depth along the axis."""
     x, y, depth = covered.T
     in_camera = np.stack([(x - 40.0) / 50.0 * depth, (y - 30.0) / 50.0 * depth, depth], axis=1)
     pose = inverse(far_view().world_to_camera)
-    positions, _ = some_far_points(60 * 44, in_camera @ pose[:3, :3].T + pose[:3, 3])
+    positions, _ = some_far_points(60 * 44, in_camera @ pose[:3, :3].T + pose[:3, 3], near=near)
     pixels, depths = project(positions, far_view().world_to_camera, K)
     cells = np.floor(pixels / 8).astype(int)
     return {
@@ -364,6 +365,28 @@ def test_far_points_above_something_upright_have_its_depth():
     np.testing.assert_allclose(depths[4, 0], 40.0)
     for cell in ((4, 2), (4, 3), (2, 4), (3, 0)):
         assert np.ptp(np.log(depths[cell])) > 0.5, "neither above the ground, nor below a wall, nor beside it"
+
+
+@pytest.mark.parametrize("near", [1.0, 0.5])
+def test_far_points_may_have_depths_of_what_is_near_in_the_image(near, monkeypatch):
+    """The farthest point of the two nearest covered cells counts, of those at most two cells away. Cells are 8 x 8
+    pixels."""
+    monkeypatch.setattr(lidar_seed, "NEAREST", 2)
+    monkeypatch.setattr(lidar_seed, "NEAR_CELLS", 2)
+    left, beside, alone = (4.0, 4.0, 9.0), (12.0, 4.0, 5.0), (52.0, 4.0, 30.0)
+    depths = above(np.array([left, beside, alone]), near)
+    of_cell = {(0, 1): 9.0, (1, 1): 9.0, (6, 1): 30.0, (5, 0): 30.0}
+    for cell, expected in of_cell.items():
+        close = np.abs(np.log(depths[cell] / expected)) < 5 * lidar_seed.SPREAD
+        assert close.all() if near == 1.0 else 0.3 < close.mean() < 0.9
+    assert np.ptp(np.log(depths[3, 3])) > 0.5, "too far from all of them"
+
+
+def test_depths_near_need_a_covered_cell():
+    """Without one all points have random depths, the same as without the setting in its distribution."""
+    positions, _ = some_far_points(2640, np.empty((0, 3)), near=1.0)
+    _, depth = project(positions, far_view().world_to_camera, K)
+    assert np.ptp(np.log(depth)) > 3.0
 
 
 def test_without_free_pixels_there_are_no_far_points():
