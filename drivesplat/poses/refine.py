@@ -192,9 +192,9 @@ def unusable(
     return None
 
 
-def no_gain(trial: WithheldTrial, limits: LimitSettings) -> str | None:
-    """Why refined poses are not better than the given ones, None where they are."""
-    if not trial.after < (1.0 - limits.min_gain) * trial.before:
+def no_gain(trial: WithheldTrial | None, limits: LimitSettings) -> str | None:
+    """Why refined poses are not better than the given ones, None where they are, or where nothing was tried."""
+    if trial is not None and not trial.after < (1.0 - limits.min_gain) * trial.before:
         return (
             f"the error of withheld points is {trial.after:.2f} pixels with refined poses and {trial.before:.2f} with "
             f"the given ones, a gain of less than {limits.min_gain:.0%}"

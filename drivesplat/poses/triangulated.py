@@ -73,7 +73,7 @@ def triangulated_points(frames: Sequence[int], observations: Observations) -> Tr
 
 
 def no_points() -> TriangulatedPoints:
-    """The record of a refinement that was rejected."""
+    """The record of a drive without triangulated points."""
     none = np.empty(0, dtype=np.int64)
     return TriangulatedPoints(np.empty((0, 3)), none, none)
 

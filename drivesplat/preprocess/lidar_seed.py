@@ -193,7 +193,8 @@ class Uncovered(NamedTuple):
     def depths_near(
         self, rows: Int[np.ndarray, " k"], columns: Int[np.ndarray, " k"], random: np.random.Generator
     ) -> Float[np.ndarray, " k"]:
-        """The depths (metres) of seed points near pixels in the image, with noise; inf where none is near."""
+        """The depths (metres) of seed points near pixels in the image, with noise, in any range; inf where none is
+        near."""
         cells = np.argwhere(np.isfinite(self.nearest))
         if not len(cells):
             return np.full(len(rows), np.inf)

@@ -25,7 +25,7 @@ class RoadSettings(Settings):
 
     surface: Literal["path", "lidar", "lidar_or_path"] = "path"
     """'path': the road under the path of the vehicle, which follows from its poses. 'lidar': the ground wherever LiDAR
-    seed points show it. 'lidar_or_path': the latter, and where no LiDAR point shows the ground, the former."""
+    seed points show it. 'lidar_or_path': the latter, and where LiDAR gives no plane of the ground, the former."""
     half_width: float = Field(1.2, gt=0, le=10)
     """Maximum lateral distance from the path of the vehicle's centre (metres) of the road under the path. The weight
     falls with this distance, since kerbs and grass may begin beside the vehicle."""

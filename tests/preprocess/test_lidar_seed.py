@@ -389,12 +389,15 @@ def test_depths_near_need_a_covered_cell():
     assert np.ptp(np.log(depth)) > 3.0
 
 
-def test_without_free_pixels_there_are_no_far_points():
+@pytest.mark.parametrize("near", [0.0, 1.0])
+def test_without_free_pixels_there_are_no_far_points(near):
     everywhere = far_view()
     unusable = dataclasses.replace(everywhere, usable=np.zeros_like(everywhere.usable))
-    candidates = uncovered(unusable, np.empty((0, 3)), GROUND)
-    positions, colors = far_points(unusable, GROUND, candidates, 10, (3.0, 300.0), np.random.default_rng(0))
-    assert positions.shape == (0, 3) and colors.shape == (0, 3)
+    for covered in (np.empty((0, 3)), np.array([[12.0, 0.0, GROUND + 1.0]])):
+        candidates = uncovered(unusable, covered, GROUND)
+        assert np.isfinite(candidates.nearest).any() == bool(len(covered))
+        positions, colors = far_points(unusable, GROUND, candidates, 10, (3.0, 300.0), np.random.default_rng(0), near)
+        assert positions.shape == (0, 3) and colors.shape == (0, 3)
 
 
 def assert_same_seed(a: PointCloud, b: PointCloud) -> None:
