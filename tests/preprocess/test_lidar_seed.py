@@ -393,7 +393,7 @@ def test_depths_near_need_a_covered_cell():
 def test_without_free_pixels_there_are_no_far_points(near):
     everywhere = far_view()
     unusable = dataclasses.replace(everywhere, usable=np.zeros_like(everywhere.usable))
-    for covered in (np.empty((0, 3)), np.array([[12.0, 0.0, GROUND + 1.0]])):
+    for covered in (np.empty((0, 3)), np.array([[112.0, 20.0, GROUND + 1.0]])):
         candidates = uncovered(unusable, covered, GROUND)
         assert np.isfinite(candidates.nearest).any() == bool(len(covered))
         positions, colors = far_points(unusable, GROUND, candidates, 10, (3.0, 300.0), np.random.default_rng(0), near)
