@@ -76,7 +76,7 @@ def refine_from_matches(
     unadjusted, reconstruction = _adjust_in_rounds(start, rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
     corrections = _corrections(images, observations, poses_of(reconstruction))
-    trial = _trial(unadjusted, priors, job, threads) if len(observations.positions) else None
+    trial, at_given = _trial(unadjusted, priors, job, threads) if len(observations.positions) else (None, None)
     changes, limits = corrections.at(images.timestamps), job.refine_poses.limits
     flaw = unusable(images, observations, changes, trial, limits)
     reason = flaw or no_gain(trial, limits)
@@ -85,10 +85,8 @@ def refine_from_matches(
         points = triangulated_points(images.indices, observations)
         return Refinement(apply_corrections(scene, corrections), record, points)
     log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
-    if flaw is not None:
-        return Refinement(scene, record, no_points())
-    at_given = _fitted(unadjusted, priors.given, job, threads)
-    return Refinement(scene, record, triangulated_points(images.indices, at_given))
+    points = no_points() if flaw or at_given is None else triangulated_points(images.indices, at_given)
+    return Refinement(scene, record, points)
 
 
 def estimate_from_matches(
@@ -145,8 +143,11 @@ def poses_of(reconstruction: pycolmap.Reconstruction) -> np.ndarray:
     return np.stack([inverse(from_pycolmap(frame.rig_from_world)) for frame in frames])
 
 
-def _trial(start: pycolmap.Reconstruction, priors: Priors, job: RefinePosesJob, threads: int) -> WithheldTrial:
-    """Adjusts `start` without some of its points, then fits these to the given and to the refined poses."""
+def _trial(
+    start: pycolmap.Reconstruction, priors: Priors, job: RefinePosesJob, threads: int
+) -> tuple[WithheldTrial, Observations]:
+    """Adjusts `start` without some of its points, then fits all to the given and to the refined poses. Also returns the
+    points fitted to the given poses."""
     settings, numbers = job.refine_poses, sorted(start.points3D)
     random = np.random.default_rng(job.random_seed)
     withheld = random.choice(numbers, max(1, round(settings.withheld * len(numbers))), replace=False)
@@ -154,12 +155,9 @@ def _trial(start: pycolmap.Reconstruction, priors: Priors, job: RefinePosesJob, 
     for point in withheld.tolist():
         reduced.delete_point3D(point)
     bundle_adjust(reduced, priors, settings.robust_pixels, threads)
-    medians = []
-    for poses in (priors.given, poses_of(reduced)):
-        observations = _fitted(start, poses, job, threads)
-        errors = observations.error[np.isin(observations.numbers[observations.point], withheld)]
-        medians.append(_median(errors))
-    return WithheldTrial(len(withheld), len(errors), *medians)
+    fitted = [_fitted(start, poses, job, threads) for poses in (priors.given, poses_of(reduced))]
+    errors = [points.error[np.isin(points.numbers[points.point], withheld)] for points in fitted]
+    return WithheldTrial(len(withheld), len(errors[-1]), *map(_median, errors)), fitted[0]
 
 
 def _fitted(

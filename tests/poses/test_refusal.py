@@ -200,7 +200,7 @@ def test_withheld_points_take_no_part_in_the_trial_adjustment(tmp_path, monkeypa
         calls.append((set(reconstruction.points3D), priors is not None, moves > 1e-4))
 
     monkeypatch.setattr(refine, "bundle_adjust", watched)
-    trial = refine._trial(start, priors_of(images, job.refine_poses), job, 1)
+    trial, _ = refine._trial(start, priors_of(images, job.refine_poses), job, 1)
     everything = set(start.points3D)
     (fitted, *judged) = calls
     assert len(everything - fitted[0]) == trial.points == round(0.25 * len(everything)) and fitted[1:] == (True, True)

@@ -383,7 +383,7 @@ def test_far_points_may_have_depths_of_what_is_near_in_the_image(near, monkeypat
 
 
 def test_depths_near_need_a_covered_cell():
-    """Without one all points have random depths, the same as without the setting in its distribution."""
+    """Without one all points have random depths."""
     positions, _ = some_far_points(2640, np.empty((0, 3)), near=1.0)
     _, depth = project(positions, far_view().world_to_camera, K)
     assert np.ptp(np.log(depth)) > 3.0
