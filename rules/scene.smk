@@ -161,7 +161,7 @@ rule masks:
         "<benchmarks>/{scene}/masks.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: 8
+    threads: plan.mask_threads
     resources:
         mem_mb=4000,
         runtime=30,

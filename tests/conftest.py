@@ -83,7 +83,7 @@ def demo_job():
     """The settings of a small synthetic drive by day."""
     from helpers.demo_worlds import CAMERAS, job_of, world_of
 
-    return job_of(world_of(width=160, key_frames=6, cameras=CAMERAS))
+    return job_of(world_of(width=160, key_frames=6, cameras=CAMERAS, sweeps=("CAM_FRONT",)))
 
 
 @pytest.fixture(scope="session")

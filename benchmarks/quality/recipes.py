@@ -16,6 +16,7 @@ from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, with_seed
 from drivesplat.settings.names import require_name
 from drivesplat.settings.train import Parts
+from drivesplat.workflow.stages import stage_settings
 
 SCENE_SETTINGS = tuple(key for key in SHARED_SETTINGS if key not in (*VARIATION_OVERRIDES, "methods"))
 """The sections that `config` of one recipe may set; its `overrides` set the others."""
@@ -122,14 +123,15 @@ def _refuse_twins(runs: list[SnakemakeRun]) -> None:
 
 def _refuse_two_worlds(runs: list[SnakemakeRun]) -> None:
     """Raises ConfigError if two runs would make different synthetic worlds in one folder, in turns."""
-    makers: dict[Path, SnakemakeRun] = {}
+    makers: dict[Path, tuple[str, str]] = {}
     for run in runs:
         dataset = _dataset(run)
         if dataset.world is None:
             continue
-        first = makers.setdefault(Path(dataset.world_root).resolve(), run)
-        if _dataset(first).world != dataset.world:
+        recipe, world = run.methods[0], stage_settings(run.plan.config, "demo_world", run.scene)
+        first, made = makers.setdefault(Path(dataset.world_root).resolve(), (recipe, world))
+        if made != world:
             raise ConfigError(
-                f"recipes {first.methods[0]!r} and {run.methods[0]!r} make different worlds in {dataset.dataroot}; "
-                "give each a dataroot of its own"
+                f"recipes {first!r} and {recipe!r} make different worlds in {dataset.dataroot}; give each a dataroot "
+                "of its own, or name the sensors of both: world.cameras and world.sweeps"
             )

@@ -206,6 +206,15 @@ class Config(Settings):
         return {}
 
     @cached_property
+    def place_of_dataset(self) -> dict[str, str]:
+        """The first dataset with the same overrides, by dataset: their settings are the same (see `for_scene`)."""
+        first: dict[str, str] = {}
+        for name, dataset in self.datasets.items():
+            same = (other for other in first.values() if self.datasets[other].overrides == dataset.overrides)
+            first[name] = next(same, name)
+        return first
+
+    @cached_property
     def ablated(self) -> dict[str, MethodSettings]:
         """The methods of the ablation, by name; empty where the ablated method is not configured."""
         whole = self.methods.get(self.ablation.of)
@@ -263,7 +272,7 @@ def load(values: Mapping[str, Any]) -> Config:
 
 def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
     """The config of one scene, and of one method where given. Raises ConfigError for an unknown scene."""
-    dataset, known = config.dataset_of(scene), config.places
+    dataset, known = config.place_of_dataset[config.dataset_of(scene)], config.places
     if (dataset, None) not in known:
         known[dataset, None] = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
     if (dataset, method) not in known:

@@ -1,5 +1,6 @@
 """Settings of synthetic worlds."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -67,8 +68,9 @@ class WorldSettings(Settings):
     """Images a second of cameras in `sweeps`; a multiple of key_frame_hz."""
     lidar_hz: Literal[10, 20] = 20
     """Revolutions of the LiDAR a second."""
-    sweeps: tuple[Channel, ...] = ("CAM_FRONT",)
-    """Sensors that also record between key frames."""
+    sweeps: tuple[Channel, ...] | None = None
+    """Sensors that also record between key frames. null = those that the config reads there: the cameras with the
+    setting `sweeps`, LIDAR_TOP with `lidar_seed.sweeps`."""
     readout_s: float = Field(0.0, ge=0, le=0.1)
     """Seconds from the first row of an image to the last (rolling shutter, downwards). Timestamps are those of the
     middle row. 0 = all rows at once."""
@@ -117,6 +119,19 @@ class WorldSettings(Settings):
         if self.image_hz % self.key_frame_hz:
             raise ValueError(f"image_hz is {self.image_hz}, no multiple of key_frame_hz ({self.key_frame_hz})")
         return self
+
+    def with_sensors(self, cameras: Sequence[CameraChannel], sweeps: bool, lidar_sweeps: bool) -> "WorldSettings":
+        """These settings with the names of sensors in place of null: `cameras` record, between key frames, too, with
+        `sweeps`, and the LiDAR with `lidar_sweeps`.
+
+        >>> made = WorldSettings().with_sensors(["CAM_FRONT"], sweeps=False, lidar_sweeps=True)
+        >>> made.cameras, made.sweeps
+        (('CAM_FRONT',), ('LIDAR_TOP',))
+        """
+        recording = tuple(cameras) if self.cameras is None else self.cameras
+        read: tuple[Channel, ...] = (*(recording if sweeps else ()), *(("LIDAR_TOP",) if lidar_sweeps else ()))
+        between = read if self.sweeps is None else self.sweeps
+        return self.model_copy(update={"cameras": recording, "sweeps": between})
 
     @property
     def seconds(self) -> float:

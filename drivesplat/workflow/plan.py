@@ -21,10 +21,10 @@ from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, no_such_edit, no_such_film, scene_edits
-from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
+from drivesplat.workflow.job_resources import JobResources
 from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
-from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM, Outputs
+from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
@@ -41,7 +41,7 @@ def let_scripts_import(folder: str) -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join([folder, *([inherited] if inherited else [])])
 
 
-class Plan(Outputs):
+class Plan(JobResources):
     """The interface of the rules to the validated config; `basedir` is the Snakefile's folder, and `prefix` is that of
     a module of another workflow."""
 
@@ -50,7 +50,6 @@ class Plan(Outputs):
         self.targets: list[str] | None = None
         """The targets of the run; None where they are not known."""
         self._held_lock: Any = None
-        self._devices: dict[str, tuple[str, int]] = {}
 
     def settings(self, stage: str) -> Callable[[Any], str]:
         """The function of wildcards that gives a stage's settings as canonical JSON."""
@@ -70,11 +69,6 @@ class Plan(Outputs):
         """The settings of the download of nuScenes mini. Raises ConfigError where no dataset takes it."""
         return canonical_json(download_job(self.config).model_dump(mode="json"))
 
-    def device(self, wildcards: Any) -> str:
-        """The device settings of a scene's jobs as canonical JSON. A resource of the rules, not a param: moving to
-        another machine reruns nothing."""
-        return self._device(wildcards.scene)[0]
-
     def track_references(self, wildcards: Any) -> str:
         """Those of a job's tracks that a scene's settings name, as canonical JSON. A resource, not a param: it changes
         no result of the stages that check it."""
@@ -84,27 +78,6 @@ class Plan(Outputs):
     def refuse_wrong_tracks(self, jobs: Iterable[Any]) -> None:
         """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that settings name."""
         refuse_wrong_tracks(self.config, jobs, self.shown_scene)
-
-    def _device(self, scene: str) -> tuple[str, int]:
-        """The device of a scene's jobs as canonical JSON, and how many GPUs each takes."""
-        name = self.config.dataset_of(scene)
-        if name not in self._devices:
-            device = for_scene(self.config, scene).device.model_dump(mode="json")
-            if self.config.datasets[name].world is not None and device["kind"] == "auto":
-                device["kind"] = "any"
-            on_gpu = device["kind"] != "cpu" and (device["kind"] != "any" or any_gpu())
-            self._devices[name] = canonical_json(device), int(on_gpu)
-        return self._devices[name]
-
-    def gpus(self, wildcards: Any) -> int:
-        """The number of GPUs that a training or rendering of a scene takes: 1, or 0 on the CPU of this machine."""
-        return self._device(wildcards.scene)[1]
-
-    def threads(self, on_gpu: int) -> Callable[[Any], int]:
-        """The threads of such a job: `on_gpu` with a GPU, otherwise half of the processors, since two jobs in parallel
-        finish sooner than two in sequence on all processors."""
-        on_cpu = max(1, len(os.sched_getaffinity(0)) // 2)
-        return lambda wildcards: on_gpu if self.gpus(wildcards) else on_cpu
 
     def known(self, names: Any) -> str:
         """A wildcard constraint that matches only these names."""

@@ -225,11 +225,10 @@ def _world(at: Place) -> dict[str, Any]:
     for name in wanted:
         if name not in edits:
             raise ConfigError(no_such_edit(at.scene, name, edits))
-    cameras = at.config.cameras if world.cameras is None else world.cameras
     return {
         "scene": at.scene,
         "version": at.dataset.version,
-        "world": world.model_copy(update={"cameras": cameras}),
+        "world": world.with_sensors(at.config.cameras, at.config.sweeps, at.config.lidar_seed.sweeps),
         "edits": {name: edits[name] for name in wanted},
     }
 

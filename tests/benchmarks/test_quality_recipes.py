@@ -175,6 +175,8 @@ def test_two_synthetic_worlds_in_one_folder_are_refused(runs):
     night = {"datasets": {"demo": {"world": {"night": True}}}}
     with pytest.raises(ConfigError, match=r"'day' and 'night' make different worlds in resources/demo"):
         runs(scene="demo", recipes={"day": {}, "night": {"config": night}})
+    with pytest.raises(ConfigError, match=r"name the sensors of both: world\.cameras and world\.sweeps"):
+        runs(scene="demo", recipes={"day": {}, "swept": {"config": {"sweeps": True}}})
     apart = merged(night, {"datasets": {"demo": {"dataroot": "resources/night"}}})
     assert len(runs(scene="demo", recipes={"day": {}, "night": {"config": apart}})) == 2
 

@@ -363,7 +363,8 @@ def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record
         assert [point["iteration"] for point in run["curve"]] == [4, 8, 12]
         assert 0.0 < run["curve"][0]["seconds"] < run["curve"][1]["seconds"] <= run["loop"]
         group = next(group for group in run["result"].values() if group["static"])
-        assert run["curve"][-1]["static"] == pytest.approx(group["static"]["psnr"], abs=1e-4), "as in metrics.json"
+        near = 0.2 if run["recipe"] == "ours" else 1e-4  # ours colours hidden Gaussians after its last iteration
+        assert run["curve"][-1]["static"] == pytest.approx(group["static"]["psnr"], abs=near), "as in metrics.json"
     page = (measured.folder / "results/speed/tiny/speed.md").read_text(encoding="utf-8")
     assert page == markdown(record) and "| `plain` |" in page and "| `vanilla` |" in page
 

@@ -120,9 +120,29 @@ def test_a_worlds_stage_knows_its_scene_tables_and_street_alone(tmp_path):
     config = load({"datasets": {"demo": first}, "random_seed": 7, "train": {"iterations": 50}})
     told = json.loads(stage_settings(config, "demo_world", "demo"))
     assert told["scene"] == "demo" and told["version"] == "v1.0-mini"
-    expected = {"cameras": ["CAM_FRONT"], "random_seed": 3, "night": True}
+    expected = {"cameras": ["CAM_FRONT"], "sweeps": [], "random_seed": 3, "night": True}
     assert told["world"] == {**WorldSettings().model_dump(mode="json"), **expected}
     assert told.keys() == {"scene", "version", "world", "edits"} and told["edits"] == {}
+
+
+@pytest.mark.parametrize(
+    ("written", "read", "recorded"),
+    [
+        (None, {}, []),
+        (None, {"sweeps": True}, ["CAM_FRONT", "CAM_BACK"]),
+        (None, {"lidar_seed": {"sweeps": True}}, ["LIDAR_TOP"]),
+        (None, {"sweeps": True, "lidar_seed": {"sweeps": True}}, ["CAM_FRONT", "CAM_BACK", "LIDAR_TOP"]),
+        (["CAM_BACK"], {}, ["CAM_BACK"]),
+        ([], {"sweeps": True}, []),
+    ],
+)
+def test_a_world_records_between_key_frames_what_is_read_there_unless_its_settings_name_sensors(
+    tmp_path, written, read, recorded
+):
+    config = load(
+        {"datasets": {"demo": demo(tmp_path, world={"sweeps": written})}, "cameras": ["CAM_FRONT", "CAM_BACK"], **read}
+    )
+    assert json.loads(stage_settings(config, "demo_world", "demo"))["world"]["sweeps"] == recorded
 
 
 def test_wrong_settings_of_a_world_are_named(tmp_path):

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers import REPOSITORY
+from helpers.demo_worlds import CAMERAS
 
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.machine.device import choose_device
@@ -179,3 +180,10 @@ def test_films_that_there_are_and_what_is_no_film_are_not_refused(target):
 def test_an_unknown_scene_is_refused_however_its_path_is_spelled():
     with pytest.raises(ConfigError, match="9999"):
         plan().refuse_unknown(["./results/9999/metrics.json"])
+
+
+@pytest.mark.parametrize(("cameras", "threads"), [(0, 1), (1, 2), (3, 6), (6, 8)])
+def test_masks_take_two_threads_for_each_camera(cameras, threads):
+    channels = sorted(CAMERAS)[:cameras]
+    made = plan(cameras=channels, eval_camera=channels[0] if channels else None)
+    assert made.mask_threads(scene("0103")) == threads

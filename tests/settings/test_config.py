@@ -323,6 +323,16 @@ def test_for_scene_without_a_method_leaves_methods_overrides_alone():
     assert for_scene(config, "0061", "mine").sky == "none"
 
 
+def test_datasets_with_equal_overrides_share_the_settings_of_a_scene():
+    """Each validation takes milliseconds, and a config may have hundreds of datasets."""
+    named = {name: {"scenes": [name], "overrides": {"sky": "none"}} for name in ("a", "b")}
+    other = {"scenes": ["c"], "overrides": {"sky": "mask"}}
+    config = load({"datasets": {**named, "c": other, "d": {"scenes": ["d"]}}})
+    assert [for_scene(config, scene).sky for scene in "abcd"] == ["none", "none", "mask", Config().sky]
+    assert for_scene(config, "a", "street") is for_scene(config, "b", "street")
+    assert for_scene(config, "a", "street") is not for_scene(config, "c", "street")
+
+
 @pytest.mark.parametrize(
     ("where", "overrides", "words"),
     [

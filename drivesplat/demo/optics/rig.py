@@ -84,7 +84,7 @@ def trigger_times(sensor: DemoSensor, world: WorldSettings) -> list[tuple[int, b
     """For each recording: microseconds since the start of the drive, whether it is a key frame, and the index of the
     key frame it belongs to."""
     rate = world.image_hz if sensor.is_camera else world.lidar_hz
-    steps = rate // world.key_frame_hz if sensor.channel in world.sweeps else 1
+    steps = rate // world.key_frame_hz if sensor.channel in (world.sweeps or ()) else 1
     return [
         (round(i * 1_000_000 / (steps * world.key_frame_hz)) + sensor.delay_us, i % steps == 0, -(-i // steps))
         for i in range((world.key_frames - 1) * steps + 1)
