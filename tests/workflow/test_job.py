@@ -1,5 +1,6 @@
 """The seam between scripts and library: what a rule's script does not wait for."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +41,16 @@ def test_garbage_is_collected_while_all_is_imported_but_by_a_rules_script(code, 
 @pytest.mark.parametrize("code", [AS_A_SCRIPT, AS_A_LIBRARY])
 def test_a_job_collects_its_own_garbage_and_looks_through_no_import(code, tmp_path):
     assert output_of(code + IN_A_JOB, tmp_path) == "True True"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="threads are counted in /proc")
+@pytest.mark.parametrize("code", [AS_A_SCRIPT, AS_A_LIBRARY])
+def test_a_rules_script_multiplies_matrices_in_its_own_thread(code, tmp_path):
+    """Snakemake sets the number of OpenBLAS's threads; stages have their own, and OpenBLAS's wait actively."""
+    asked = 'import os\nos.environ["OPENBLAS_NUM_THREADS"] = "3"\n'
+    product = 'import numpy as np\nnp.ones((900, 900)) @ np.ones((900, 900))\nprint(len(os.listdir("/proc/self/task")))'
+    as_asked = min(3, len(os.sched_getaffinity(0)))
+    assert int(output_of(asked + code + product, tmp_path)) == (1 if code is AS_A_SCRIPT else as_asked)
 
 
 def test_every_script_imports_the_job_before_the_rest_of_the_library():
