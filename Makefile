@@ -2,7 +2,7 @@
 # make setup        .venv with all packages; compiles gsplat where there is an NVIDIA GPU (idempotent; docs/installation.md)
 # make doctor       check the machine and suggest remedies
 # make test         set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
-# make test-slow    whole runs and fits that make test leaves out (two cores: three minutes)
+# make test-slow    whole runs and fits that make test leaves out (two cores: ten minutes)
 # make test-viewers pages and exports in Chromium, and in other viewers (apt-get install chromium; docs/exports.md)
 # make test-gpu     tests that need a GPU: the rasterizers agree, trainings resume
 # make test-slurm   one scene through a real SLURM, started on this machine for the test (root on Debian; docs/cluster.md)

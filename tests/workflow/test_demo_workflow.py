@@ -69,9 +69,7 @@ def test_what_only_a_synthetic_world_knows_is_measured_too(finished):
 
 def test_the_world_and_its_truth_lie_at_the_dataroot(finished):
     root = finished.folder / "resources/demo"
-    assert {path.name for path in root.iterdir()} == {
-        "maps", "samples", "sweeps", "truth", "v1.0-mini", "world.json"
-    }  # fmt: skip
+    assert {path.name for path in root.iterdir()} == {"maps", "samples", "truth", "v1.0-mini", "world.json"}
     views = json.loads((root / "truth/truth.json").read_text())["views"]
     assert [view["left_m"] for view in views if view["without"] is None] == [0.0, 2.0, -2.0, 4.0]
     assert all(len(view["frames"]) == 6 for view in views)
