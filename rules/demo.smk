@@ -1,7 +1,8 @@
 # Synthetic worlds: a start without a dataset, with ground truth that recorded drives lack.
 #
 # REQUIRED INPUTS: none.
-# OUTPUTS: the tables of a nuScenes dataset at the dataset's dataroot; samples/, sweeps/, maps/ and truth/ beside them.
+# OUTPUTS: the tables of a nuScenes dataset at the dataset's dataroot; samples/, maps/ and truth/ beside them, and sweeps/
+# where sensors record between key frames.
 
 for dataset in plan.worlds:
 

@@ -1,5 +1,6 @@
 """Recipe files (docs/quality.md). Recipes become methods; those with the same scene settings share a Snakemake run."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def _refuse_twins(runs: list[SnakemakeRun]) -> None:
     """Raises ConfigError if two recipes would train the same."""
     known: dict[str, str] = {}
     for run in runs:
-        source = _dataset(run).model_dump(mode="json", include={"dataroot", "world"})
+        source = [_dataset(run).dataroot, _world(run)]
         for recipe in run.methods:
             stages = run.plan.evaluation_stages(run.scene, [with_seed(recipe, run.seeds[0])])
             settings = {name.rpartition("/")[2]: stage["settings"] for name, stage in stages.items()}
@@ -121,17 +122,26 @@ def _refuse_twins(runs: list[SnakemakeRun]) -> None:
                 )
 
 
+def _world(run: SnakemakeRun) -> dict[str, Any] | None:
+    """The settings that generate a run's synthetic world; None for a recorded drive."""
+    if _dataset(run).world is None:
+        return None
+    return json.loads(stage_settings(run.plan.config, "demo_world", run.scene))
+
+
 def _refuse_two_worlds(runs: list[SnakemakeRun]) -> None:
     """Raises ConfigError if two runs would make different synthetic worlds in one folder, in turns."""
-    makers: dict[Path, tuple[str, str]] = {}
+    makers: dict[Path, tuple[str, dict[str, Any]]] = {}
     for run in runs:
-        dataset = _dataset(run)
-        if dataset.world is None:
+        recipe, dataset, world = run.methods[0], _dataset(run), _world(run)
+        if world is None:
             continue
-        recipe, world = run.methods[0], stage_settings(run.plan.config, "demo_world", run.scene)
         first, made = makers.setdefault(Path(dataset.world_root).resolve(), (recipe, world))
-        if made != world:
-            raise ConfigError(
-                f"recipes {first!r} and {recipe!r} make different worlds in {dataset.dataroot}; give each a dataroot "
-                "of its own, or name the sensors of both: world.cameras and world.sweeps"
-            )
+        if made == world:
+            continue
+        sensors = {name: made["world"][name] for name in ("cameras", "sweeps")}
+        same_street = made == {**world, "world": {**world["world"], **sensors}}
+        raise ConfigError(
+            f"recipes {first!r} and {recipe!r} make different worlds in {dataset.dataroot}; give each a dataroot of "
+            f"its own{', or set world.cameras and world.sweeps to the same sensors in both' * same_street}"
+        )

@@ -202,17 +202,17 @@ class Config(Settings):
 
     @cached_property
     def places(self) -> dict[tuple[str, str | None], "Config"]:
-        """Cache of `for_scene`, by dataset and method: rules call it hundreds of times."""
+        """Cache of `for_scene`, by representative dataset and method: rules call it hundreds of times."""
         return {}
 
     @cached_property
-    def place_of_dataset(self) -> dict[str, str]:
-        """The first dataset with the same overrides, by dataset: their settings are the same (see `for_scene`)."""
-        first: dict[str, str] = {}
+    def representative(self) -> dict[str, str]:
+        """The first dataset with equal overrides, by dataset: `for_scene` gives both the same settings."""
+        found: dict[str, str] = {}
         for name, dataset in self.datasets.items():
-            same = (other for other in first.values() if self.datasets[other].overrides == dataset.overrides)
-            first[name] = next(same, name)
-        return first
+            first = dict.fromkeys(found.values())
+            found[name] = next((at for at in first if self.datasets[at].overrides == dataset.overrides), name)
+        return found
 
     @cached_property
     def ablated(self) -> dict[str, MethodSettings]:
@@ -272,7 +272,7 @@ def load(values: Mapping[str, Any]) -> Config:
 
 def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
     """The config of one scene, and of one method where given. Raises ConfigError for an unknown scene."""
-    dataset, known = config.place_of_dataset[config.dataset_of(scene)], config.places
+    dataset, known = config.representative[config.dataset_of(scene)], config.places
     if (dataset, None) not in known:
         known[dataset, None] = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
     if (dataset, method) not in known:

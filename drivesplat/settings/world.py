@@ -1,7 +1,7 @@
 """Settings of synthetic worlds."""
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, model_validator
 
@@ -69,8 +69,8 @@ class WorldSettings(Settings):
     lidar_hz: Literal[10, 20] = 20
     """Revolutions of the LiDAR a second."""
     sweeps: tuple[Channel, ...] | None = None
-    """Sensors that also record between key frames. null = those that the config reads there: the cameras with the
-    setting `sweeps`, LIDAR_TOP with `lidar_seed.sweeps`."""
+    """Sensors that also record between key frames. null = those that are used there: the cameras of the setting
+    `cameras` if `sweeps` is true, LIDAR_TOP if `lidar_seed.sweeps` is true."""
     readout_s: float = Field(0.0, ge=0, le=0.1)
     """Seconds from the first row of an image to the last (rolling shutter, downwards). Timestamps are those of the
     middle row. 0 = all rows at once."""
@@ -120,17 +120,20 @@ class WorldSettings(Settings):
             raise ValueError(f"image_hz is {self.image_hz}, no multiple of key_frame_hz ({self.key_frame_hz})")
         return self
 
-    def with_sensors(self, cameras: Sequence[CameraChannel], sweeps: bool, lidar_sweeps: bool) -> "WorldSettings":
-        """These settings with the names of sensors in place of null: `cameras` record, between key frames, too, with
-        `sweeps`, and the LiDAR with `lidar_sweeps`.
+    def with_sensors(self, cameras: Sequence[str], sweeps: bool, lidar_sweeps: bool) -> "WorldSettings":
+        """These settings with the names of sensors in place of null, for a config that uses `cameras`.
+
+        These cameras record. Between key frames they record if the config uses these images (`sweeps`), and the LiDAR
+        if it uses these scans (`lidar_sweeps`). A rig has no cameras of other names.
 
         >>> made = WorldSettings().with_sensors(["CAM_FRONT"], sweeps=False, lidar_sweeps=True)
         >>> made.cameras, made.sweeps
         (('CAM_FRONT',), ('LIDAR_TOP',))
         """
         recording = tuple(cameras) if self.cameras is None else self.cameras
-        read: tuple[Channel, ...] = (*(recording if sweeps else ()), *(("LIDAR_TOP",) if lidar_sweeps else ()))
-        between = read if self.sweeps is None else self.sweeps
+        of_rig = [channel for channel in get_args(CameraChannel) if channel in recording and channel in cameras]
+        used = (*(of_rig if sweeps else ()), *(("LIDAR_TOP",) if lidar_sweeps else ()))
+        between = used if self.sweeps is None else self.sweeps
         return self.model_copy(update={"cameras": recording, "sweeps": between})
 
     @property

@@ -3,7 +3,7 @@
 import os
 import sys
 
+# Stages have threads of their own. Snakemake asks OpenBLAS for as many again, which wait actively during small matrix
+# products: a fifth of the processor time of `masks` with two threads.
 if hasattr(sys.modules["__main__"], "snakemake"):  # in a rule's script, which imports this before numpy
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    """Stages have threads of their own. Snakemake asks OpenBLAS for as many again, which then wait actively for small
-    products of matrices: 20 % of the processor time of `masks` with two threads."""

@@ -11,6 +11,7 @@ from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.outputs import Outputs
 
 MAX_MASK_THREADS = 8
+"""Maximum number of threads of the masks of a scene."""
 
 
 class JobResources(Outputs):
@@ -36,8 +37,8 @@ class JobResources(Outputs):
         return lambda wildcards: on_gpu if self.gpus(wildcards) else on_cpu
 
     def mask_threads(self, wildcards: Any) -> int:
-        """The threads of a scene's masks: two for each camera, so that masks of a front camera start beside trainings
-        of other scenes on few free processors."""
+        """The threads of a scene's masks: two for each camera, at most `MAX_MASK_THREADS`. Masks of a front camera thus
+        start beside trainings of other scenes on few free processors."""
         return min(MAX_MASK_THREADS, max(1, 2 * len(for_scene(self.config, wildcards.scene).cameras)))
 
     def _device(self, scene: str) -> tuple[str, int]:

@@ -1,6 +1,7 @@
 """A synthetic world never overwrites a recorded dataset."""
 
 import json
+import warnings
 from pathlib import Path
 
 import pytest
@@ -129,6 +130,7 @@ def test_a_worlds_stage_knows_its_scene_tables_and_street_alone(tmp_path):
     ("written", "read", "recorded"),
     [
         (None, {}, []),
+        (None, {"sweeps": True, "cameras": ["CAM_BACK", "side"], "eval_camera": "CAM_BACK"}, ["CAM_BACK"]),
         (None, {"sweeps": True}, ["CAM_FRONT", "CAM_BACK"]),
         (None, {"lidar_seed": {"sweeps": True}}, ["LIDAR_TOP"]),
         (None, {"sweeps": True, "lidar_seed": {"sweeps": True}}, ["CAM_FRONT", "CAM_BACK", "LIDAR_TOP"]),
@@ -139,10 +141,11 @@ def test_a_worlds_stage_knows_its_scene_tables_and_street_alone(tmp_path):
 def test_a_world_records_between_key_frames_what_is_read_there_unless_its_settings_name_sensors(
     tmp_path, written, read, recorded
 ):
-    config = load(
-        {"datasets": {"demo": demo(tmp_path, world={"sweeps": written})}, "cameras": ["CAM_FRONT", "CAM_BACK"], **read}
-    )
-    assert json.loads(stage_settings(config, "demo_world", "demo"))["world"]["sweeps"] == recorded
+    datasets = {"demo": demo(tmp_path, world={"sweeps": written, "cameras": ["CAM_FRONT", "CAM_BACK"]})}
+    config = load({"datasets": datasets, "cameras": ["CAM_FRONT", "CAM_BACK"], **read})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert json.loads(stage_settings(config, "demo_world", "demo"))["world"]["sweeps"] == recorded
 
 
 def test_wrong_settings_of_a_world_are_named(tmp_path):

@@ -183,7 +183,7 @@ def test_an_unknown_scene_is_refused_however_its_path_is_spelled():
 
 
 @pytest.mark.parametrize(("cameras", "threads"), [(0, 1), (1, 2), (3, 6), (6, 8)])
-def test_masks_take_two_threads_for_each_camera(cameras, threads):
+def test_masks_take_two_threads_for_each_camera_and_at_most_eight(cameras, threads):
     channels = sorted(CAMERAS)[:cameras]
     made = plan(cameras=channels, eval_camera=channels[0] if channels else None)
     assert made.mask_threads(scene("0103")) == threads

@@ -83,6 +83,7 @@ def test_a_second_call_plans_nothing(finished):
     ("changes", "expected"),
     [
         ({"world": {"random_seed": 5}}, {"demo_world_demo": 1, **AFTER_THE_WORLD}),
+        ({"overrides": {"sweeps": True}}, {"demo_world_demo": 1, **AFTER_THE_WORLD}),
         ({"overrides": {"train": {"iterations": 31}}}, {"train": 2, "evaluate": 2, "scene_metrics": 1}),
         ({"device": {"kind": "cpu"}, "batch": True}, {}),
     ],

@@ -49,8 +49,10 @@ def test_a_rules_script_multiplies_matrices_in_its_own_thread(code, tmp_path):
     """Snakemake sets the number of OpenBLAS's threads; stages have their own, and OpenBLAS's wait actively."""
     asked = 'import os\nos.environ["OPENBLAS_NUM_THREADS"] = "3"\n'
     product = 'import numpy as np\nnp.ones((900, 900)) @ np.ones((900, 900))\nprint(len(os.listdir("/proc/self/task")))'
-    as_asked = min(3, len(os.sched_getaffinity(0)))
-    assert int(output_of(asked + code + product, tmp_path)) == (1 if code is AS_A_SCRIPT else as_asked)
+    processors = len(os.sched_getaffinity(0))
+    if processors == 1:
+        pytest.skip("OpenBLAS has one thread on one processor")
+    assert int(output_of(asked + code + product, tmp_path)) == (1 if code is AS_A_SCRIPT else min(3, processors))
 
 
 def test_every_script_imports_the_job_before_the_rest_of_the_library():
