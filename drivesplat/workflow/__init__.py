@@ -3,7 +3,10 @@
 import os
 import sys
 
+IN_SCRIPT = hasattr(sys.modules["__main__"], "snakemake")
+"""Whether this runs in a rule's script, which imports this package before all others."""
+
 # Stages have threads of their own. Snakemake asks OpenBLAS for as many again, which wait actively during small matrix
 # products: a fifth of the processor time of `masks` with two threads.
-if hasattr(sys.modules["__main__"], "snakemake"):  # in a rule's script, which imports this before numpy
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+if IN_SCRIPT:
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when numpy is imported

@@ -26,6 +26,7 @@ from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.track_references import TrackReferences
 from drivesplat.settings.tracks import OTHER_TRACKS
+from drivesplat.workflow import IN_SCRIPT
 from drivesplat.workflow.gpus import hold_gpu
 
 S = TypeVar("S", bound=Settings)
@@ -33,7 +34,7 @@ S = TypeVar("S", bound=Settings)
 REFUSED_BY_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 """Errors of the disk, not of the workflow."""
 
-if hasattr(sys.modules["__main__"], "snakemake"):  # in a rule's script, which imports this first
+if IN_SCRIPT:
     gc.disable()  # until the job begins: imported objects stay, and collecting garbage among them takes 0.5 s
 
 
