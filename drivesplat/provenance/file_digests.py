@@ -84,11 +84,12 @@ def checked_digest(path: str | Path, warn: bool = True) -> str:
         return digest
     if digest != record["digest"]:
         raise unreadable(path, record["rule"], ALTERED)
-    for name, expected in record["members"].items():
-        member = path.parent / name
+    members = {path.parent / name: expected for name, expected in record["members"].items()}
+    for member in members:
         if not member.is_file():
             raise unreadable(member, record["rule"], "missing", delete=path)
-        if file_digest(member) != expected:
+    for (member, expected), found in zip(members.items(), file_digests(members).values(), strict=True):
+        if found != expected:
             raise unreadable(member, record["rule"], ALTERED, delete=path)
     return digest
 

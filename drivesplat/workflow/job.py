@@ -7,6 +7,7 @@ import logging
 import sys
 import threading
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -93,8 +94,13 @@ class Job:
         """Compares the inputs with what their rules wrote, and the dataset's files of the kinds `dataset` ('images',
         'sweeps') with what `extract` read. Raises ResultError naming an altered file and the rule that rebuilds it."""
         results = self._scene_folder()
-        for path in map(str, self.input):
-            self._read[path] = checked_digest(path, warn=results is not None and results in Path(path).parents)
+
+        def digest(path: str) -> str:
+            return checked_digest(path, warn=results is not None and results in Path(path).parents)
+
+        paths = [str(path) for path in self.input]
+        with ThreadPoolExecutor() as pool:
+            self._read.update(zip(paths, pool.map(digest, paths), strict=True))
         if dataset:
             record = self.input.scene if hasattr(self.input, "scene") else self.input.parser
             folder = Path(record).parent
@@ -113,8 +119,12 @@ class Job:
 
     def record_outputs(self) -> None:
         """Writes the digests of all files that the job has read and written."""
-        for path, before in self._members.items():
-            record_output(path, self._rule, before, self._read, self._dataset)
+
+        def record(path: str) -> None:
+            record_output(path, self._rule, self._members[path], self._read, self._dataset)
+
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(record, self._members))
 
 
 @contextmanager
