@@ -6,6 +6,8 @@ leave a hole, where an object is removed, and from beside the path. After the tr
 surroundings.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -13,10 +15,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drivesplat.kernels.morton import morton_order
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.kernels.view_colors import all_view_colors
 from drivesplat.model.part import Part
 from drivesplat.model.sky import CubemapSky, logit_of
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.views import TrainingView
 
 COVERED = 0.2
@@ -53,13 +55,10 @@ def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
         return
     weights = torch.zeros(sum(part.row_count for part in model.parts), device=model.parts[0].params["means"].device)
     for view in views:
-        picture = model.render(view.view)
-        static = torch.ones_like(picture.alpha, dtype=torch.bool)
-        if has_objects:
-            static, of_view = _static_pixels(model, picture.gaussians, view)
-            weights += of_view
+        shown = _shown(model, view, has_objects)
+        weights += shown.weights
         if texels is not None:
-            texels.add(model, view, picture, static)
+            texels.add(model, view, shown)
     if has_objects:
         for part, rows in zip(model.parts, model.rows, strict=True):
             if not part.moves:
@@ -68,22 +67,39 @@ def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
         texels.fill()
 
 
-def _static_pixels(
-    model: SplatModel, gaussians: Gaussians, view: TrainingView
-) -> tuple[Bool[Tensor, "h w"], Float[Tensor, " n"]]:
-    """The pixels of a view that show the static scene, and the weight of each Gaussian, summed over them.
+@dataclass(frozen=True)
+class _Shown:
+    """What a model shows in a view: its colours premultiplied by alpha, alpha, the pixels that show the static scene,
+    and the weight of each Gaussian, summed over these."""
+
+    splats: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w 1"]
+    static: Bool[Tensor, "h w"]
+    weights: Float[Tensor, " n"]
+
+
+def _shown(model: SplatModel, view: TrainingView, has_objects: bool) -> _Shown:
+    """What a model shows in a view. Without objects there are no weights: they are 0.
 
     The share of a pixel that shows objects is the rendering of a value that is 1 for Gaussians of objects. It is linear
     in the values: its gradient for them are the weights.
     """
+    gaussians, seen_from = model.gaussians_in(view.view), model.seen_from(view.view)
+    colors = all_view_colors(gaussians.means, gaussians.sh0, gaussians.shN, seen_from.camera_to_world)
+    nothing = colors.new_zeros(len(colors))
+    if not has_objects:
+        rendering = model.composited(gaussians, colors, view.view)
+        image, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)
+        return _Shown(image, alpha, torch.ones_like(image[..., 0], dtype=torch.bool), nothing)
     of_parts = [torch.full((part.row_count, 1), float(part.has_objects)) for part in model.parts]
-    values = torch.cat(of_parts).to(gaussians.means).requires_grad_()
+    objects = torch.cat(of_parts).to(colors).requires_grad_()
     with torch.enable_grad():
-        share = model.composited(gaussians, values, view.view).image.squeeze((0, 3))
-    static = share.detach() < COVERED
+        rendering = model.composited(gaussians, torch.cat([colors, objects], dim=1), view.view)
+        splats, share = rendering.image.squeeze(0).split([3, 1], dim=2)
+    static = share.detach().squeeze(2) < COVERED
     static = static if view.ego_mask is None else static & ~view.ego_mask
-    (weights,) = torch.autograd.grad(share, values, static.to(share))
-    return static, weights[:, 0]
+    (weights,) = torch.autograd.grad(share, objects, static[..., None].to(share))
+    return _Shown(splats.detach(), rendering.alpha.detach().squeeze(0), static, weights[:, 0])
 
 
 def _recolour(part: Part, hidden: Bool[Tensor, " n"]) -> None:
@@ -106,14 +122,14 @@ class _TexelColors:
         self._through = torch.zeros_like(self._texels[:, :1])
         self._sums = torch.zeros(len(self._texels), 4).to(self._texels)
 
-    def add(self, model: SplatModel, view: TrainingView, picture: Picture, static: Bool[Tensor, "h w"]) -> None:
-        """Adds a view whose pixels `static` show no object of the model."""
-        alpha, seen_from = picture.alpha[..., None], model.seen_from(view.view)
+    def add(self, model: SplatModel, view: TrainingView, shown: _Shown) -> None:
+        """Adds a view and what the model shows in it."""
+        alpha, seen_from = shown.alpha, model.seen_from(view.view)
         unmasked = torch.ones_like(alpha)
         for mask in (view.ego_mask, view.moving):
             unmasked = unmasked if mask is None else unmasked * ~mask[..., None]
-        background = unmasked * static[..., None]
-        colors = self._sky.behind(picture.splats, alpha, seen_from)
+        background = unmasked * shown.static[..., None]
+        colors = self._sky.behind(shown.splats, alpha, seen_from)
         values = torch.cat([unmasked * (1.0 - alpha).square(), background * colors, background], dim=-1)
         found = self._sky.sums(seen_from.rays(), values)
         self._through += found[:, :1] / self._texel_area(view)

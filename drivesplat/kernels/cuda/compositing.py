@@ -1,9 +1,10 @@
 """Alpha compositing of tiles' lists in chunks by CUDA C++ kernels, and its gradient.
 
-They differ from gsplat's, which give the same images, in four ways. A warp skips Gaussians whose ellipse does not
-reach its pixels. A thread has two pixels and adds their gradients. All gradients of a Gaussian are summed over a warp
-together, in 16 shuffles, in place of five for each. The alpha of some of the Gaussians alone can be had beside the
-image.
+They differ from gsplat's, which give the same images, in five ways. Blocks process chunks of at most LENGTH Gaussians
+of a tile's list, not the whole list, so that an image does not wait for its longest list. A warp skips Gaussians whose
+ellipse does not reach its pixels. A thread has two pixels and adds their gradients. All gradients of a Gaussian are
+summed over a warp together, in 16 shuffles, in place of five for each. The alpha of some of the Gaussians alone can be
+had beside the image.
 """
 
 from typing import Any
@@ -20,13 +21,19 @@ from drivesplat.kernels.triton.chunks import Chunks, join
 from drivesplat.kernels.triton.tiles import TILE, Footprints, TileLists
 
 THREADS = TILE.value**2 // PIXELS
+WAVES = 4
+"""The maximum number of launches that composite the chunks of an image: one for the first chunk of every tile, one for
+the second, and so on, and the last one for all others. Each skips rays that have ended in chunks of earlier ones."""
 
 
 def composite(
     gaussians: Footprints, lists: TileLists, width: int, height: int, length: int = LENGTH
 ) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
-    """Images of values, premultiplied by alpha, and alpha, as `drivesplat.kernels.triton.chunks.composite`, in chunks
-    of at most `length` Gaussians."""
+    """Images of values, premultiplied by alpha, and alpha, equal to those of gsplat's `rasterize_to_pixels`, in chunks
+    of at most `length` Gaussians.
+
+    Equal within rounding: a ray ends where its transmittance falls below 1e-4, also in an earlier chunk. One that ends
+    in a chunk of the last launch (`WAVES`) may still show Gaussians of later chunks."""
     chunks = Chunks.of(lists, length)
     values, alpha, _ = _ChunkImages.apply(*gaussians, lists, chunks, None)
     return join(values, alpha, chunks, lists, width, height)
@@ -35,10 +42,8 @@ def composite(
 def composite_with_objects(
     gaussians: Footprints, lists: TileLists, width: int, height: int, objects: slice, length: int = LENGTH
 ) -> tuple[Float[Tensor, "1 h w v"], Float[Tensor, "1 h w 1"], Float[Tensor, "1 h w 1"]]:
-    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone.
-
-    Objects do not count where the ray has ended before them: it ends within a chunk where the transmittance of all
-    Gaussians of the chunk falls below 1e-4."""
+    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone, without those behind the end of a
+    ray."""
     chunks = Chunks.of(lists, length)
     values, alpha, past_objects = _ChunkImages.apply(*gaussians, lists, chunks, objects)
     image, whole = join(values, alpha, chunks, lists, width, height)
@@ -64,7 +69,9 @@ class _ChunkImages(torch.autograd.Function):
         ctx.chunks, ctx.sizes = chunks, (len(chunks.firsts) - 1, down * across, across, *own)
         ctx.program = IMAGES if objects is None else IMAGES_WITH_OBJECTS
         written = (images, alphas, transmittances, lasts, past_objects)
-        _launch(ctx, "composite_chunks", values, *read, *written, *ctx.sizes)
+        last_wave = min(WAVES - 1, len(lists.ids) // (chunks.length * (len(chunks.firsts) - 1)))
+        for wave in range(last_wave + 1):
+            _launch(ctx, "composite_chunks", values, *read, *written, *ctx.sizes, wave, last_wave)
         ctx.save_for_backward(*read, transmittances, lasts, past_objects)
         return images, alphas, past_objects
 
