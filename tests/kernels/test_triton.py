@@ -447,6 +447,7 @@ DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "l
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
 SCAN[scan_chunks._copy] = RAYS
+SCAN |= dict.fromkeys((chunk_alpha._alpha, chunk_alpha._alpha_backward), {"reached": FLOATS})
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)

@@ -1,10 +1,12 @@
 """Alpha compositing of tiles' lists in chunks by CUDA C++ kernels, and its gradient.
 
-They differ from gsplat's, which give the same images, in five ways. Blocks process chunks of at most LENGTH Gaussians
-of a tile's list, not the whole list, so that an image does not wait for its longest list. A warp skips Gaussians whose
-ellipse does not reach its pixels. A thread has two pixels and adds their gradients. All gradients of a Gaussian are
-summed over a warp together, in 16 shuffles, in place of five for each. The alpha of some of the Gaussians alone can be
-had beside the image.
+They differ from gsplat's, which give the same images, in four ways. A warp skips Gaussians whose ellipse does not
+reach its pixels. A thread has two pixels and adds their gradients. All gradients of a Gaussian are summed over a warp
+together, in 16 shuffles, in place of five for each. The alpha of some of the Gaussians alone can be had beside the
+image.
+
+Chunks are composited at the same time, also those behind the end of a ray. The image does not show these, and their
+gradients are skipped.
 """
 
 from typing import Any
@@ -21,22 +23,16 @@ from drivesplat.kernels.triton.chunks import Chunks, join
 from drivesplat.kernels.triton.tiles import TILE, Footprints, TileLists
 
 THREADS = TILE.value**2 // PIXELS
-WAVES = 4
-"""The maximum number of launches that composite the chunks of an image: one for the first chunk of every tile, one for
-the second, and so on, and the last one for all others. Each skips rays that have ended in chunks of earlier ones."""
 
 
 def composite(
     gaussians: Footprints, lists: TileLists, width: int, height: int, length: int = LENGTH
 ) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
-    """Images of values, premultiplied by alpha, and alpha, equal to those of gsplat's `rasterize_to_pixels`, in chunks
-    of at most `length` Gaussians.
-
-    Equal within rounding: a ray ends where its transmittance falls below 1e-4, also in an earlier chunk. One that ends
-    in a chunk of the last launch (`WAVES`) may still show Gaussians of later chunks."""
+    """Images of values, premultiplied by alpha, and alpha, as `drivesplat.kernels.triton.chunks.composite`, in chunks
+    of at most `length` Gaussians."""
     chunks = Chunks.of(lists, length)
     values, alpha, _ = _ChunkImages.apply(*gaussians, lists, chunks, None)
-    return join(values, alpha, chunks, lists, width, height)
+    return join(values, alpha, chunks, lists, width, height)[:2]
 
 
 def composite_with_objects(
@@ -46,13 +42,14 @@ def composite_with_objects(
     ray."""
     chunks = Chunks.of(lists, length)
     values, alpha, past_objects = _ChunkImages.apply(*gaussians, lists, chunks, objects)
-    image, whole = join(values, alpha, chunks, lists, width, height)
-    return image, whole, alpha_of_chunks(past_objects, chunks, lists, width, height)
+    image, whole, before = join(values, alpha, chunks, lists, width, height)
+    return image, whole, alpha_of_chunks(past_objects, before, chunks, lists, width, height)
 
 
 class _ChunkImages(torch.autograd.Function):
-    """The values (m, 256, v), premultiplied by alpha, and alpha (m, 256) of each of m chunks by itself, at the pixels
-    of its tile, row by row; and the transmittance (m, 256) of the Gaussians `objects` alone, empty without them."""
+    """The values (m, 256, v), premultiplied by alpha, and alpha (m, 256), negative where the ray ends, of each of m
+    chunks by itself, at the pixels of its tile, row by row; and the transmittance (m, 256) of the Gaussians `objects`
+    alone, empty without them."""
 
     @staticmethod
     def forward(
@@ -69,9 +66,7 @@ class _ChunkImages(torch.autograd.Function):
         ctx.chunks, ctx.sizes = chunks, (len(chunks.firsts) - 1, down * across, across, *own)
         ctx.program = IMAGES if objects is None else IMAGES_WITH_OBJECTS
         written = (images, alphas, transmittances, lasts, past_objects)
-        last_wave = min(WAVES - 1, len(lists.ids) // (chunks.length * (len(chunks.firsts) - 1)))
-        for wave in range(last_wave + 1):
-            _launch(ctx, "composite_chunks", values, *read, *written, *ctx.sizes, wave, last_wave)
+        _launch(ctx, "composite_chunks", values, *read, *written, *ctx.sizes)
         ctx.save_for_backward(*read, transmittances, lasts, past_objects)
         return images, alphas, past_objects
 

@@ -46,16 +46,14 @@ struct Batch {                              // in shared memory: a Gaussian for 
     float wide[THREADS], high[THREADS];     // half the size of the box around its ellipse, in pixels
 };
 
-// The chunk of a block: its place among those of its tile, its first and last entry, and the corner of its tile in
-// pixels.
+// The chunk of a block: its first and last entry, and the corner of its tile in pixels.
 struct Chunk {
-    int place, start, end;
+    int start, end;
     float left, top;
 
     __device__ Chunk(const Lists& lists, int chunk) {
         int tile = lists.tile_of[chunk], within = tile % lists.per_camera;
-        place = chunk - lists.firsts[tile];
-        start = lists.offsets[tile] + place * LENGTH;
+        start = lists.offsets[tile] + (chunk - lists.firsts[tile]) * LENGTH;
         end = min(start + LENGTH, lists.offsets[tile + 1]);
         left = float(within % lists.across * TILE);
         top = float(within / lists.across * TILE);
@@ -116,41 +114,30 @@ __device__ __forceinline__ bool of_object(const Batch& batch, int j, int first_o
 }
 
 // Composites each chunk by itself: premultiplied values (m, 256, CHANNELS), alpha and transmittance (m, 256) by pixel,
-// the last entry of the chunk that a pixel shows (-1: none), and the transmittance of objects alone (m, 256). Chunks of
-// the places 0 to last_wave - 1 in their tile are composited one after the other, by a launch each (`wave`), and all
-// others by another one: rays that have ended in chunks of earlier launches show nothing. Transmittances of chunks in
-// which or before which a ray has ended are negative.
+// the last entry of the chunk that a pixel shows (-1: none), and the transmittance of objects alone (m, 256). Alpha is
+// negative where the ray ends.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, float* images, float* alphas,
     float* transmittances, int* lasts, float* object_transmittances, int tiles, int per_camera, int across,
-    int first_object, int end_object, int wave, int last_wave
+    int first_object, int end_object
 ) {
     if ((int)blockIdx.x >= firsts[tiles]) return;
+    __shared__ Batch batch;
     Gaussians g = {means, conics, values, opacities};
     Lists lists = {ids, order, offsets, firsts, tile_of, tiles, per_camera, across};
     Chunk chunk(lists, blockIdx.x);
-    if (min(chunk.place, last_wave) != wave) return;
-    __shared__ Batch batch;
     int thread = threadIdx.x;
     float x = column_of(thread) + 0.5f;
-    // by pixel: transmittance of earlier launches' chunks, `before`, and of this one
-    float y[PIXELS], before[PIXELS], passes[PIXELS], past_objects[PIXELS], total[PIXELS][CHANNELS] = {};
+    float y[PIXELS], passes[PIXELS], past_objects[PIXELS], total[PIXELS][CHANNELS] = {};
     int last[PIXELS];
-    bool ended[PIXELS], all_ended = true;
+    bool ended[PIXELS], all_ended = false;
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
         y[p] = row_of(thread, p) + 0.5f;
-        before[p] = passes[p] = past_objects[p] = 1.0f;
+        passes[p] = past_objects[p] = 1.0f;
         last[p] = -1;
         ended[p] = false;
-        for (int k = 1; k <= wave; ++k) {
-            long long chunk_before = (int)blockIdx.x - chunk.place + k - 1;
-            float own = transmittances[chunk_before * TILE * TILE + row_of(thread, p) * TILE + column_of(thread)];
-            ended[p] |= own < 0.0f;
-            before[p] *= own;
-        }
-        all_ended &= ended[p];
     }
     for (int begin = chunk.start; begin < chunk.end; begin += THREADS) {
         if (__syncthreads_and(all_ended)) break;
@@ -167,7 +154,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
                     float falloff, alpha = alpha_at(batch, j, dx, batch.y[j] - y[p], falloff);
                     if (ended[p] || alpha == 0.0f) continue;
                     float behind = passes[p] * (1.0f - alpha);
-                    if (before[p] * behind <= MIN_TRANSMITTANCE) {
+                    if (behind <= MIN_TRANSMITTANCE) {
                         ended[p] = true;
                         continue;
                     }
@@ -188,14 +175,15 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
         long long at = (long long)blockIdx.x * TILE * TILE + row_of(thread, p) * TILE + column_of(thread);
         #pragma unroll
         for (int k = 0; k < CHANNELS; ++k) images[at * CHANNELS + k] = total[p][k];
-        alphas[at] = 1.0f - passes[p];
-        transmittances[at] = ended[p] ? -passes[p] : passes[p];
+        alphas[at] = ended[p] ? passes[p] - 1.0f : 1.0f - passes[p];
+        transmittances[at] = passes[p];
         if (OBJECTS) object_transmittances[at] = past_objects[p];
         lasts[at] = last[p];
     }
 }
 
-// Adds the gradients of all Gaussians, given those of each chunk's values, alpha and transmittance of objects alone.
+// Adds the gradients of all Gaussians, given those of each chunk's values, absolute alpha and transmittance of objects
+// alone.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, const float* transmittances,
@@ -220,7 +208,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     for (int p = 0; p < PIXELS; ++p) {
         long long at = (long long)blockIdx.x * TILE * TILE + row_of(thread, p) * TILE + column_of(thread);
         y[p] = row_of(thread, p) + 0.5f;
-        passes[p] = fabsf(transmittances[at]);
+        passes[p] = transmittances[at];
         behind[p] = -passes[p] * v_alphas[at];
         by_objects[p] = OBJECTS ? v_object_transmittances[at] * object_transmittances[at] : 0.0f;
         bool matters = v_alphas[at] != 0.0f || by_objects[p] != 0.0f;
