@@ -142,8 +142,7 @@ def test_the_alpha_of_objects_alone_and_its_gradient_equal_those_of_torch(channe
 
 
 def one_after_the_other(given: list[torch.Tensor], objects: slice) -> tuple[torch.Tensor, ...]:
-    """The image of one tile, its alpha, that of `objects` alone, and which rays do not end, in torch, with rays that
-    end as in the kernels."""
+    """The image of one tile, its alpha and that of `objects` alone, in torch, with rays that end as in the kernels."""
     means, conics, values, opacities = (tensor[0] for tensor in given)
     at = torch.arange(TILE, device=DEVICE) + 0.5
     passes, past_objects = torch.ones(2, TILE, TILE, device=DEVICE)
@@ -159,28 +158,23 @@ def one_after_the_other(given: list[torch.Tensor], objects: slice) -> tuple[torc
         image = image + (passes * alpha)[..., None] * values[i]
         passes = passes * (1.0 - alpha)
         past_objects = past_objects * (1.0 - alpha) if objects.start <= i < objects.stop else past_objects
-    return image[None], 1.0 - passes[None, ..., None], 1.0 - past_objects[None, ..., None], lives
+    assert 0.2 < lives.float().mean() < 0.8
+    return image[None], 1.0 - passes[None, ..., None], 1.0 - past_objects[None, ..., None]
 
 
-def before_one_tile(generator: torch.Generator) -> tuple[list[torch.Tensor], TileLists]:
-    """200 Gaussians, in front of and behind which rays of a tile end, and its list."""
-    count = 200
+def check_ends_of_rays() -> None:
+    """Of 200 Gaussians, which are two batches of a block, in front of and behind which rays end."""
+    generator, count, objects = torch.Generator().manual_seed(0), 200, slice(60, 150)
     given = [
         torch.rand(1, count, 2, generator=generator) * 24.0 - 4.0,
         torch.tensor([0.05, 0.01, 0.08]) * (0.5 + torch.rand(1, count, 1, generator=generator)),
         torch.rand(1, count, 3, generator=generator),
         0.05 + 0.4 * torch.rand(1, count, generator=generator),
     ]
+    given = [values.to(DEVICE).requires_grad_() for values in given]
     ids, ends = torch.arange(count, device=DEVICE), torch.tensor([0, count], dtype=torch.int32, device=DEVICE)
-    return [values.to(DEVICE).requires_grad_() for values in given], TileLists(ids.int(), ids, ends, (1, 1, 1))
-
-
-def check_ends_of_rays() -> None:
-    """In two batches of a block."""
-    generator, objects = torch.Generator().manual_seed(0), slice(60, 150)
-    given, lists = before_one_tile(generator)
-    *expected, lives = one_after_the_other(given, objects)
-    assert 0.2 < lives.float().mean() < 0.8
+    lists = TileLists(ids.int(), ids, ends, (1, 1, 1))
+    expected = one_after_the_other(given, objects)
     for found in (
         compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects),
         compositing.composite(Footprints(*given), lists, TILE, TILE),
@@ -224,38 +218,13 @@ def test_ends_of_rays_by_the_source_compiled_for_a_processor(on_the_processor):
     check_ends_of_rays()
 
 
-def check_chunks_behind_the_end() -> None:
-    """Chunks are composited by themselves: a ray ends at most 1e-4 later than where Gaussians follow one another, and
-    nothing in the chunks behind has a gradient."""
-    given, lists = before_one_tile(torch.Generator().manual_seed(0))
-    length, early, objects = 48, 144, slice(60, 150)
-    *expected, _ = one_after_the_other(given, objects)
-    *_, goes_on = one_after_the_other([values[:, :early] for values in given], objects)
-    assert 0.1 < goes_on.float().mean() < 0.9
-    found = compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects, length)
-    for mine, theirs in zip(found[:2], expected[:2], strict=True):
-        torch.testing.assert_close(mine, theirs, atol=2e-4, rtol=0.0)
-    behind = torch.autograd.grad(sum(image[:, ~goes_on].sum() for image in found), given)
-    assert all(gradient[:, :length].any() and not gradient[:, early:].any() for gradient in behind)
-
-
-@gpu
-@needs_gpu
-def test_chunks_behind_the_end_of_a_ray_have_no_gradient():
-    check_chunks_behind_the_end()
-
-
-def test_chunks_behind_the_end_by_the_source_compiled_for_a_processor(on_the_processor):
-    check_chunks_behind_the_end()
-
-
 @gpu
 @needs_gpu
 @pytest.mark.parametrize(("cameras", "channels"), [(1, 3), (2, 1)])
 def test_images_and_gradients_equal_those_of_gsplat(cameras, channels):
     """Of long lists, with opaque Gaussians that end rays. Alpha rounded to the other side of its limit is an
     exception at single pixels."""
-    from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
+    from gsplat import rasterize_to_pixels
 
     width, height = 150, 80
     gaussians, radii, depths = ellipses(cameras, 40_000 // cameras, width, height)
@@ -263,16 +232,13 @@ def test_images_and_gradients_equal_those_of_gsplat(cameras, channels):
     given = [values.requires_grad_() for values in given]
     lists = tile_lists(Footprints(*given), radii, depths, width, height)
     assert int(lists.offsets.diff().max()) > chunks.LENGTH
-    down, across = lists.tiles[1:]
-    _, keys, ids = isect_tiles(given[0], radii, depths, TILE, across, down, n_images=cameras)
-    offsets = isect_offset_encode(keys, cameras, across, down).reshape(lists.tiles)
-    theirs = rasterize_to_pixels(*given, width, height, TILE, offsets, ids)
-    found = compositing.composite(Footprints(*given), lists, width, height)
-    for mine, expected in zip(found, theirs, strict=True):
-        off = (mine - expected).abs()
+    expected = chunks.composite(Footprints(*given), lists, width, height, rasterize_to_pixels)
+    found = compositing.composite(Footprints(*given), lists, width, height, chunks.LENGTH)
+    for mine, theirs in zip(found, expected, strict=True):
+        off = (mine - theirs).abs()
         assert float(off.mean()) < 1e-5 and float(off.max()) < 5e-3
-    for expected, mine in zip(*gradients(given, theirs, found), strict=True):
-        assert float((mine - expected).norm() / expected.norm()) < 1e-3
+    for theirs, mine in zip(*gradients(given, expected, found), strict=True):
+        assert float((mine - theirs).norm() / theirs.norm()) < 1e-3
 
 
 @gpu

@@ -26,7 +26,6 @@ from drivesplat.kernels.adam import adam_step
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
-from drivesplat.kernels.depth_error import mean_depth_error
 from drivesplat.kernels.echoes import echo_values
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import sh_basis
@@ -220,32 +219,6 @@ def test_the_entropy_of_alpha_and_its_gradient_agree_with_torch(masked, width):
         assert mean_entropy(broken).isnan() and mean_cross_entropy(broken, empty).isnan()
 
 
-@pytest.mark.parametrize(("count", "room"), [(1, 1), (19, 19), (0, 40), (20, 40), (2500, 2500), (1700, 2100)])
-def test_errors_of_depth_and_their_gradient_agree_with_torch(count, room):
-    torch.manual_seed(room)
-    depth = (1.0 + 8.0 * torch.rand(60, 50, device=DEVICE)).requires_grad_()
-    pixels = torch.randperm(3000, device=DEVICE)[:room]
-    measured = depth.detach().flatten()[pixels] + torch.randn(room, device=DEVICE).exp()
-    measured[count:] = torch.nan
-    used = None if count == room else torch.tensor(count, device=DEVICE)
-    expected, found = both_ways(lambda: [mean_depth_error(depth, pixels, measured, used)])
-    torch.testing.assert_close(found, expected, atol=0.0, rtol=1e-5)
-    theirs, mine = (torch.autograd.grad(mean, depth)[0] for (mean,) in (expected, found))
-    apart = ((mine - theirs).abs() > 1e-7).sum()
-    assert apart <= 4, "errors that agree in 22 bits with the last one that counts share its weight"
-    torch.testing.assert_close(mine.sum(), theirs.sum(), atol=1e-6, rtol=1e-5)
-
-
-def test_of_equal_errors_of_depth_those_that_count_share_their_weight():
-    """40 errors of 2 m, of which 38 count."""
-    depth = torch.full((8, 5), 3.0, device=DEVICE, requires_grad=True)
-    with triton(True):
-        found = mean_depth_error(depth, torch.arange(40, device=DEVICE), torch.full((40,), 5.0, device=DEVICE))
-    (gradient,) = torch.autograd.grad(found, depth)
-    assert float(found.detach()) == 2.0
-    torch.testing.assert_close(gradient, torch.full_like(depth, -1.0 / 40.0))
-
-
 @pytest.mark.parametrize("count", [0, 1, 700])
 def test_values_of_echoes_and_their_gradients_agree_with_torch(count):
     torch.manual_seed(count)
@@ -423,7 +396,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
 from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
-from drivesplat.kernels.triton import chunk_alpha, depth_error
+from drivesplat.kernels.triton import chunk_alpha
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
 
@@ -443,12 +416,9 @@ NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i 
 SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.COLUMNS}
 
 RAYS = {"numbers": "*i32", "values": FLOATS}
-DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "last": FLOATS}
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
 SCAN[scan_chunks._copy] = RAYS
-SCAN |= dict.fromkeys((chunk_alpha._alpha, chunk_alpha._alpha_backward), {"reached": FLOATS})
-SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
 
@@ -478,10 +448,6 @@ compiled(regularizers._spread_to_thinnest, BLOCK=regularizers.BLOCK)
 for masked in (False, True):
     compiled(alpha_entropy._sums, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
     compiled(alpha_entropy._gradients, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
-for kernel in (depth_error._errors, depth_error._gradients):
-    compiled(kernel, BLOCK=depth_error.BLOCK)
-for kernel in (depth_error._refine, depth_error._sum):
-    compiled(kernel, kept_percent=95, BLOCK=depth_error.BLOCK)
 compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
 compiled(tiles._list, BLOCK=tiles.BLOCK)
 compiled(chunks.count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)

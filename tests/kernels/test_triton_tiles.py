@@ -119,17 +119,15 @@ def test_composited_chunks_equal_whole_lists(cameras, channels, monkeypatch):
 
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_the_alpha_of_chunks_and_its_gradient_equal_those_of_torch(cameras):
-    """For tiles with no entries, one chunk, and several chunks, some of which let nothing through or do not count."""
+    """For tiles with no entries, one chunk, and several chunks, some of which let nothing through."""
     _, lists, _ = lists_of_all_lengths(cameras, 1)
     made = chunks.Chunks.of(lists, 4)
-    remains, reached = torch.rand(2, made.count, 256, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    remains = torch.rand(made.count, 256, generator=torch.Generator().manual_seed(0)).to(DEVICE)
     remains[::3, :100] = 0.0
-    reached[1::2, 50:150] = 0.0
     remains.requires_grad_()
-    found = alpha_of_chunks(remains, reached, made, lists, WIDTH, HEIGHT)
+    found = alpha_of_chunks(remains, made, lists, WIDTH, HEIGHT)
     firsts = made.firsts.tolist()
-    counted = torch.where(reached > 0.0, remains, 1.0)
-    tiles = [1.0 - counted[start:end].prod(dim=0) for start, end in pairwise(firsts)]
+    tiles = [1.0 - remains[start:end].prod(dim=0) for start, end in pairwise(firsts)]
     down, across = lists.tiles[1:]
     whole = torch.stack(tiles).reshape(cameras, down, across, 16, 16).transpose(2, 3).flatten(3, 4).flatten(1, 2)
     expected = whole[:, :HEIGHT, :WIDTH, None]

@@ -22,8 +22,6 @@ LENGTH = 512
 """Maximum number of Gaussians in a chunk."""
 MAX_VALUES = 8
 """Maximum number of values of a Gaussian: every entry of a list gets its own copy of them."""
-MIN_TRANSMITTANCE = tl.constexpr(1e-4)
-"""Transmittance below which a ray ends, as in gsplat."""
 BLOCK = 4096
 """Tiles counted at a time."""
 TILES = 128
@@ -60,10 +58,8 @@ def join(
     lists: TileLists,
     width: int,
     height: int,
-) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"], Float[Tensor, "m 256"]]:
-    """Images and alpha of all tiles, composited from those of their chunks, and the transmittance in front of each
-    chunk. A negative alpha ends the ray in its chunk, and so does a transmittance below 1e-4: chunks behind the end are
-    not shown, and 0 is the transmittance in front of them. Gradients are those by the absolute alpha."""
+) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
+    """Images and alpha of all tiles, composited from those of their chunks."""
     return _Join.apply(values, alpha, chunks.firsts, lists.tiles, width, height)
 
 
@@ -72,14 +68,14 @@ def composite(
 ) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
     """Images of values, and alpha, equal to those of gsplat's `rasterize_to_pixels`, which is the `rasterizer`.
 
-    Equal within 1e-4: a ray ends in a chunk where its transmittance in the chunk falls below 1e-4, and behind a chunk
-    where that of all chunks so far does.
+    Equal within rounding: a ray ends within a chunk where its transmittance there falls below 1e-4; later chunks may
+    still contribute.
     """
     *copies, starts, exists, firsts = _Split.apply(*gaussians, lists)
     edge = TILE.value
     each = torch.arange(len(lists.ids), dtype=torch.int32, device=lists.ids.device)
     values, alpha = rasterizer(*copies, edge, edge, edge, starts, each, masks=exists, packed=True)
-    return _Join.apply(values, alpha, firsts, lists.tiles, width, height)[:2]
+    return _Join.apply(values, alpha, firsts, lists.tiles, width, height)
 
 
 class _Split(torch.autograd.Function):
@@ -121,12 +117,12 @@ class _Split(torch.autograd.Function):
 
 
 class _Join(torch.autograd.Function):
-    """`join`: images (c, h, w, v), alpha (c, h, w, 1), and the transmittance in front of each chunk (m, 256)."""
+    """Composites chunks to images (c, h, w, v) and alpha (c, h, w, 1)."""
 
     @staticmethod
     def forward(
         ctx: Any, values: Tensor, alpha: Tensor, firsts: Tensor, tiles: tuple[int, int, int], width: int, height: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         cameras, down, across = tiles
         values, alpha, channels = values.contiguous(), alpha.contiguous(), values.shape[-1]
         before = torch.empty_like(alpha)
@@ -135,12 +131,11 @@ class _Join(torch.autograd.Function):
         ctx.sizes = (width, height, across, down * across, channels, triton.next_power_of_2(channels))
         _composite[(cameras * down * across,)](values, alpha, firsts, before, image, whole, *ctx.sizes)
         ctx.save_for_backward(values, alpha, firsts, before)
-        ctx.mark_non_differentiable(before)
-        return image, whole, before
+        return image, whole
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_whole: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, v_image: Tensor, v_whole: Tensor) -> tuple[Tensor | None, ...]:
         values, alpha, firsts, before = ctx.saved_tensors
         v_values, v_alpha = torch.empty_like(values), torch.empty_like(alpha)
         _composite_backward[(len(firsts) - 1,)](
@@ -261,22 +256,18 @@ def _composite(
     values, alpha, firsts, before, image, whole, width, height, across, per_camera,
     CHANNELS: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Composites a tile of the image; writes to `before` the transmittance in front of each of its chunks, 0 behind the
-    end of a ray."""
+    """Composites a tile of the image; writes to `before` the transmittance in front of each of its chunks."""
     tile = tl.program_id(0)
     at, inside = tile_pixels(tile, width, height, across, per_camera)
     pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
     passes = tl.full((TILE * TILE,), 1.0, tl.float32)
-    goes_on = tl.full((TILE * TILE,), 1, tl.int1)
     total = tl.zeros((TILE * TILE, WIDTH), tl.float32)
     for chunk in range(tl.load(firsts + tile), tl.load(firsts + tile + 1)):
         own = chunk * TILE * TILE + pixel
-        reaches, found = tl.where(goes_on, passes, 0.0), tl.load(alpha + own)
-        tl.store(before + own, reaches)
+        tl.store(before + own, passes)
         shown = tl.load(values + own[:, None] * CHANNELS + channel, mask=(channel < CHANNELS)[None, :], other=0.0)
-        total += reaches[:, None] * shown
-        passes = tl.where(goes_on, passes * (1.0 - tl.abs(found)), passes)
-        goes_on &= (found >= 0.0) & (passes > MIN_TRANSMITTANCE)
+        total += passes[:, None] * shown
+        passes *= 1.0 - tl.load(alpha + own)
     tl.store(whole + at, 1.0 - passes, mask=inside)
     tl.store(image + at[:, None] * CHANNELS + channel, total, mask=inside[:, None] & (channel < CHANNELS)[None, :])
 
@@ -299,9 +290,9 @@ def _composite_backward(
     first, last = tl.load(firsts + tile), tl.load(firsts + tile + 1)
     for step in range(last - first):
         own = (last - 1 - step) * TILE * TILE + pixel
-        reaches, left = tl.load(before + own), 1.0 - tl.abs(tl.load(alpha + own))
+        reaches, left = tl.load(before + own), 1.0 - tl.load(alpha + own)
         tl.store(v_values + own[:, None] * CHANNELS + channel, reaches[:, None] * v_pixel, mask=valid)
         tl.store(v_alpha + own, reaches * (v_pixel_alpha * passes - tl.sum(v_pixel * behind, 1)))
         shown = tl.load(values + own[:, None] * CHANNELS + channel, mask=valid, other=0.0)
-        behind = tl.where(reaches[:, None] > 0.0, shown + left[:, None] * behind, 0.0)
-        passes = tl.where(reaches > 0.0, passes * left, 1.0)
+        behind = shown + left[:, None] * behind
+        passes *= left
