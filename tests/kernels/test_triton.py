@@ -35,7 +35,7 @@ from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickne
 from drivesplat.kernels.road_distance import Road, by_torch, road_distance
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.kernels.time_varying_colors import colors_in_world
-from drivesplat.kernels.view_colors import fused_view_colors
+from drivesplat.kernels.view_colors import all_view_colors, fused_view_colors
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import RollingShutter, View
@@ -175,6 +175,20 @@ def test_no_fused_view_colors_without_triton_or_for_a_learned_camera_or_a_high_d
         assert fused_view_colors(*values, pose.clone().requires_grad_(), 1) is None
     with triton(False):
         assert fused_view_colors(*values, pose, 1) is None
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_colors_of_all_gaussians_have_all_coefficients(degree):
+    """Also of those behind the camera and beside its view."""
+    torch.manual_seed(0)
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
+    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
+    means, sh = torch.randn(300, 3, device=DEVICE), torch.randn(300, (degree + 1) ** 2, 3, device=DEVICE)
+    basis = sh_basis((degree + 1) ** 2, F.normalize(means - pose[:3, 3].to(DEVICE), dim=1))
+    expected = ((basis[..., None] * sh).sum(dim=1) + 0.5).clamp(min=0.0)
+    found = all_view_colors(means, sh[:, :1], sh[:, 1:], pose.to(DEVICE))
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
 def test_regularized_means_and_their_gradients_agree_with_torch():
