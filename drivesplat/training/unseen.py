@@ -86,11 +86,10 @@ def _shown(model: SplatModel, view: TrainingView, has_objects: bool) -> _Shown:
     """
     gaussians, seen_from = model.gaussians_in(view.view), model.seen_from(view.view)
     colors = all_view_colors(gaussians.means, gaussians.sh0, gaussians.shN, seen_from.camera_to_world)
-    nothing = colors.new_zeros(len(colors))
     if not has_objects:
         rendering = model.composited(gaussians, colors, view.view)
-        image, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)
-        return _Shown(image, alpha, torch.ones_like(image[..., 0], dtype=torch.bool), nothing)
+        splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)
+        return _Shown(splats, alpha, torch.ones_like(alpha[..., 0], dtype=torch.bool), colors.new_zeros(len(colors)))
     of_parts = [torch.full((part.row_count, 1), float(part.has_objects)) for part in model.parts]
     objects = torch.cat(of_parts).to(colors).requires_grad_()
     with torch.enable_grad():
