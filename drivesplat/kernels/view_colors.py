@@ -1,7 +1,5 @@
 """View-dependent colors of Gaussians from spherical harmonics."""
 
-import math
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -55,19 +53,3 @@ def fused_view_colors(
     from drivesplat.kernels.triton.view_colors import ViewColors
 
     return ViewColors.apply(means, sh0, shN, camera_to_world, degree)
-
-
-def all_view_colors(
-    means: Float[Tensor, "n 3"],
-    sh0: Float[Tensor, "n 1 3"],
-    shN: Float[Tensor, "n k_less_1 3"],
-    camera_to_world: Float[Tensor, "4 4"],
-) -> Float[Tensor, "n 3"]:
-    """The colours of all Gaussians from one camera, also of those that are out of its view, with all coefficients."""
-    degree = math.isqrt(1 + shN.shape[1]) - 1
-    colors = fused_view_colors(means, sh0, shN, camera_to_world, degree)
-    if colors is not None:
-        return colors
-    everywhere = torch.ones(1, len(means), 2, dtype=torch.int32, device=means.device)
-    viewmat = torch.linalg.inv_ex(camera_to_world).inverse[None]
-    return view_colors(means, torch.cat([sh0, shN], dim=1), viewmat, everywhere, degree)[0]

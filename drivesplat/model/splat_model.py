@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from drivesplat.errors import ResultError
-from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
@@ -18,6 +17,7 @@ from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.model.view import View, depth_at_lines, limited_scales, where_seen
+from drivesplat.model.view_colors import rasterizer_colors
 from drivesplat.rasterization import Rendering, rasterize
 
 
@@ -201,7 +201,7 @@ class SplatModel(nn.Module):
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
         shown = concatenate(sets)
         seen_from = self.seen_from(view)
-        colors, degree = _colors(shown, seen_from, sh_degree)
+        colors, degree = rasterizer_colors(shown, seen_from, sh_degree)
         rendering = rasterize(
             **self._placed(shown, seen_from), colors=colors, sh_degree=degree, absgrad=absgrad, with_depth=with_depth,
             objects=self._rows_of_objects() if with_objects else None, with_surface_depth=with_surface_depth,
@@ -289,11 +289,3 @@ class SplatModel(nn.Module):
 
 def _sets(gaussians: Gaussians | Sequence[Gaussians]) -> Sequence[Gaussians]:
     return [gaussians] if isinstance(gaussians, Gaussians) else gaussians
-
-
-def _colors(gaussians: Gaussians, view: View, sh_degree: int | None) -> tuple[Tensor, int | None]:
-    """What the rasterizer is given: coefficients and their degree, at most `sh_degree`; or, where there is a kernel for
-    it, the colours (n, 3) that the view's camera sees, and None."""
-    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
-    colors = fused_view_colors(gaussians.means, gaussians.sh0, gaussians.shN, view.camera_to_world, degree)
-    return (gaussians.sh, degree) if colors is None else (colors, None)

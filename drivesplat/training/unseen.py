@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drivesplat.kernels.morton import morton_order
-from drivesplat.kernels.view_colors import all_view_colors
 from drivesplat.model.part import Part
 from drivesplat.model.sky import CubemapSky, logit_of
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view_colors import all_view_colors
 from drivesplat.training.views import TrainingView
 
 COVERED = 0.2
@@ -84,8 +84,8 @@ def _shown(model: SplatModel, view: TrainingView, has_objects: bool) -> _Shown:
     The share of a pixel that shows objects is the rendering of a value that is 1 for Gaussians of objects. It is linear
     in the values: its gradient for them are the weights.
     """
-    gaussians, seen_from = model.gaussians_in(view.view), model.seen_from(view.view)
-    colors = all_view_colors(gaussians.means, gaussians.sh0, gaussians.shN, seen_from.camera_to_world)
+    gaussians = model.gaussians_in(view.view)
+    colors = all_view_colors(gaussians, model.seen_from(view.view))
     if not has_objects:
         rendering = model.composited(gaussians, colors, view.view)
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)

@@ -35,10 +35,12 @@ from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickne
 from drivesplat.kernels.road_distance import Road, by_torch, road_distance
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.kernels.time_varying_colors import colors_in_world
-from drivesplat.kernels.view_colors import all_view_colors, fused_view_colors
+from drivesplat.kernels.view_colors import fused_view_colors
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import RollingShutter, View
+from drivesplat.model.view_colors import all_view_colors
 from drivesplat.settings.train import McmcSettings
 from drivesplat.training.trainer import Trainer
 
@@ -187,7 +189,9 @@ def test_colors_of_all_gaussians_have_all_coefficients(degree):
     means, sh = torch.randn(300, 3, device=DEVICE), torch.randn(300, (degree + 1) ** 2, 3, device=DEVICE)
     basis = sh_basis((degree + 1) ** 2, F.normalize(means - pose[:3, 3].to(DEVICE), dim=1))
     expected = ((basis[..., None] * sh).sum(dim=1) + 0.5).clamp(min=0.0)
-    found = all_view_colors(means, sh[:, :1], sh[:, 1:], pose.to(DEVICE))
+    shapes = [torch.ones(300, *size, device=DEVICE) for size in ((4,), (3,), ())]
+    view = View(torch.eye(3, device=DEVICE), pose.to(DEVICE), 8, 6, time=0.0)
+    found = all_view_colors(Gaussians.of(means, *shapes, sh), view)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
