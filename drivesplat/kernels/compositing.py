@@ -1,25 +1,16 @@
 """Alpha compositing of projected Gaussians, front to back (Kerbl et al. 2023)."""
 
 import math
-from typing import NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels import triton_support
+from drivesplat.kernels.composited import Composited, with_depth_apart
 from drivesplat.kernels.projection import ProjectedGaussians
 
 TILE = 16
 """Edge of gsplat's tiles in pixels."""
-
-
-class Composited(NamedTuple):
-    """Images of values, premultiplied by alpha, and alpha. `objects_alpha` is that of some of the Gaussians alone, None
-    where it was not computed beside the image."""
-
-    image: Float[Tensor, "c h w v"]
-    alpha: Float[Tensor, "c h w 1"]
-    objects_alpha: Float[Tensor, "c h w 1"] | None = None
 
 
 def composite(
@@ -29,8 +20,9 @@ def composite(
     height: int,
     absgrad: bool,
     objects: slice | None = None,
+    with_depth: bool = False,
 ) -> Composited:
-    """Images of the Gaussians' `values` and alpha.
+    """Images of the Gaussians' `values` and alpha. With `with_depth` the last of the values is depth.
 
     With `absgrad` the backward pass leaves the sums over pixels of the absolute gradients of `means2d` in
     `means2d.absgrad`. Runs gsplat on a GPU, numba elsewhere. Where Triton compiles, long lists of Gaussians are cut
@@ -42,7 +34,7 @@ def composite(
     if not means2d.is_cuda:
         from drivesplat.kernels.numba.compositing import Compositing
 
-        return Composited(*Compositing.apply(*gaussians, values, width, height, absgrad))
+        return _composited(Compositing.apply(*gaussians, values, width, height, absgrad), with_depth)
     from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
     if not absgrad and triton_support.usable_for(means2d):
@@ -54,14 +46,20 @@ def composite(
             lists = tiles.tile_lists(footprints, radii, depths, width, height)
             one_camera = objects is not None and len(radii) == 1
             if one_camera and compiled.usable_for(values, compiled.IMAGES_WITH_OBJECTS):
-                return Composited(*compositing.composite_with_objects(footprints, lists, width, height, objects))
+                return compositing.composite_with_objects(
+                    footprints, lists, width, height, objects, with_depth=with_depth
+                )
             if compiled.usable_for(values, compiled.IMAGES):
-                return Composited(*compositing.composite(footprints, lists, width, height))
-            return Composited(*chunks.composite(footprints, lists, width, height, rasterize_to_pixels))
+                return compositing.composite(footprints, lists, width, height, with_depth=with_depth)
+            return chunks.composite(footprints, lists, width, height, rasterize_to_pixels, with_depth)
     cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)
     _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, across, down, n_images=cameras)
     offsets = isect_offset_encode(isect_ids, cameras, across, down).reshape(cameras, down, across)
-    image, alpha = rasterize_to_pixels(
+    whole = rasterize_to_pixels(
         means2d, conics, values, opacities, width, height, TILE, offsets, flatten_ids, absgrad=absgrad
     )
-    return Composited(image, alpha)
+    return _composited(whole, with_depth)
+
+
+def _composited(image_and_alpha: tuple[Tensor, Tensor], with_depth: bool) -> Composited:
+    return with_depth_apart(*image_and_alpha) if with_depth else Composited(*image_and_alpha)

@@ -15,12 +15,13 @@ from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
 from drivesplat.kernels import torch_private
+from drivesplat.kernels.object_poses import corrected
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
-from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
+from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
 from drivesplat.model.actor_placements import placement_sets, with_placements
 from drivesplat.model.gaussians import Gaussians, concatenate, recolored, without_colors
-from drivesplat.model.harmonics import rotation_of_harmonics
+from drivesplat.model.harmonics import rotation_of_harmonics_by
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
@@ -68,7 +69,8 @@ class Actors(Part):
         self._known_owners: tuple[Tensor | None, int, Tensor | None] = (None, 0, None)
         sizes = torch.from_numpy(np.stack([track.size for track in tracks])).float()
         self.register_buffer("_reach", 0.5 * sizes + settings.box_margin, persistent=False)
-        self.register_buffer("_annotated", self.timeline.of_actors, persistent=False)
+        self.register_buffer("_annotated_actor", self.timeline.actor_of_annotations, persistent=False)
+        self.register_buffer("_sizes", torch.ones(len(tracks)), persistent=False)
         self.register_buffer("_neighbours", self.timeline.neighbours, persistent=False)
 
     @classmethod
@@ -112,12 +114,9 @@ class Actors(Part):
 
     def poses(self, state: TimeState) -> ObjectPoses:
         """The annotated poses of the actors with their learned corrections."""
-        weights = state.weights * self._annotated
-        turns = about_vertical(weights @ self.shared["yaw"])
-        quats = (left_factor(state.quats) @ turns[..., None])[..., 0]
-        sizes = torch.ones_like(state.translations[:, 0])
-        translations = state.translations + weights @ self.shared["translation"]
-        return ObjectPoses(quats, translations, sizes, state.present.to(sizes.dtype))
+        corrections = self._annotated_actor, self.shared["yaw"], self.shared["translation"]
+        quats, translations = corrected(state.quats, state.translations, state.weights, *corrections)
+        return ObjectPoses(quats, translations, self._sizes, state.present.to(self._sizes.dtype))
 
     def local(self, state: TimeState) -> LocalGaussians:
         """The Gaussians in the frames of their objects at a time state."""
@@ -215,7 +214,7 @@ class Actors(Part):
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
         p, owner, owns = self.params, self.params["owner"], self._owns
         # colors rotate by a few degrees: their gradient would add only noise to the track
-        rotations = rotation_of_harmonics(rotation_matrix(poses.quats.detach()), p["shN"].shape[2] + 1)
+        rotations = rotation_of_harmonics_by(poses.quats, p["shN"].shape[2] + 1)
         sh = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
         return Gaussians.of(*place(self.local(state), poses, owner, owns), sh)
 

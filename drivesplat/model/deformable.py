@@ -58,6 +58,7 @@ class Deformable(Actors):
         gait = {"stride": torch.zeros(len(tracks)), "phase": torch.zeros(len(self.shared["yaw"]))}
         self.shared.update(make_parameters({**gait, **initial}))
         walked = [track.motion.walked(track.motion.times) for track in tracks]
+        self.register_buffer("_annotated", self.timeline.of_actors, persistent=False)
         self.register_buffer("_knots", torch.from_numpy(hat_functions(walked)).float(), persistent=False)
         strides = [settings.gait.stride_of(track.object_class) * float(track.size[2]) for track in tracks]
         self.register_buffer("_strides", torch.tensor(strides), persistent=False)
@@ -73,7 +74,7 @@ class Deformable(Actors):
     def cycles(self, state: TimeState) -> Float[Tensor, " a"]:
         """The phase of each actor's gait at a time state, in cycles."""
         before, here, after = self._knots  # (m,) each
-        x = self._annotated.to(state.walked.dtype).T @ state.walked  # (m,), of the annotation's actor
+        x = state.walked.index_select(0, self._annotated_actor)
         hats = torch.minimum((x - before) / (here - before), (after - x) / (after - here)).clamp(0.0, 1.0)
         weights = hats * self._annotated
         corrections = (weights @ self.shared["phase"]) / weights.sum(dim=1).clamp(min=1e-6)

@@ -11,6 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.object_poses import fused_rotation_of_harmonics
+from drivesplat.kernels.quaternions import rotation_matrix
+
 
 def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) -> Float[Tensor, "a k k"]:
     """The maps of k `coefficients` under `rotations` (object to world): sh_world = map @ sh_object.
@@ -26,6 +29,13 @@ def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) 
     directions, inverse, same_degree = _directions(coefficients, rotations.dtype, rotations.device)
     turned = directions @ rotations  # rows are R^T d
     return inverse @ sh_basis(coefficients, turned) * same_degree
+
+
+def rotation_of_harmonics_by(quats: Float[Tensor, "a 4"], coefficients: int) -> Float[Tensor, "a k k"]:
+    """`rotation_of_harmonics` by unit quaternions (w, x, y, z), object to world. Without gradient."""
+    quats = quats.detach()
+    fused = fused_rotation_of_harmonics(quats, coefficients)
+    return rotation_of_harmonics(rotation_matrix(quats), coefficients) if fused is None else fused
 
 
 def _of_vectors(rotations: Float[Tensor, "a 3 3"], coefficients: int) -> Float[Tensor, "a k k"]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from drivesplat.errors import ResultError
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import Gaussians, concatenate, concatenate_shapes
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
@@ -23,14 +23,15 @@ from drivesplat.rasterization import Rendering, rasterize
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendering of `gaussians`, which are `sets` one after the other: `image` with sky and the exposure of the view's
-    camera; `splats` without sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or
-    None; `objects_alpha`, the alpha of the parts with objects alone, None where it needs a second rendering. What is
-    opaque may hide objects behind it in `objects_alpha`. `surface_depth`, in metres or None, is that of the surfaces
-    shown, 0 where there are none; it has no gradient (`drivesplat.rasterization.rasterize`).
+    """A rendering of `sets` of Gaussians, of which `shapes` are one after the other without their colours: `image` with
+    sky and the exposure of the view's camera; `splats` without sky in the model's own colours (premultiplied by their
+    `alpha`), `depth` in metres or None; `objects_alpha`, the alpha of the parts with objects alone, None where it needs
+    a second rendering. What is opaque may hide objects behind it in `objects_alpha`. `surface_depth`, in metres or
+    None, is that of the surfaces shown, 0 where there are none; it has no gradient
+    (`drivesplat.rasterization.rasterize`).
     """
 
-    gaussians: Gaussians
+    shapes: Gaussians
     sets: Sequence[Gaussians]
     image: Float[Tensor, "h w 3"]
     splats: Float[Tensor, "h w 3"]
@@ -199,9 +200,9 @@ class SplatModel(nn.Module):
         where this needs no second rendering.
         """
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
-        shown = concatenate(sets)
+        shown = concatenate_shapes(sets)
         seen_from = self.seen_from(view)
-        colors, degree = rasterizer_colors(shown, seen_from, sh_degree)
+        colors, degree = rasterizer_colors(sets, seen_from, sh_degree)
         rendering = rasterize(
             **self._placed(shown, seen_from), colors=colors, sh_degree=degree, absgrad=absgrad, with_depth=with_depth,
             objects=self._rows_of_objects() if with_objects else None, with_surface_depth=with_surface_depth,
@@ -271,7 +272,7 @@ class SplatModel(nn.Module):
         if not all("classes" in part.params for part in self.parts):
             return None
         logits = torch.cat([part.params["classes"] for part in self.parts])
-        return self.composited(picture.gaussians, logits, view).image.squeeze(0)
+        return self.composited(picture.shapes, logits, view).image.squeeze(0)
 
     def composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
         """A rendering of `values` of Gaussians in place of their colours, without sky and exposure."""

@@ -68,6 +68,11 @@ class Timeline:
         return rows
 
     @property
+    def actor_of_annotations(self) -> Int[Tensor, " m"]:
+        """The index of the actor of each annotation."""
+        return self.of_actors.int().argmax(dim=0)
+
+    @property
     def neighbours(self) -> Int[Tensor, "q 3"]:
         """All triples of consecutive annotations without a gap."""
         triples = [

@@ -1,12 +1,13 @@
 """The rasterization call, with the meaning of gsplat's, on GPU and CPU, and its result."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.composited import Composited
 from drivesplat.kernels.compositing import composite
 from drivesplat.kernels.projection import project
 from drivesplat.kernels.surface_depth import surface_depth
@@ -122,9 +123,9 @@ def rasterize(
     cameras = len(viewmats)
     if means.is_cuda and len(means) == 0:  # gsplat's kernels need at least one Gaussian
         size = (cameras, height, width)
-        channels = colors.shape[-1] + with_depth
-        empty = assembled(means.new_zeros(*size, channels), means.new_zeros(*size, 1), with_depth)
-        return replace(empty, surface_depth=means.new_zeros(size) if with_surface_depth else None)
+        image, alpha = means.new_zeros(*size, colors.shape[-1]), means.new_zeros(*size, 1)
+        empty = Composited(image, alpha, depth=torch.zeros_like(alpha) if with_depth else None)
+        return assembled(empty, means.new_zeros(size) if with_surface_depth else None)
     gaussians = project(means, quats, scales, opacities, viewmats, Ks, width, height, antialiased)
     if sh_degree is not None:
         values = view_colors(means, colors, viewmats, gaussians.radii, sh_degree)
@@ -132,22 +133,19 @@ def rasterize(
         values = colors[None] if cameras == 1 else colors.expand(cameras, -1, -1)
     if with_depth:
         values = torch.cat([values, gaussians.depths[..., None]], dim=-1)
-    image, alpha, alone = composite(gaussians, values, width, height, absgrad, objects)
+    composited = composite(gaussians, values, width, height, absgrad, objects, with_depth)
     surfaces = None
     if with_surface_depth:
-        surfaces = surface_depth(means, quats, scales, gaussians, alpha.squeeze(-1), viewmats, Ks)
-    rendering = assembled(image, alpha, with_depth, **gaussians._asdict())
-    return replace(rendering, objects_alpha=alone, surface_depth=surfaces)
+        surfaces = surface_depth(means, quats, scales, gaussians, composited.alpha.squeeze(-1), viewmats, Ks)
+    return assembled(composited, surfaces, **gaussians._asdict())
 
 
 def assembled(
-    composited: Float[Tensor, "c h w channels"], alpha: Float[Tensor, "c h w 1"], with_depth: bool, **projected: Any
+    composited: Composited, surface_depth: Float[Tensor, "c h w"] | None = None, **projected: Any
 ) -> Rendering:
-    """A Rendering of composited values, whose last channel is depth times alpha where `with_depth`. `projected` are the
-    Gaussians in the images: means2d, radii, depths, conics, opacities."""
-    cameras, height, width = alpha.shape[:3]
+    """A Rendering of composited values. `projected` are the Gaussians in the images: means2d, radii, depths, conics,
+    opacities."""
+    cameras, height, width = composited.alpha.shape[:3]
     info = {**projected, "width": width, "height": height, "n_cameras": cameras, "gaussian_ids": None}
-    if not with_depth:
-        return Rendering(composited, alpha, None, info)
-    image, depth_sum = composited.split([composited.shape[-1] - 1, 1], dim=-1)  # slices would copy in their gradients
-    return Rendering(image, alpha, depth_sum / alpha.clamp(min=1e-10), info)
+    image, alpha, alone, depth = composited
+    return Rendering(image, alpha, depth, info, alone, surface_depth)

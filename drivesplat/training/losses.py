@@ -2,11 +2,12 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
+from drivesplat.kernels.depth_error import mean_depth_error
 from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import active_fraction
@@ -14,9 +15,6 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.views import LidarDepth, TrainingView
-
-IGNORED_DEPTHS = 0.05
-"""Fraction of the depths that the loss ignores: those with the largest errors."""
 
 MIN_DEPTH = 1.0
 """Metres: nearer depths count as this where their inverse is compared."""
@@ -39,7 +37,7 @@ def loss_terms(
     }
     if difference.moving_l1 is not None:
         terms["dynamic"] = settings.dynamic_weight * difference.moving_l1
-    terms |= regularization(picture.gaussians, model, settings)
+    terms |= regularization(picture.shapes, model, settings)
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
@@ -97,19 +95,7 @@ def class_cross_entropy(logits: Float[Tensor, "h w c"], classes: UInt8[Tensor, "
 def depth_loss(depth: Float[Tensor, "h w"], lidar: LidarDepth) -> Float[Tensor, ""]:
     """Mean absolute difference to the LiDAR depths in metres, without the largest 5 % (Street Gaussians, section 3.3):
     these are returns from behind an edge, or of surfaces that the image does not show."""
-    errors = (depth.reshape(-1).index_select(0, lidar.pixels) - lidar.depth).abs()
-    if lidar.count is not None:
-        return _mean_of_smallest(errors, lidar.count)
-    kept = max(1, int(len(errors) * (1.0 - IGNORED_DEPTHS)))
-    return torch.topk(errors, kept, largest=False, sorted=False).values.mean()
-
-
-def _mean_of_smallest(errors: Float[Tensor, " m"], count: Int[Tensor, ""]) -> Float[Tensor, ""]:
-    """The mean of the first `count` errors without the largest 5 %. Does not synchronise with the device."""
-    places = torch.arange(len(errors), device=errors.device)
-    ordered = torch.where(places < count, errors, torch.inf).sort().values
-    kept = (count.double() * (1.0 - IGNORED_DEPTHS)).long().clamp(min=1)
-    return torch.where(places < kept, ordered, 0.0).sum() / kept
+    return mean_depth_error(depth, lidar.pixels, lidar.depth, lidar.count)
 
 
 def depth_roughness(

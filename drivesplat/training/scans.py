@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from drivesplat.kernels.alpha_entropy import CERTAIN
+from drivesplat.kernels.depth_error import KEPT_PERCENT
 from drivesplat.lidar.sweeps import thin
 from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
 from drivesplat.model.splat_model import SplatModel
@@ -19,7 +20,7 @@ from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
-from drivesplat.training.losses import IGNORED_DEPTHS, regularization
+from drivesplat.training.losses import regularization
 from drivesplat.training.views import view_index
 
 SCANS_SEED = 7919
@@ -130,6 +131,6 @@ def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan
     errors = torch.where(met, (expected - scan.range).abs(), 0.0)
     with torch.no_grad():
         ascending = errors.masked_fill(~met, torch.inf).flatten().sort().values
-        last = ((1.0 - IGNORED_DEPTHS) * (met.sum().double() - 1.0)).clamp(min=0.0).long()
+        last = (KEPT_PERCENT / 100 * (met.sum().double() - 1.0)).clamp(min=0.0).long()
         kept = met & (errors <= ascending.gather(0, last[None]))
     return (errors * kept).sum() / kept.sum().clamp(min=1)

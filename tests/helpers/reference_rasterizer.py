@@ -9,6 +9,7 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
+from drivesplat.kernels.composited import Composited, with_depth_apart
 from drivesplat.rasterization.rasterization import Rendering, assembled
 
 MAX_ALPHA = 0.999
@@ -42,9 +43,8 @@ def rasterize_reference(
         images.append(image)
         alphas.append(alpha)
     image, alpha = torch.stack(images), torch.stack(alphas)
-    return assembled(
-        image, alpha, with_depth, means2d=means2d, radii=radii, depths=depths, conics=conics, opacities=opacities2d
-    )
+    composited = with_depth_apart(image, alpha) if with_depth else Composited(image, alpha)
+    return assembled(composited, means2d=means2d, radii=radii, depths=depths, conics=conics, opacities=opacities2d)
 
 
 def _project(means: Tensor, covars: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, ...]:

@@ -56,12 +56,12 @@ def check(launched, program: compiled.Program) -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="on a GPU the kernels themselves are compared")
 def test_kernels_of_images(launched):
     given, lists, _ = lists_of_all_lengths(1, 3, 1.0 / 255.0)
-    image, alpha = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT)
+    image, alpha = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT)[:2]
     torch.autograd.grad(image.sum() + alpha.sum(), given)
     check(launched, compiled.IMAGES)
     launched.clear()
-    *_, alone = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, slice(3, 9))
-    torch.autograd.grad(alone.sum(), given)
+    found = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, slice(3, 9))
+    torch.autograd.grad(found.objects_alpha.sum(), given)
     check(launched, compiled.IMAGES_WITH_OBJECTS)
 
 

@@ -102,7 +102,7 @@ def test_programs_are_usable_one_by_one(monkeypatch):
 def test_chunks_and_their_gradients_equal_those_of_torch(cameras, channels, length):
     """For tiles with no entries, less than a chunk, a full chunk, and several chunks."""
     given, lists, expected = lists_of_all_lengths(cameras, channels, 1.0 / 255.0)
-    found = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT, length)
+    found = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT, length)[:2]
     for mine, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
     for theirs, mine in zip(*gradients(given, expected, found), strict=True):
@@ -122,7 +122,7 @@ def check_alpha_of_objects(channels: int, compared: slice, length: int) -> None:
         lists.ids[lists.order[: int(lists.offsets[-1])]], least=1.0 / 255.0,
     )[1]  # fmt: skip
     assert float(alone.detach().max()) > 0.1 and float((alpha - alone).detach().max()) > 0.1
-    found = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, objects, length)
+    found = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, objects, length)[:3]
     expected = (image, alpha, alone)
     for mine, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
@@ -142,7 +142,8 @@ def test_the_alpha_of_objects_alone_and_its_gradient_equal_those_of_torch(channe
 
 
 def one_after_the_other(given: list[torch.Tensor], objects: slice) -> tuple[torch.Tensor, ...]:
-    """The image of one tile, its alpha and that of `objects` alone, in torch, with rays that end as in the kernels."""
+    """The image of one tile, its alpha, that of `objects` alone, and which rays do not end, in torch, with rays that
+    end as in the kernels."""
     means, conics, values, opacities = (tensor[0] for tensor in given)
     at = torch.arange(TILE, device=DEVICE) + 0.5
     passes, past_objects = torch.ones(2, TILE, TILE, device=DEVICE)
@@ -158,31 +159,52 @@ def one_after_the_other(given: list[torch.Tensor], objects: slice) -> tuple[torc
         image = image + (passes * alpha)[..., None] * values[i]
         passes = passes * (1.0 - alpha)
         past_objects = past_objects * (1.0 - alpha) if objects.start <= i < objects.stop else past_objects
-    assert 0.2 < lives.float().mean() < 0.8
-    return image[None], 1.0 - passes[None, ..., None], 1.0 - past_objects[None, ..., None]
+    return image[None], 1.0 - passes[None, ..., None], 1.0 - past_objects[None, ..., None], lives
 
 
-def check_ends_of_rays() -> None:
-    """Of 200 Gaussians, which are two batches of a block, in front of and behind which rays end."""
-    generator, count, objects = torch.Generator().manual_seed(0), 200, slice(60, 150)
+def in_chunks(given: list[torch.Tensor], objects: slice, length: int) -> tuple[torch.Tensor, ...]:
+    """As `one_after_the_other`, in chunks of `length` that are composited by themselves and then joined."""
+    passes, past_objects = torch.ones(2, 1, TILE, TILE, 1, device=DEVICE)
+    image, lives = torch.zeros(1, TILE, TILE, 3, device=DEVICE), torch.ones(TILE, TILE, dtype=torch.bool, device=DEVICE)
+    for begin in range(0, given[0].shape[1], length):
+        chunk = [values[:, begin : begin + length] for values in given]
+        own = slice(objects.start - begin, objects.stop - begin)
+        shown, alpha, alone, goes_on = one_after_the_other(chunk, own)
+        counts = lives[None, ..., None]
+        image = image + torch.where(counts, passes, 0.0) * shown
+        passes = torch.where(counts, passes * (1.0 - alpha), passes)
+        past_objects = torch.where(counts, past_objects * (1.0 - alone), past_objects)
+        lives = lives & goes_on & (passes[0, ..., 0] > 1e-4)
+    return image, 1.0 - passes, 1.0 - past_objects, lives
+
+
+def before_one_tile(generator: torch.Generator) -> tuple[list[torch.Tensor], TileLists]:
+    """200 Gaussians, in front of and behind which rays of a tile end, and its list."""
+    count = 200
     given = [
         torch.rand(1, count, 2, generator=generator) * 24.0 - 4.0,
         torch.tensor([0.05, 0.01, 0.08]) * (0.5 + torch.rand(1, count, 1, generator=generator)),
         torch.rand(1, count, 3, generator=generator),
         0.05 + 0.4 * torch.rand(1, count, generator=generator),
     ]
-    given = [values.to(DEVICE).requires_grad_() for values in given]
     ids, ends = torch.arange(count, device=DEVICE), torch.tensor([0, count], dtype=torch.int32, device=DEVICE)
-    lists = TileLists(ids.int(), ids, ends, (1, 1, 1))
-    expected = one_after_the_other(given, objects)
+    return [values.to(DEVICE).requires_grad_() for values in given], TileLists(ids.int(), ids, ends, (1, 1, 1))
+
+
+def check_ends_of_rays(length: int) -> None:
+    """In two batches of a block, or in chunks."""
+    generator, objects = torch.Generator().manual_seed(0), slice(60, 150)
+    given, lists = before_one_tile(generator)
+    *expected, lives = in_chunks(given, objects, length)
+    assert 0.2 < lives.float().mean() < 0.8
     for found in (
-        compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects),
-        compositing.composite(Footprints(*given), lists, TILE, TILE),
+        compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects, length)[:3],
+        compositing.composite(Footprints(*given), lists, TILE, TILE, length)[:2],
     ):
         for mine, theirs in zip(found, expected, strict=False):
             torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-4)
         retained = [values.detach().requires_grad_() for values in given]
-        both = one_after_the_other(retained, objects)[: len(found)]
+        both = in_chunks(retained, objects, length)[: len(found)]
         weights = [torch.rand(image.shape, generator=generator).to(DEVICE) for image in found]
         mine, theirs = (
             torch.autograd.grad(sum((w * image).sum() for w, image in zip(weights, images, strict=True)), inputs)
@@ -194,8 +216,9 @@ def check_ends_of_rays() -> None:
 
 @gpu
 @needs_gpu
-def test_rays_end_before_the_last_gaussian():
-    check_ends_of_rays()
+@pytest.mark.parametrize("length", [256, 48])
+def test_rays_end_before_the_last_gaussian(length):
+    check_ends_of_rays(length)
 
 
 @pytest.fixture
@@ -214,31 +237,61 @@ def test_the_alpha_of_objects_by_the_source_compiled_for_a_processor(compared, o
     check_alpha_of_objects(3, compared, 4)
 
 
-def test_ends_of_rays_by_the_source_compiled_for_a_processor(on_the_processor):
-    check_ends_of_rays()
+@pytest.mark.parametrize("length", [256, 48])
+def test_ends_of_rays_by_the_source_compiled_for_a_processor(length, on_the_processor):
+    check_ends_of_rays(length)
+
+
+def check_chunks_behind_the_end() -> None:
+    """Chunks are composited by themselves: a ray ends at most 1e-4 later than where Gaussians follow one another, and
+    nothing in the chunks behind has a gradient."""
+    given, lists = before_one_tile(torch.Generator().manual_seed(0))
+    length, early, objects = 48, 144, slice(60, 150)
+    *expected, _ = one_after_the_other(given, objects)
+    *_, goes_on = one_after_the_other([values[:, :early] for values in given], objects)
+    assert 0.1 < goes_on.float().mean() < 0.9
+    found = compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects, length)[:3]
+    for mine, theirs in zip(found[:2], expected[:2], strict=True):
+        torch.testing.assert_close(mine, theirs, atol=2e-4, rtol=0.0)
+    behind = torch.autograd.grad(sum(image[:, ~goes_on].sum() for image in found), given)
+    assert all(gradient[:, :length].any() and not gradient[:, early:].any() for gradient in behind)
+
+
+@gpu
+@needs_gpu
+def test_chunks_behind_the_end_of_a_ray_have_no_gradient():
+    check_chunks_behind_the_end()
+
+
+def test_chunks_behind_the_end_by_the_source_compiled_for_a_processor(on_the_processor):
+    check_chunks_behind_the_end()
 
 
 @gpu
 @needs_gpu
 @pytest.mark.parametrize(("cameras", "channels"), [(1, 3), (2, 1)])
 def test_images_and_gradients_equal_those_of_gsplat(cameras, channels):
-    """Of long lists, with opaque Gaussians that end rays. Alpha rounded to the other side of its limit is an
-    exception at single pixels."""
-    from gsplat import rasterize_to_pixels
+    """Of long lists, each in one chunk, with opaque Gaussians that end rays. Alpha rounded to the other side of its
+    limit is an exception at single pixels."""
+    from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
     width, height = 150, 80
     gaussians, radii, depths = ellipses(cameras, 40_000 // cameras, width, height)
     given = [gaussians.means, gaussians.conics, gaussians.values[..., :channels].contiguous(), gaussians.opacities]
     given = [values.requires_grad_() for values in given]
     lists = tile_lists(Footprints(*given), radii, depths, width, height)
-    assert int(lists.offsets.diff().max()) > chunks.LENGTH
-    expected = chunks.composite(Footprints(*given), lists, width, height, rasterize_to_pixels)
-    found = compositing.composite(Footprints(*given), lists, width, height, chunks.LENGTH)
-    for mine, theirs in zip(found, expected, strict=True):
-        off = (mine - theirs).abs()
+    longest = int(lists.offsets.diff().max())
+    assert longest > chunks.LENGTH
+    down, across = lists.tiles[1:]
+    _, keys, ids = isect_tiles(given[0], radii, depths, TILE, across, down, n_images=cameras)
+    offsets = isect_offset_encode(keys, cameras, across, down).reshape(lists.tiles)
+    theirs = rasterize_to_pixels(*given, width, height, TILE, offsets, ids)
+    found = compositing.composite(Footprints(*given), lists, width, height, longest)[:2]
+    for mine, expected in zip(found, theirs, strict=True):
+        off = (mine - expected).abs()
         assert float(off.mean()) < 1e-5 and float(off.max()) < 5e-3
-    for theirs, mine in zip(*gradients(given, expected, found), strict=True):
-        assert float((mine - theirs).norm() / theirs.norm()) < 1e-3
+    for expected, mine in zip(*gradients(given, theirs, found), strict=True):
+        assert float((mine - expected).norm() / expected.norm()) < 1e-3
 
 
 @gpu
@@ -247,6 +300,6 @@ def test_empty_lists_give_an_empty_image_and_no_gradient():
     given = [torch.zeros(1, 5, *tail, device=DEVICE).requires_grad_() for tail in ((2,), (3,), (3,), ())]
     unseen = torch.zeros(1, 5, 2, dtype=torch.int32, device=DEVICE)
     lists = tile_lists(Footprints(*given), unseen, torch.ones(1, 5, device=DEVICE), 20, 10)
-    image, alpha = compositing.composite(Footprints(*given), lists, 20, 10)
+    image, alpha = compositing.composite(Footprints(*given), lists, 20, 10)[:2]
     assert image.shape == (1, 10, 20, 3) and alpha.shape == (1, 10, 20, 1) and not image.any() and not alpha.any()
     assert not any(gradient.any() for gradient in torch.autograd.grad(image.sum() + alpha.sum(), given))

@@ -26,21 +26,24 @@ from drivesplat.kernels.adam import adam_step
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
+from drivesplat.kernels.depth_error import mean_depth_error
 from drivesplat.kernels.echoes import echo_values
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import sh_basis
+from drivesplat.kernels.object_poses import corrected
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness
 from drivesplat.kernels.road_distance import Road, by_torch, road_distance
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.kernels.time_varying_colors import colors_in_world
+from drivesplat.kernels.track_penalties import sums_of_squares
 from drivesplat.kernels.view_colors import fused_view_colors
-from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.harmonics import rotation_of_harmonics
+from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.harmonics import rotation_of_harmonics, rotation_of_harmonics_by
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import RollingShutter, View
-from drivesplat.model.view_colors import all_view_colors
+from drivesplat.model.view_colors import all_view_colors, rasterizer_colors
 from drivesplat.settings.train import McmcSettings
 from drivesplat.training.trainer import Trainer
 
@@ -148,9 +151,44 @@ def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
     assert found == [True, False, not used]
 
 
+@pytest.mark.parametrize(("objects", "annotations"), [(1, 1), (3, 20), (40, 700)])
+def test_corrected_poses_and_their_gradients_agree_with_torch(objects, annotations):
+    torch.manual_seed(0)
+    quats = F.normalize(torch.randn(objects, 4, device=DEVICE), dim=1)
+    translations, weights = torch.randn(objects, 3, device=DEVICE), torch.randn(annotations, device=DEVICE)
+    owner = torch.arange(annotations, device=DEVICE) * objects // annotations
+    yaw, shifts = (torch.randn(annotations, *size, device=DEVICE, requires_grad=True) for size in ((), (3,)))
+    expected, found = both_ways(lambda: corrected(quats, translations, weights, owner, yaw, shifts))
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-5)
+    assert_same_gradients([expected, found], [yaw, shifts], atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9])
+def test_rotations_of_harmonics_by_quaternions_agree_with_torch(coefficients):
+    torch.manual_seed(0)
+    quats = F.normalize(torch.randn(40, 4, device=DEVICE), dim=1)
+    expected, found = both_ways(lambda: rotation_of_harmonics_by(quats, coefficients))
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(found, rotation_of_harmonics(rotation_matrix(quats), coefficients), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("annotations", [0, 1, 3, 700])
+def test_penalties_of_tracks_and_their_gradients_agree_with_torch(annotations):
+    """Of two tracks with a gap between them."""
+    torch.manual_seed(0)
+    yaw, shifts = (torch.randn(annotations, *size, device=DEVICE, requires_grad=True) for size in ((), (3,)))
+    starts = torch.arange(max(0, annotations - 2))
+    neighbours = (starts[(starts < 300) | (starts > 302)][:, None] + torch.arange(3)).to(DEVICE)
+    results = both_ways(lambda: sums_of_squares(shifts, yaw, neighbours, 0.1, 0.03))
+    torch.testing.assert_close(results[1], results[0], atol=1e-4, rtol=1e-5)
+    assert_same_gradients(results, [yaw, shifts], atol=1e-3, rtol=1e-4)
+
+
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("coefficients", [1, 4, 9])
-def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients):
+@pytest.mark.parametrize("wider", [False, True])
+def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients, wider):
+    """Also where the colours are columns of a `wider` tensor."""
     if degree == 1 and coefficients == 1:
         pytest.skip("there are none of that degree")
     torch.manual_seed(0)
@@ -166,7 +204,9 @@ def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients):
     with triton(True):
         found = fused_view_colors(*inputs, pose.to(DEVICE), degree)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    assert_same_gradients([[expected], [found]], inputs, atol=1e-4, rtol=1e-4)
+    beside = torch.ones(700, 1, device=DEVICE)
+    results = [[torch.cat([colors, beside], dim=1) if wider else colors] for colors in (expected, found)]
+    assert_same_gradients(results, inputs, atol=1e-4, rtol=1e-4)
 
 
 def test_no_fused_view_colors_without_triton_or_for_a_learned_camera_or_a_high_degree():
@@ -193,6 +233,19 @@ def test_colors_of_all_gaussians_have_all_coefficients(degree):
     view = View(torch.eye(3, device=DEVICE), pose.to(DEVICE), 8, 6, time=0.0)
     found = all_view_colors(Gaussians.of(means, *shapes, sh), view)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_colors_of_several_sets_equal_those_of_one():
+    """Also where one has no coefficients of degree 1."""
+    torch.manual_seed(0)
+    sets = [
+        Gaussians.of(*(torch.randn(count, *size, device=DEVICE) for size in ((3,), (4,), (3,), (), (k, 3))))
+        for count, k in ((30, 4), (20, 1), (0, 4))
+    ]
+    view = View(torch.eye(3, device=DEVICE), torch.eye(4, device=DEVICE), 8, 6, time=0.0)
+    with triton(True):
+        found = [rasterizer_colors(of, view) for of in (sets, [concatenate(sets)])]
+    torch.testing.assert_close(found[0], found[1])
 
 
 def test_regularized_means_and_their_gradients_agree_with_torch():
@@ -235,6 +288,32 @@ def test_the_entropy_of_alpha_and_its_gradient_agree_with_torch(masked, width):
     broken[2, 0] = torch.nan
     with triton(True):
         assert mean_entropy(broken).isnan() and mean_cross_entropy(broken, empty).isnan()
+
+
+@pytest.mark.parametrize(("count", "room"), [(1, 1), (19, 19), (0, 40), (20, 40), (2500, 2500), (1700, 2100)])
+def test_errors_of_depth_and_their_gradient_agree_with_torch(count, room):
+    torch.manual_seed(room)
+    depth = (1.0 + 8.0 * torch.rand(60, 50, device=DEVICE)).requires_grad_()
+    pixels = torch.randperm(3000, device=DEVICE)[:room]
+    measured = depth.detach().flatten()[pixels] + torch.randn(room, device=DEVICE).exp()
+    measured[count:] = torch.nan
+    used = None if count == room else torch.tensor(count, device=DEVICE)
+    expected, found = both_ways(lambda: [mean_depth_error(depth, pixels, measured, used)])
+    torch.testing.assert_close(found, expected, atol=0.0, rtol=1e-5)
+    theirs, mine = (torch.autograd.grad(mean, depth)[0] for (mean,) in (expected, found))
+    apart = ((mine - theirs).abs() > 1e-7).sum()
+    assert apart <= 4, "errors that agree in 22 bits with the last one that counts share its weight"
+    torch.testing.assert_close(mine.sum(), theirs.sum(), atol=1e-6, rtol=1e-5)
+
+
+def test_of_equal_errors_of_depth_those_that_count_share_their_weight():
+    """40 errors of 2 m, of which 38 count."""
+    depth = torch.full((8, 5), 3.0, device=DEVICE, requires_grad=True)
+    with triton(True):
+        found = mean_depth_error(depth, torch.arange(40, device=DEVICE), torch.full((40,), 5.0, device=DEVICE))
+    (gradient,) = torch.autograd.grad(found, depth)
+    assert float(found.detach()) == 2.0
+    torch.testing.assert_close(gradient, torch.full_like(depth, -1.0 / 40.0))
 
 
 @pytest.mark.parametrize("count", [0, 1, 700])
@@ -414,29 +493,32 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
 from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
-from drivesplat.kernels.triton import chunk_alpha
+from drivesplat.kernels.triton import chunk_alpha, depth_error, joined_chunks, object_poses, track_penalties
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "empty": "*i1", "index": "*i64",
               "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "exists": "*i1",
-              "places": "*i32", "reached": "*i32",
+              "places": "*i32", "reached": "*i32", "neighbours": "*i64",
               "radii": "*i32", "counts": "*i32", "nearest": "*i64", "ends": "*i32", "keys": "*i16"}
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
-NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each"), "i32")
+NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each", "stride"), "i32")
 NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps", "certain"), "fp32")
-NUMBERS |= dict.fromkeys(("rows", "columns", "beams", "firings"), "i32")
+NUMBERS |= dict.fromkeys(("rows", "columns", "beams", "firings", "triples"), "i32")
 NUMBERS |= dict.fromkeys(("first_count", "last_count", "room"), "i32")
-NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range"), "fp32")
+NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range", "per_metre", "per_radian"), "fp32")
 IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
 SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.COLUMNS}
 
 RAYS = {"numbers": "*i32", "values": FLOATS}
+DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "last": FLOATS}
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
 SCAN[scan_chunks._copy] = RAYS
+SCAN |= dict.fromkeys((chunk_alpha._alpha, chunk_alpha._alpha_backward), {"reached": FLOATS})
+SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
 
@@ -445,7 +527,7 @@ def compiled(kernel, **constants):
              for name in kernel.arg_names}
     if kernel in (cube_map._blend, cube_map._gradients):
         kinds["pixels"] = "i32"
-    if kernel in (adam._step, chunks._split, chunks._composite, chunks._composite_backward):
+    if kernel in (adam._step, chunks._split, joined_chunks._composite, joined_chunks._composite_backward):
         kinds["values"] = FLOATS
     kinds |= {name: kind for name, kind in SCAN.get(kernel, {}).items() if name in kinds}
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
@@ -466,13 +548,18 @@ compiled(regularizers._spread_to_thinnest, BLOCK=regularizers.BLOCK)
 for masked in (False, True):
     compiled(alpha_entropy._sums, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
     compiled(alpha_entropy._gradients, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
+for kernel in (depth_error._errors, depth_error._gradients):
+    compiled(kernel, BLOCK=depth_error.BLOCK)
+for kernel in (depth_error._refine, depth_error._sum):
+    compiled(kernel, kept_percent=95, BLOCK=depth_error.BLOCK)
 compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
 compiled(tiles._list, BLOCK=tiles.BLOCK)
 compiled(chunks.count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
 for kernel in (chunks._split, chunks._sum_copies):
     compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
-for kernel in (chunks._composite, chunks._composite_backward):
-    compiled(kernel, CHANNELS=3, WIDTH=4)
+for kernel in (joined_chunks._composite, joined_chunks._composite_backward):
+    compiled(kernel, CHANNELS=3, WIDTH=4, DEPTH=False)
+    compiled(kernel, CHANNELS=4, WIDTH=4, DEPTH=True)
 for kernel in (chunk_alpha._alpha, chunk_alpha._alpha_backward):
     compiled(kernel)
 for motion, moving, parts in ((True, True, 2), (True, False, 2), (True, True, 1), (False, False, 1)):
@@ -492,6 +579,12 @@ compiled(scan_gradients.add_gradients, CHANNELS=2, GROUP=scan_sums.GROUP_BACKWAR
 compiled(exploration._move, BLOCK=exploration.BLOCK)
 compiled(cube_map._blend, BLOCK=cube_map.BLOCK)
 compiled(cube_map._gradients, BLOCK=cube_map.BLOCK)
+for kernel in (object_poses._correct, object_poses._correct_backward):
+    compiled(kernel, BLOCK=object_poses.BLOCK)
+for k in (1, 4):
+    compiled(object_poses._rotate_harmonics, K=k, OBJECTS=object_poses.OBJECTS)
+for kernel in (track_penalties._sums, track_penalties._gradients):
+    compiled(kernel, BLOCK=track_penalties.BLOCK)
 compiled(placement._place, BLOCK=placement.BLOCK)
 compiled(placement._place_backward, BLOCK=placement.BLOCK)
 for kernel in (time_varying_colors._colors, time_varying_colors._colors_backward):

@@ -13,6 +13,7 @@ pytest.importorskip("triton", reason="Triton is not there for this system")
 from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses, gradients, lists_of_all_lengths, rasterized
 
 from drivesplat.kernels import capacity
+from drivesplat.kernels.composited import with_depth_apart
 from drivesplat.kernels.triton import chunks
 from drivesplat.kernels.triton.chunk_alpha import alpha_of_chunks
 from drivesplat.kernels.triton.tiles import Footprints, TileLists, tile_lists
@@ -108,7 +109,7 @@ def test_composited_chunks_equal_whole_lists(cameras, channels, monkeypatch):
     multiple of the tile's."""
     monkeypatch.setattr(chunks, "LENGTH", 4)
     given, lists, expected = lists_of_all_lengths(cameras, channels)
-    found = chunks.composite(Footprints(*given), lists, WIDTH, HEIGHT, rasterized)
+    found = chunks.composite(Footprints(*given), lists, WIDTH, HEIGHT, rasterized)[:2]
     for mine, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
     assert float(found[1].detach().max()) > 0.5 and float(found[1].detach()[:, :16, :16].max()) == 0.0
@@ -117,17 +118,35 @@ def test_composited_chunks_equal_whole_lists(cameras, channels, monkeypatch):
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("channels", [4, 1])
+def test_the_last_value_is_depth_where_it_is_wanted(channels, monkeypatch):
+    """Images of values, mean depth, and their gradients, also where a pixel shows nothing."""
+    monkeypatch.setattr(chunks, "LENGTH", 4)
+    given, lists, whole = lists_of_all_lengths(1, channels)
+    expected = with_depth_apart(*whole)
+    found = chunks.composite(Footprints(*given), lists, WIDTH, HEIGHT, rasterized, with_depth=True)
+    assert found.image.shape == (1, HEIGHT, WIDTH, channels - 1) and not found.depth[:, :16, :16].any()
+    three = [(images.image, images.alpha, images.depth) for images in (expected, found)]
+    for theirs, mine in zip(*three, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-4)
+    for theirs, mine in zip(*gradients(given, *three), strict=True):
+        assert theirs.any()
+        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-3)
+
+
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_the_alpha_of_chunks_and_its_gradient_equal_those_of_torch(cameras):
-    """For tiles with no entries, one chunk, and several chunks, some of which let nothing through."""
+    """For tiles with no entries, one chunk, and several chunks, some of which let nothing through or do not count."""
     _, lists, _ = lists_of_all_lengths(cameras, 1)
     made = chunks.Chunks.of(lists, 4)
-    remains = torch.rand(made.count, 256, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    remains, reached = torch.rand(2, made.count, 256, generator=torch.Generator().manual_seed(0)).to(DEVICE)
     remains[::3, :100] = 0.0
+    reached[1::2, 50:150] = 0.0
     remains.requires_grad_()
-    found = alpha_of_chunks(remains, made, lists, WIDTH, HEIGHT)
+    found = alpha_of_chunks(remains, reached, made, lists, WIDTH, HEIGHT)
     firsts = made.firsts.tolist()
-    tiles = [1.0 - remains[start:end].prod(dim=0) for start, end in pairwise(firsts)]
+    counted = torch.where(reached > 0.0, remains, 1.0)
+    tiles = [1.0 - counted[start:end].prod(dim=0) for start, end in pairwise(firsts)]
     down, across = lists.tiles[1:]
     whole = torch.stack(tiles).reshape(cameras, down, across, 16, 16).transpose(2, 3).flatten(3, 4).flatten(1, 2)
     expected = whole[:, :HEIGHT, :WIDTH, None]
@@ -152,5 +171,5 @@ def test_empty_lists_give_an_empty_image():
     nothing = torch.zeros(0, dtype=torch.int32, device=DEVICE)
     lists = TileLists(nothing, nothing.long(), torch.zeros(3, dtype=torch.int32, device=DEVICE), (1, 1, 2))
     seen = Footprints(*(torch.zeros(1, 5, *tail, device=DEVICE) for tail in ((2,), (3,), (3,), ())))
-    image, alpha = chunks.composite(seen, lists, 20, 10, rasterized)
+    image, alpha = chunks.composite(seen, lists, 20, 10, rasterized)[:2]
     assert image.shape == (1, 10, 20, 3) and alpha.shape == (1, 10, 20, 1) and not image.any() and not alpha.any()

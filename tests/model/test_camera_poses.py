@@ -194,7 +194,7 @@ def test_objects_and_classes_are_rendered_from_the_corrected_pose(learned):
     view = a_view(1.0, moved=wrong_by(1.0))
     with torch.no_grad():
         picture = learned.render(view)
-        alone = learned.composited(picture.gaussians, torch.ones_like(picture.gaussians.means), view)
+        alone = learned.composited(picture.shapes, torch.ones_like(picture.shapes.means), view)
     torch.testing.assert_close(alone.alpha[0, ..., 0], picture.alpha)
 
 

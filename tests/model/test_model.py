@@ -508,7 +508,7 @@ def test_with_a_limit_a_large_gaussian_is_shown_as_a_smaller_one_and_others_stay
         assert float((full.render(view).alpha - shown.alpha).max()) > 0.3
     torch.testing.assert_close(shown.alpha, expected.alpha)
     torch.testing.assert_close(shown.surface_depth, expected.surface_depth)
-    assert torch.equal(shown.gaussians.scales, limited.gaussians_in(view).scales), "the model itself stays as it is"
+    assert torch.equal(shown.shapes.scales, limited.gaussians_in(view).scales), "the model itself stays as it is"
 
 
 def test_a_limited_gaussian_has_a_gradient_for_its_colour_and_none_for_its_size():

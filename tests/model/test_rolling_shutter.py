@@ -97,7 +97,7 @@ def test_an_actor_moves_during_the_readout():
 def test_a_model_without_rolling_shutter_renders_all_lines_at_once():
     found = model(rolling=False).render(view(DOWN))
     assert torch.equal(found.image, model().render(view(None)).image)
-    assert found.gaussians.velocities is None
+    assert found.shapes.velocities is None
 
 
 def test_the_rays_of_a_line_are_those_at_its_time():
@@ -115,7 +115,7 @@ def test_other_renderings_of_the_same_gaussians_are_displaced_alike():
     picture = model().render(view(DOWN))
     alpha = model().objects_alpha(picture, view(DOWN))
     rows = model().rows[1]
-    expected = model().render(view(DOWN), gaussians=picture.gaussians[rows]).alpha
+    expected = model().render(view(DOWN), gaussians=picture.shapes[rows]).alpha
     torch.testing.assert_close(alpha, expected)
     assert (alpha - model().objects_alpha(picture, view(None))).abs().max() > 0.3
 

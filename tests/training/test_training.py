@@ -264,7 +264,7 @@ def test_an_iteration_with_dropout_leaves_out_static_gaussians_and_others_next_t
     left_out = []
     for _ in range(2):
         _, picture, _ = trainer.fit_one()
-        left_out.append(picture.gaussians.opacities[still] == 0.0)
+        left_out.append(picture.shapes.opacities[still] == 0.0)
     assert all(0.1 < float(mask.float().mean()) < 0.5 for mask in left_out) and not torch.equal(*left_out)
     assert (trainer.model.gaussians_at(0.0).opacities[still] > 0.0).all()
 
@@ -782,7 +782,7 @@ def test_tensorboards_pictures_show_all_gaussians_also_with_dropout(tmp_path, mo
     monkeypatch.setattr(Monitor, "image", lambda self, step, view, picture: shown.append(picture))
     trained(tmp_path, settings_of(dropout=0.5))
     assert len(shown) == 2
-    assert all((picture.gaussians.opacities > 0.0).all() and not picture.image.requires_grad for picture in shown)
+    assert all((picture.shapes.opacities > 0.0).all() and not picture.image.requires_grad for picture in shown)
 
 
 def test_tensorboard_of_a_resumed_training_has_every_iteration_once(tmp_path):

@@ -4,6 +4,9 @@ They differ from gsplat's, which give the same images, in four ways. A warp skip
 reach its pixels. A thread has two pixels and adds their gradients. All gradients of a Gaussian are summed over a warp
 together, in 16 shuffles, in place of five for each. The alpha of some of the Gaussians alone can be had beside the
 image.
+
+Chunks are composited at the same time, also those behind the end of a ray. The image does not show these, and their
+gradients are skipped.
 """
 
 from typing import Any
@@ -13,41 +16,48 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from drivesplat.kernels.composited import Composited
 from drivesplat.kernels.cuda.compiled import IMAGES, IMAGES_WITH_OBJECTS, LENGTH, kernels
 from drivesplat.kernels.cuda.source import PIXELS
 from drivesplat.kernels.triton.chunk_alpha import alpha_of_chunks
-from drivesplat.kernels.triton.chunks import Chunks, join
-from drivesplat.kernels.triton.tiles import TILE, Footprints, TileLists
+from drivesplat.kernels.triton.chunks import Chunks
+from drivesplat.kernels.triton.joined_chunks import join
+from drivesplat.kernels.triton.pixels import TILE
+from drivesplat.kernels.triton.tiles import Footprints, TileLists
 
 THREADS = TILE.value**2 // PIXELS
 
 
 def composite(
-    gaussians: Footprints, lists: TileLists, width: int, height: int, length: int = LENGTH
-) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
-    """Images of values, premultiplied by alpha, and alpha, as `drivesplat.kernels.triton.chunks.composite`, in chunks
-    of at most `length` Gaussians."""
+    gaussians: Footprints, lists: TileLists, width: int, height: int, length: int = LENGTH, with_depth: bool = False
+) -> Composited:
+    """As `drivesplat.kernels.triton.chunks.composite`, in chunks of at most `length` Gaussians."""
     chunks = Chunks.of(lists, length)
     values, alpha, _ = _ChunkImages.apply(*gaussians, lists, chunks, None)
-    return join(values, alpha, chunks, lists, width, height)
+    return join(values, alpha, chunks.firsts, lists.tiles, width, height, with_depth)[0]
 
 
 def composite_with_objects(
-    gaussians: Footprints, lists: TileLists, width: int, height: int, objects: slice, length: int = LENGTH
-) -> tuple[Float[Tensor, "1 h w v"], Float[Tensor, "1 h w 1"], Float[Tensor, "1 h w 1"]]:
-    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone.
-
-    Objects do not count where the ray has ended before them: it ends within a chunk where the transmittance of all
-    Gaussians of the chunk falls below 1e-4."""
+    gaussians: Footprints,
+    lists: TileLists,
+    width: int,
+    height: int,
+    objects: slice,
+    length: int = LENGTH,
+    with_depth: bool = False,
+) -> Composited:
+    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone, without those behind the end of a
+    ray."""
     chunks = Chunks.of(lists, length)
     values, alpha, past_objects = _ChunkImages.apply(*gaussians, lists, chunks, objects)
-    image, whole = join(values, alpha, chunks, lists, width, height)
-    return image, whole, alpha_of_chunks(past_objects, chunks, lists, width, height)
+    whole, before = join(values, alpha, chunks.firsts, lists.tiles, width, height, with_depth)
+    return whole._replace(objects_alpha=alpha_of_chunks(past_objects, before, chunks, lists, width, height))
 
 
 class _ChunkImages(torch.autograd.Function):
-    """The values (m, 256, v), premultiplied by alpha, and alpha (m, 256) of each of m chunks by itself, at the pixels
-    of its tile, row by row; and the transmittance (m, 256) of the Gaussians `objects` alone, empty without them."""
+    """The values (m, 256, v), premultiplied by alpha, and alpha (m, 256), negative where the ray ends, of each of m
+    chunks by itself, at the pixels of its tile, row by row; and the transmittance (m, 256) of the Gaussians `objects`
+    alone, empty without them."""
 
     @staticmethod
     def forward(

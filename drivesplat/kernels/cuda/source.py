@@ -114,7 +114,8 @@ __device__ __forceinline__ bool of_object(const Batch& batch, int j, int first_o
 }
 
 // Composites each chunk by itself: premultiplied values (m, 256, CHANNELS), alpha and transmittance (m, 256) by pixel,
-// the last entry of the chunk that a pixel shows (-1: none), and the transmittance of objects alone (m, 256).
+// the last entry of the chunk that a pixel shows (-1: none), and the transmittance of objects alone (m, 256). Alpha is
+// negative where the ray ends.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, float* images, float* alphas,
@@ -174,14 +175,15 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
         long long at = (long long)blockIdx.x * TILE * TILE + row_of(thread, p) * TILE + column_of(thread);
         #pragma unroll
         for (int k = 0; k < CHANNELS; ++k) images[at * CHANNELS + k] = total[p][k];
-        alphas[at] = 1.0f - passes[p];
+        alphas[at] = ended[p] ? passes[p] - 1.0f : 1.0f - passes[p];
         transmittances[at] = passes[p];
         if (OBJECTS) object_transmittances[at] = past_objects[p];
         lasts[at] = last[p];
     }
 }
 
-// Adds the gradients of all Gaussians, given those of each chunk's values, alpha and transmittance of objects alone.
+// Adds the gradients of all Gaussians, given those of each chunk's values, absolute alpha and transmittance of objects
+// alone.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, const float* transmittances,

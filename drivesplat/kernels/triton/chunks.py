@@ -12,11 +12,15 @@ from typing import Any, no_type_check
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.triton.tiles import TILE, Footprints, TileLists
+from drivesplat.kernels.composited import Composited
+from drivesplat.kernels.triton.joined_chunks import join
+from drivesplat.kernels.triton.pixels import TILE
+from drivesplat.kernels.triton.rows import add_nonzero
+from drivesplat.kernels.triton.tiles import Footprints, TileLists
 
 LENGTH = 512
 """Maximum number of Gaussians in a chunk."""
@@ -51,31 +55,20 @@ class Chunks:
         return cls(firsts, tile_of, count, length)
 
 
-def join(
-    values: Float[Tensor, "m 256 v"],
-    alpha: Float[Tensor, "m 256"],
-    chunks: Chunks,
-    lists: TileLists,
-    width: int,
-    height: int,
-) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
-    """Images and alpha of all tiles, composited from those of their chunks."""
-    return _Join.apply(values, alpha, chunks.firsts, lists.tiles, width, height)
-
-
 def composite(
-    gaussians: Footprints, lists: TileLists, width: int, height: int, rasterizer: Rasterizer
-) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
-    """Images of values, and alpha, equal to those of gsplat's `rasterize_to_pixels`, which is the `rasterizer`.
+    gaussians: Footprints, lists: TileLists, width: int, height: int, rasterizer: Rasterizer, with_depth: bool = False
+) -> Composited:
+    """Images of values, and alpha, equal to those of gsplat's `rasterize_to_pixels`, which is the `rasterizer`. With
+    `with_depth` the last of the values is depth.
 
-    Equal within rounding: a ray ends within a chunk where its transmittance there falls below 1e-4; later chunks may
-    still contribute.
+    Rays end later than there: in a chunk where their transmittance in the chunk falls below 1e-4, and behind a chunk
+    where that of all chunks so far does. Alpha of pixels that opaque Gaussians cover is 1e-4 larger.
     """
     *copies, starts, exists, firsts = _Split.apply(*gaussians, lists)
     edge = TILE.value
     each = torch.arange(len(lists.ids), dtype=torch.int32, device=lists.ids.device)
     values, alpha = rasterizer(*copies, edge, edge, edge, starts, each, masks=exists, packed=True)
-    return _Join.apply(values, alpha, firsts, lists.tiles, width, height)
+    return join(values.flatten(1, 2), alpha.flatten(1), firsts, lists.tiles, width, height, with_depth)[0]
 
 
 class _Split(torch.autograd.Function):
@@ -114,34 +107,6 @@ class _Split(torch.autograd.Function):
             *copies, ids, order, offsets, firsts, starts, *summed, tiles, ctx.shapes[2][-1], LENGTH
         )
         return *summed, None
-
-
-class _Join(torch.autograd.Function):
-    """Composites chunks to images (c, h, w, v) and alpha (c, h, w, 1)."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, values: Tensor, alpha: Tensor, firsts: Tensor, tiles: tuple[int, int, int], width: int, height: int
-    ) -> tuple[Tensor, Tensor]:
-        cameras, down, across = tiles
-        values, alpha, channels = values.contiguous(), alpha.contiguous(), values.shape[-1]
-        before = torch.empty_like(alpha)
-        image = values.new_empty(cameras, height, width, channels)
-        whole = values.new_empty(cameras, height, width, 1)
-        ctx.sizes = (width, height, across, down * across, channels, triton.next_power_of_2(channels))
-        _composite[(cameras * down * across,)](values, alpha, firsts, before, image, whole, *ctx.sizes)
-        ctx.save_for_backward(values, alpha, firsts, before)
-        return image, whole
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_whole: Tensor) -> tuple[Tensor | None, ...]:
-        values, alpha, firsts, before = ctx.saved_tensors
-        v_values, v_alpha = torch.empty_like(values), torch.empty_like(alpha)
-        _composite_backward[(len(firsts) - 1,)](
-            values, alpha, firsts, before, v_image.contiguous(), v_whole.contiguous(), v_values, v_alpha, *ctx.sizes
-        )
-        return v_values, v_alpha, None, None, None, None
 
 
 @triton.jit(do_not_specialize=["tiles"])
@@ -211,13 +176,6 @@ def _split(
     tl.store(opacities_copies + place, tl.load(opacities + i, mask=inside, other=0.0), mask=inside)
 
 
-@triton.jit
-@no_type_check
-def add_nonzero(total, value, inside):
-    """Adds values other than 0."""
-    tl.atomic_add(total, value, mask=inside & (value != 0.0), sem="relaxed")
-
-
 @triton.jit(do_not_specialize=["tiles"])
 @no_type_check
 def _sum_copies(
@@ -238,61 +196,3 @@ def _sum_copies(
         value = tl.load(v_values_copies + CHANNELS * place + k, mask=inside, other=0.0)
         add_nonzero(v_values + CHANNELS * i + k, value, inside)
     add_nonzero(v_opacities + i, tl.load(v_opacities_copies + place, mask=inside, other=0.0), inside)
-
-
-@triton.jit
-@no_type_check
-def tile_pixels(tile, width, height, across, per_camera):
-    """The indices of a tile's pixels among those of all cameras, and which of them are in the image."""
-    pixel = tl.arange(0, TILE * TILE)
-    camera, within = tile // per_camera, tile % per_camera
-    x, y = within % across * TILE + pixel % TILE, within // across * TILE + pixel // TILE
-    return (camera * height + y) * width + x, (x < width) & (y < height)
-
-
-@triton.jit(do_not_specialize=["width", "height", "across", "per_camera"])
-@no_type_check
-def _composite(
-    values, alpha, firsts, before, image, whole, width, height, across, per_camera,
-    CHANNELS: tl.constexpr, WIDTH: tl.constexpr,
-):  # fmt: skip
-    """Composites a tile of the image; writes to `before` the transmittance in front of each of its chunks."""
-    tile = tl.program_id(0)
-    at, inside = tile_pixels(tile, width, height, across, per_camera)
-    pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
-    passes = tl.full((TILE * TILE,), 1.0, tl.float32)
-    total = tl.zeros((TILE * TILE, WIDTH), tl.float32)
-    for chunk in range(tl.load(firsts + tile), tl.load(firsts + tile + 1)):
-        own = chunk * TILE * TILE + pixel
-        tl.store(before + own, passes)
-        shown = tl.load(values + own[:, None] * CHANNELS + channel, mask=(channel < CHANNELS)[None, :], other=0.0)
-        total += passes[:, None] * shown
-        passes *= 1.0 - tl.load(alpha + own)
-    tl.store(whole + at, 1.0 - passes, mask=inside)
-    tl.store(image + at[:, None] * CHANNELS + channel, total, mask=inside[:, None] & (channel < CHANNELS)[None, :])
-
-
-@triton.jit(do_not_specialize=["width", "height", "across", "per_camera"])
-@no_type_check
-def _composite_backward(
-    values, alpha, firsts, before, v_image, v_whole, v_values, v_alpha, width, height, across, per_camera,
-    CHANNELS: tl.constexpr, WIDTH: tl.constexpr,
-):  # fmt: skip
-    """Writes the gradients of a tile's chunks, from the last to the first."""
-    tile = tl.program_id(0)
-    at, inside = tile_pixels(tile, width, height, across, per_camera)
-    pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
-    valid = (channel < CHANNELS)[None, :]
-    v_pixel = tl.load(v_image + at[:, None] * CHANNELS + channel, mask=inside[:, None] & valid, other=0.0)
-    v_pixel_alpha = tl.load(v_whole + at, mask=inside, other=0.0)
-    passes = tl.full((TILE * TILE,), 1.0, tl.float32)
-    behind = tl.zeros((TILE * TILE, WIDTH), tl.float32)
-    first, last = tl.load(firsts + tile), tl.load(firsts + tile + 1)
-    for step in range(last - first):
-        own = (last - 1 - step) * TILE * TILE + pixel
-        reaches, left = tl.load(before + own), 1.0 - tl.load(alpha + own)
-        tl.store(v_values + own[:, None] * CHANNELS + channel, reaches[:, None] * v_pixel, mask=valid)
-        tl.store(v_alpha + own, reaches * (v_pixel_alpha * passes - tl.sum(v_pixel * behind, 1)))
-        shown = tl.load(values + own[:, None] * CHANNELS + channel, mask=valid, other=0.0)
-        behind = shown + left[:, None] * behind
-        passes *= left

@@ -1,4 +1,4 @@
-"""Loads and stores of the rows of (n, 2), (n, 3) and (n, 4) arrays."""
+"""Loads and stores of the rows of (n, 2), (n, 3) and (n, 4) arrays, and sums in place."""
 
 from typing import no_type_check
 
@@ -62,3 +62,10 @@ def unit(values, i, valid):
     w, x, y, z = quaternion(values, i, valid)
     length = tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     return w / length, x / length, y / length, z / length, length
+
+
+@triton.jit
+@no_type_check
+def add_nonzero(total, value, inside):
+    """Adds values other than 0."""
+    tl.atomic_add(total, value, mask=inside & (value != 0.0), sem="relaxed")

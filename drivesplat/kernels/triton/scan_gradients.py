@@ -5,7 +5,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from drivesplat.kernels.triton.chunks import add_nonzero
+from drivesplat.kernels.triton.rows import add_nonzero
 from drivesplat.kernels.triton.scan_chunks import (
     CONIC_AA,
     CONIC_AE,

@@ -13,11 +13,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drivesplat.kernels.capacity import capacity_for
+from drivesplat.kernels.triton.pixels import TILE
 
 BLOCK = 128
 """Gaussians per program."""
-TILE = tl.constexpr(16)
-"""Edge of a tile in pixels."""
 MIN_ALPHA = tl.constexpr(1.0 / 255.0)
 """Minimum alpha: smaller contributions are not rasterized, as in 3D Gaussian Splatting."""
 SLACK = tl.constexpr(0.01)

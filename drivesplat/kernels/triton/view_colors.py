@@ -38,10 +38,11 @@ class ViewColors(torch.autograd.Function):
         count, others = shN.shape[:2]
         v_means, v_sh0 = torch.empty_like(means), means.new_empty(count, 1, 3)
         v_shN = torch.empty_like(shN) if ctx.degree == 1 and others == 3 else torch.zeros_like(shN)
+        v_colors = v_colors if v_colors.stride(1) == 1 else v_colors.contiguous()  # columns of more are not copied
         if count:
             _colors_backward[(triton.cdiv(count, BLOCK),)](
-                means, shN, camera, colors, v_colors.contiguous(), v_means, v_sh0, v_shN,
-                count, others, ctx.degree, BLOCK,
+                means, shN, camera, colors, v_colors, v_means, v_sh0, v_shN,
+                count, v_colors.stride(0), others, ctx.degree, BLOCK,
             )  # fmt: skip
         return v_means, v_sh0, v_shN, None, None
 
@@ -94,12 +95,12 @@ def _colors(means, sh0, shN, camera, colors, count, OTHERS: tl.constexpr, DEGREE
 @triton.jit(do_not_specialize=["count"])
 @no_type_check
 def _colors_backward(
-    means, shN, camera, colors, v_colors, v_means, v_sh0, v_shN, count,
+    means, shN, camera, colors, v_colors, v_means, v_sh0, v_shN, count, stride,
     OTHERS: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i, k, channel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4), tl.arange(0, 4)
     color, known, linear, exists = _indices(i, k, channel, i < count, OTHERS)
-    v_color = tl.load(v_colors + color, mask=known, other=0.0)
+    v_color = tl.load(v_colors + stride * i[:, None] + channel[None, :], mask=known, other=0.0)
     v_color = tl.where(tl.load(colors + color, mask=known, other=0.0) > 0.0, v_color, 0.0)
     tl.store(v_sh0 + color, CONSTANT * v_color, mask=known)
     direction, at, inside, length = _directions(means, camera, i, k, i < count)
