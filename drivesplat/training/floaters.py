@@ -1,6 +1,7 @@
 """Floaters: Gaussians where nothing is seen, since the ego vehicle drove or LiDAR rays passed through the space, or the
 road hides it."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,3 +121,9 @@ def fade_floaters(part: Part, empty: EmptySpace) -> None:
     keeps a margin around LiDAR returns, so a centre inside it belongs to no surface.
     """
     part.fade(empty.holds(part.params["means"]))
+
+
+def fade_in_empty_space(parts: Iterable[Part], empty: EmptySpace) -> None:
+    """Fades the Gaussians of all static `parts` whose centres lie in empty space, where any is known."""
+    for part in (part for part in parts if not part.moves and empty.known):
+        fade_floaters(part, empty)

@@ -19,8 +19,9 @@ from drivesplat.model.reach import bound_positions, reach_of
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import resume_state
+from drivesplat.training.averaging import ParameterAverage
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
-from drivesplat.training.floaters import EmptySpace, SensorPath, fade_floaters
+from drivesplat.training.floaters import EmptySpace, SensorPath, fade_in_empty_space
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor
 from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
@@ -112,6 +113,7 @@ class TrainingRun:
     """When the state was last saved, or else when this run began (`time.monotonic`, as `began`)."""
     curves: CurveViews
     visits: Visits
+    average: ParameterAverage
 
     @classmethod
     def begin(cls, trainer: Trainer, folders: TrainingFolders, curves: CurveViews, visits: Visits) -> "TrainingRun":
@@ -119,15 +121,18 @@ class TrainingRun:
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(trainer.device)
+        average = ParameterAverage.of(trainer.settings)
         saved = resume_state.resumable(folders.state, folders.fingerprint)
         if saved is None:
             shutil.rmtree(folders.tensorboard, ignore_errors=True)
-            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves, visits)
+            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves, visits, average)
         resume_state.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
+        average.restore(saved["average"], trainer.device)
         log.info("resuming at iteration %d of %d", trainer.step, trainer.iterations)
         now = time.monotonic()
-        return cls(trainer, folders, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now, curves, visits)
+        resumed_at = [*saved["resumed_at"], trainer.step]
+        return cls(trainer, folders, saved["seconds"], resumed_at, now, now, curves, visits, average)
 
     @property
     def seconds(self) -> float:
@@ -154,6 +159,7 @@ class TrainingRun:
             "seconds": self.seconds,
             "resumed_at": self.resumed_at,
             "state": resume_state.state_of(t.model, t.optimizers, t.densifiers, t.device),
+            "average": self.average.state(),
         }
         checkpoint_file.save(self.folders.state, content)
         self.saved = time.monotonic()
@@ -214,6 +220,9 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
             terms, picture, view = trainer.fit_one(with_picture)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
+                if run.average.follow(trainer.step, trainer.model):
+                    _confine(trainer)  # the mean of those that were faded within the average is between
+                    fade_in_empty_space(trainer.model.parts, empty)
                 _bound(trainer, reach)
             if trainer.step % settings.log_every == 0:
                 run.check()
@@ -248,14 +257,19 @@ def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> No
     if trainer.checks_due():
         run.check()  # NaN in a strategy triggers a GPU assertion, after which the process cannot continue
         trainer.graphs.check()
-        for part in () if fine_tunes else trainer.model.parts:
-            part.confine()
+        if not fine_tunes:
+            _confine(trainer)
     trainer.densify(picture)
     if len(trainer.model) == 0:
         run.check()
-    if empty.known and not fine_tunes and trainer.step % settings.floaters.every == 0:
-        for part in (part for part in trainer.model.parts if not part.moves):
-            fade_floaters(part, empty)
+    if not fine_tunes and trainer.step % settings.floaters.every == 0:
+        fade_in_empty_space(trainer.model.parts, empty)
+
+
+def _confine(trainer: Trainer) -> None:
+    """Fades Gaussians of objects outside their boxes."""
+    for part in trainer.model.parts:
+        part.confine()
 
 
 def _bound(trainer: Trainer, reach: float) -> None:
