@@ -66,7 +66,7 @@ def regularization(gaussians: Gaussians, model: SplatModel, settings: TrainSetti
     if not any(weights.values()):
         return {}
     means, active = mean_opacity_and_scale(gaussians.opacities, gaussians.scales), active_fraction(model.parts)
-    return {name: w * mean / active for (name, w), mean in zip(weights.items(), means, strict=True) if w}
+    return {name: (w / active) * mean for (name, w), mean in zip(weights.items(), means, strict=True) if w}
 
 
 def _dynamic_terms(

@@ -15,12 +15,12 @@ from tqdm import tqdm
 
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.io.storage import unwritable
+from drivesplat.kernels.finite import NEVER, record_not_finite
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
 
-NEVER = 2**62
 WATCHED = 65_536
 """Maximum number of values in all combinations that iterations of a training watch."""
 LOGGED_EVERY_S = 10.0
@@ -57,9 +57,8 @@ class FiniteGuard:
             if begin + len(names) > WATCHED:
                 raise ValueError(f"iterations watch more than {WATCHED} values")
             self._first[names] = self._records[begin : begin + len(names)]
-        finite = torch.isfinite(torch.stack([value.detach() for value in values.values()]))
-        first = self._first[names]
-        torch.minimum(first, torch.where(finite, NEVER, step), out=first)
+        stacked = torch.stack([value.detach() for value in values.values()])
+        record_not_finite(stacked, step, self._first[names])
 
     def check(self, checkpoint: str, tracks: Callable[[], list[str]] = list) -> None:
         """Raises TrainingError naming the earliest iteration and its terms where one was not finite, and the `tracks`

@@ -29,6 +29,7 @@ from drivesplat.kernels.cube_map import CubeMap, over_cube_map
 from drivesplat.kernels.depth_error import mean_depth_error
 from drivesplat.kernels.echoes import echo_values
 from drivesplat.kernels.exploration import explore
+from drivesplat.kernels.finite import NEVER, record_not_finite
 from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.kernels.object_poses import corrected
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
@@ -114,6 +115,21 @@ def test_an_empty_moving_mask_gives_no_difference_and_no_gradient():
         moving = color_difference(image, pixels, None, nowhere).moving_l1
     moving.backward()
     assert float(moving.detach()) == 0.0 and not image.grad.any()
+
+
+@pytest.mark.parametrize("count", [1, 130])
+def test_the_first_iterations_of_values_that_are_not_finite_agree_with_torch(count):
+    values = torch.linspace(-3.0, 3e38, count, device=DEVICE)
+    values[::3], values[1::5], values[2::7] = torch.nan, torch.inf, -torch.inf
+    found = []
+    for used in (False, True):
+        first = torch.full((count,), NEVER, device=DEVICE)
+        first[::2] = 5
+        with triton(used):
+            for step in (7, 3):
+                record_not_finite(values, torch.tensor(step, device=DEVICE), first)
+        found.append(first)
+    assert torch.equal(*found) and (found[0] == 3).any()
 
 
 def test_adam_steps_agree_with_torch():
@@ -493,7 +509,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
 from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
-from drivesplat.kernels.triton import chunk_alpha, depth_error, joined_chunks, object_poses, track_penalties
+from drivesplat.kernels.triton import chunk_alpha, depth_error, finite, joined_chunks, object_poses, track_penalties
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
 
@@ -506,7 +522,7 @@ NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "se
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each", "stride"), "i32")
 NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps", "certain"), "fp32")
 NUMBERS |= dict.fromkeys(("rows", "columns", "beams", "firings", "triples"), "i32")
-NUMBERS |= dict.fromkeys(("first_count", "last_count", "room"), "i32")
+NUMBERS |= dict.fromkeys(("first_count", "last_count", "room", "blocks"), "i32")
 NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range", "per_metre", "per_radian"), "fp32")
 IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
@@ -517,6 +533,7 @@ DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "l
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
 SCAN[scan_chunks._copy] = RAYS
+SCAN[finite._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
 SCAN |= dict.fromkeys((chunk_alpha._alpha, chunk_alpha._alpha_backward), {"reached": FLOATS})
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
@@ -542,6 +559,7 @@ compiled(adam._step, BLOCK=adam.BLOCK)
 compiled(echoes._values, BLOCK=echoes.BLOCK)
 compiled(echoes._values_backward, BLOCK=echoes.BLOCK)
 compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
+compiled(regularizers._means, BLOCK=regularizers.BLOCK)
 compiled(regularizers._spread, BLOCK=regularizers.BLOCK)
 compiled(regularizers._thinnest, BLOCK=regularizers.BLOCK)
 compiled(regularizers._spread_to_thinnest, BLOCK=regularizers.BLOCK)
@@ -585,6 +603,7 @@ for k in (1, 4):
     compiled(object_poses._rotate_harmonics, K=k, OBJECTS=object_poses.OBJECTS)
 for kernel in (track_penalties._sums, track_penalties._gradients):
     compiled(kernel, BLOCK=track_penalties.BLOCK)
+compiled(finite._record, BLOCK=finite.BLOCK)
 compiled(placement._place, BLOCK=placement.BLOCK)
 compiled(placement._place_backward, BLOCK=placement.BLOCK)
 for kernel in (time_varying_colors._colors, time_varying_colors._colors_backward):

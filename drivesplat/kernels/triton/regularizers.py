@@ -23,11 +23,11 @@ class MeanOpacityAndScale(torch.autograd.Function):
     def forward(ctx: Any, opacities: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         opacities, scales, count = opacities.contiguous(), scales.contiguous(), len(opacities)
         blocks = triton.cdiv(count, BLOCK)
-        partial = opacities.new_empty(2, blocks)
+        partial, opacity, scale = opacities.new_empty(2, blocks), opacities.new_empty(()), opacities.new_empty(())
         _sums[(blocks,)](opacities, scales, partial, count, BLOCK)
+        _means[(1,)](partial, opacity, scale, blocks, count, BLOCK)
         ctx.save_for_backward(opacities)
-        means = partial.sum(dim=1) / count
-        return means[0], means[1] / 3.0
+        return opacity, scale
 
     @staticmethod
     @once_differentiable
@@ -94,6 +94,19 @@ def _sums(opacities, scales, partial, count, BLOCK: tl.constexpr):
     length += tl.load(scales + 3 * i + 2, mask=present, other=0.0)
     tl.store(partial + tl.program_id(0), tl.sum(opacity))
     tl.store(partial + tl.num_programs(0) + tl.program_id(0), tl.sum(length))
+
+
+@triton.jit(do_not_specialize=["blocks", "count"])
+@no_type_check
+def _means(partial, opacity, scale, blocks, count, BLOCK: tl.constexpr):
+    """Writes the means by the sums of all blocks."""
+    of_opacities, of_scales = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for begin in range(0, blocks, BLOCK):
+        block = begin + tl.arange(0, BLOCK)
+        of_opacities += tl.load(partial + block, mask=block < blocks, other=0.0)
+        of_scales += tl.load(partial + blocks + block, mask=block < blocks, other=0.0)
+    tl.store(opacity, tl.sum(of_opacities) / count)
+    tl.store(scale, tl.sum(of_scales) / (3.0 * count))
 
 
 @triton.jit(do_not_specialize=["count"])
