@@ -72,6 +72,7 @@ def capture(
     """
     graph, random_state = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(device)
     needed_now, most = torch.zeros(2, len(needed), dtype=torch.int32, device=device)
+    torch.cuda.current_blas_handle()  # every thread has its own, which cannot be created during a capture
     try:
         with capacity.planned(needed) as lists:
             graph.capture_begin(pool=pool, capture_error_mode=errors)
