@@ -192,8 +192,8 @@ class TrainSettings(Settings):
     refine_stop: float = Field(0.833, ge=0, le=1)
     """Fraction of the iterations after which densification stops."""
     averaged: float = Field(0.1, ge=0, le=1)
-    """Fraction of the iterations, the last ones, over which all parameters are averaged, at most those after
-    `refine_stop`. The mean shows held-out images better than the last of them (docs/measured.md). 0 = no average."""
+    """Fraction of the iterations, the last ones, over which all parameters are averaged: at most those after
+    `refine_stop`. Their mean shows held-out images better than their last values (docs/measured.md). 0 = no average."""
     sh_every: float = Field(0.0333, ge=0, le=1)
     """Fraction of the iterations after which the degree of the spherical harmonics rises by one, repeatedly."""
     ssim_weight: float = Field(0.2, ge=0, le=1)
