@@ -28,7 +28,7 @@ def composite(
     `means2d.absgrad`. Runs gsplat on a GPU, numba elsewhere. Where Triton compiles, long lists of Gaussians are cut
     into chunks, so that no tile waits for the longest one; where torch compiles CUDA C++, too, kernels of this package
     composite the chunks. For one camera these also compute the alpha of the Gaussians `objects` alone, without those
-    behind the end of a ray (`drivesplat.kernels.cuda.compositing.composite_with_objects`).
+    behind the end of a ray (`drivesplat.kernels.cuda.compositing.composite`).
     """
     means2d, depths, conics, radii, opacities = gaussians
     if not means2d.is_cuda:
@@ -45,12 +45,9 @@ def composite(
             footprints = tiles.Footprints(means2d, conics, values, opacities)
             lists = tiles.tile_lists(footprints, radii, depths, width, height)
             one_camera = objects is not None and len(radii) == 1
-            if one_camera and compiled.usable_for(values, compiled.IMAGES_WITH_OBJECTS):
-                return compositing.composite_with_objects(
-                    footprints, lists, width, height, objects, with_depth=with_depth
-                )
-            if compiled.usable_for(values, compiled.IMAGES):
-                return compositing.composite(footprints, lists, width, height, with_depth=with_depth)
+            alone = objects if one_camera and compiled.usable_for(values, compiled.IMAGES_WITH_OBJECTS) else None
+            if alone is not None or compiled.usable_for(values, compiled.IMAGES):
+                return compositing.composite(footprints, lists, width, height, with_depth=with_depth, objects=alone)
             return chunks.composite(footprints, lists, width, height, rasterize_to_pixels, with_depth)
     cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)
     _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, across, down, n_images=cameras)

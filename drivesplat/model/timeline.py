@@ -60,17 +60,15 @@ class Timeline:
         return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
     @property
-    def of_actors(self) -> Bool[Tensor, "a m"]:
-        """The mask of annotations of each actor."""
-        rows = torch.zeros(len(self.tracks), sum(len(track.motion.times) for track in self.tracks), dtype=torch.bool)
-        for row, own in zip(rows, self.owned, strict=True):
-            row[own] = True
-        return rows
-
-    @property
     def actor_of_annotations(self) -> Int[Tensor, " m"]:
         """The index of the actor of each annotation."""
-        return self.of_actors.int().argmax(dim=0)
+        counts = torch.tensor([len(track.motion.times) for track in self.tracks])
+        return torch.repeat_interleave(torch.arange(len(counts)), counts)
+
+    @property
+    def of_actors(self) -> Bool[Tensor, "a m"]:
+        """The mask of annotations of each actor."""
+        return torch.arange(len(self.tracks))[:, None] == self.actor_of_annotations
 
     @property
     def neighbours(self) -> Int[Tensor, "q 3"]:

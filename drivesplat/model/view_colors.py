@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels.view_colors import fused_view_colors, view_colors
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import Gaussians, with_sh_degree
 from drivesplat.model.view import View
 
 
@@ -18,8 +18,9 @@ def rasterizer_colors(sets: Sequence[Gaussians], view: View, sh_degree: int | No
     colors = [own for own in seen if own is not None]
     if len(colors) == len(sets):
         return torch.cat(colors) if len(colors) > 1 else colors[0], None
-    whole = concatenate(sets)
-    return whole.sh, _degree(whole, sh_degree)
+    highest = max(own.sh_degree for own in sets)
+    coefficients = [with_sh_degree(own, highest).sh for own in sets]
+    return torch.cat(coefficients) if len(sets) > 1 else coefficients[0], _up_to(highest, sh_degree)
 
 
 def all_view_colors(gaussians: Gaussians, view: View) -> Float[Tensor, "n 3"]:
@@ -32,8 +33,8 @@ def all_view_colors(gaussians: Gaussians, view: View) -> Float[Tensor, "n 3"]:
 
 
 def _fused(own: Gaussians, view: View, sh_degree: int | None) -> Float[Tensor, "n 3"] | None:
-    return fused_view_colors(own.means, own.sh0, own.shN, view.camera_to_world, _degree(own, sh_degree))
+    return fused_view_colors(own.means, own.sh0, own.shN, view.camera_to_world, _up_to(own.sh_degree, sh_degree))
 
 
-def _degree(gaussians: Gaussians, sh_degree: int | None) -> int:
-    return gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+def _up_to(degree: int, limit: int | None) -> int:
+    return degree if limit is None else min(degree, limit)

@@ -60,7 +60,7 @@ def test_kernels_of_images(launched):
     torch.autograd.grad(image.sum() + alpha.sum(), given)
     check(launched, compiled.IMAGES)
     launched.clear()
-    found = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, slice(3, 9))
+    found = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT, objects=slice(3, 9))
     torch.autograd.grad(found.objects_alpha.sum(), given)
     check(launched, compiled.IMAGES_WITH_OBJECTS)
 

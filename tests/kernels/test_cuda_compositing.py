@@ -122,7 +122,7 @@ def check_alpha_of_objects(channels: int, compared: slice, length: int) -> None:
         lists.ids[lists.order[: int(lists.offsets[-1])]], least=1.0 / 255.0,
     )[1]  # fmt: skip
     assert float(alone.detach().max()) > 0.1 and float((alpha - alone).detach().max()) > 0.1
-    found = compositing.composite_with_objects(Footprints(*given), lists, WIDTH, HEIGHT, objects, length)[:3]
+    found = compositing.composite(Footprints(*given), lists, WIDTH, HEIGHT, length, objects=objects)[:3]
     expected = (image, alpha, alone)
     for mine, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
@@ -198,7 +198,7 @@ def check_ends_of_rays(length: int) -> None:
     *expected, lives = in_chunks(given, objects, length)
     assert 0.2 < lives.float().mean() < 0.8
     for found in (
-        compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects, length)[:3],
+        compositing.composite(Footprints(*given), lists, TILE, TILE, length, objects=objects)[:3],
         compositing.composite(Footprints(*given), lists, TILE, TILE, length)[:2],
     ):
         for mine, theirs in zip(found, expected, strict=False):
@@ -250,7 +250,7 @@ def check_chunks_behind_the_end() -> None:
     *expected, _ = one_after_the_other(given, objects)
     *_, goes_on = one_after_the_other([values[:, :early] for values in given], objects)
     assert 0.1 < goes_on.float().mean() < 0.9
-    found = compositing.composite_with_objects(Footprints(*given), lists, TILE, TILE, objects, length)[:3]
+    found = compositing.composite(Footprints(*given), lists, TILE, TILE, length, objects=objects)[:3]
     for mine, theirs in zip(found[:2], expected[:2], strict=True):
         torch.testing.assert_close(mine, theirs, atol=2e-4, rtol=0.0)
     behind = torch.autograd.grad(sum(image[:, ~goes_on].sum() for image in found), given)

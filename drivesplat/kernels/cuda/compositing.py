@@ -29,28 +29,21 @@ THREADS = TILE.value**2 // PIXELS
 
 
 def composite(
-    gaussians: Footprints, lists: TileLists, width: int, height: int, length: int = LENGTH, with_depth: bool = False
-) -> Composited:
-    """As `drivesplat.kernels.triton.chunks.composite`, in chunks of at most `length` Gaussians."""
-    chunks = Chunks.of(lists, length)
-    values, alpha, _ = _ChunkImages.apply(*gaussians, lists, chunks, None)
-    return join(values, alpha, chunks.firsts, lists.tiles, width, height, with_depth)[0]
-
-
-def composite_with_objects(
     gaussians: Footprints,
     lists: TileLists,
     width: int,
     height: int,
-    objects: slice,
     length: int = LENGTH,
     with_depth: bool = False,
+    objects: slice | None = None,
 ) -> Composited:
-    """As `composite` for one camera, and the alpha of the Gaussians `objects` alone, without those behind the end of a
-    ray."""
+    """As `drivesplat.kernels.triton.chunks.composite`, in chunks of at most `length` Gaussians. For one camera also the
+    alpha of the Gaussians `objects` alone, without those behind the end of a ray."""
     chunks = Chunks.of(lists, length)
     values, alpha, past_objects = _ChunkImages.apply(*gaussians, lists, chunks, objects)
     whole, before = join(values, alpha, chunks.firsts, lists.tiles, width, height, with_depth)
+    if objects is None:
+        return whole
     return whole._replace(objects_alpha=alpha_of_chunks(past_objects, before, chunks, lists, width, height))
 
 
