@@ -221,7 +221,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
                 if run.average.follow(trainer.step, trainer.model):
-                    _confine(trainer)  # the mean of those that were faded within the average is between
+                    _confine(trainer)  # in the mean, Gaussians that were faded meanwhile are visible again
                     fade_in_empty_space(trainer.model.parts, empty)
                 _bound(trainer, reach)
             if trainer.step % settings.log_every == 0:
