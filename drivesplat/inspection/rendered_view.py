@@ -12,7 +12,8 @@ from drivesplat.errors import ResultError
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.picture import Picture
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.scene import Frame

@@ -15,16 +15,17 @@ def colors_in_world(
     rotations: Float[Tensor, "a k k"],
     owner: Int[Tensor, " n"],
     owns: Float[Tensor, "n a"],
-) -> Float[Tensor, "n k 3"]:
-    """The harmonics of n Gaussians in the world: `colors_in_object`, mapped by `rotations` of their object's
-    harmonics. `owner` is the object of every Gaussian, `owns` the same as a one-hot matrix. Gradients reach `sh0` and
-    `shN`."""
+) -> tuple[Float[Tensor, "n 1 3"], Float[Tensor, "n k_less_1 3"]]:
+    """The harmonics of n Gaussians in the world, those of degree 0 and those above: `colors_in_object`, mapped by
+    `rotations` of their object's harmonics. `owner` is the object of every Gaussian, `owns` the same as a one-hot
+    matrix. Gradients reach `sh0` and `shN`."""
     if triton_support.usable_for(sh0):
         from drivesplat.kernels.triton.time_varying_colors import ColorsInWorld
 
         return ColorsInWorld.apply(sh0, shN, series.contiguous(), rotations.contiguous(), owner)
     sh = colors_in_object(sh0, shN, series, owns)
-    return of_owners(rotations, owns) @ sh if sh.shape[1] > 1 else sh
+    turned = of_owners(rotations, owns) @ sh if sh.shape[1] > 1 else sh
+    return turned[:, :1], turned[:, 1:]
 
 
 def colors_in_object(

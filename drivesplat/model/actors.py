@@ -215,8 +215,8 @@ class Actors(Part):
         p, owner, owns = self.params, self.params["owner"], self._owns
         # colors rotate by a few degrees: their gradient would add only noise to the track
         rotations = rotation_of_harmonics_by(poses.quats, p["shN"].shape[2] + 1)
-        sh = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
-        return Gaussians.of(*place(self.local(state), poses, owner, owns), sh)
+        colors = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
+        return Gaussians(*place(self.local(state), poses, owner, owns), *colors)
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:

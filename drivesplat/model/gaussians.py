@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -101,6 +102,15 @@ def _alike_in_velocities(sets: Sequence[Gaussians]) -> Sequence[Gaussians]:
     if all(own.velocities is None for own in sets):
         return sets
     return [replace(own, velocities=torch.zeros_like(own.means)) if own.velocities is None else own for own in sets]
+
+
+class GaussianSets(tuple[Gaussians, ...]):
+    """Sets of Gaussians, one after the other."""
+
+    @cached_property
+    def shapes(self) -> Gaussians:
+        """All of them as one set, as `concatenate_shapes`."""
+        return concatenate_shapes(self)
 
 
 def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, echoes: Tensor | None) -> Gaussians:

@@ -1,6 +1,5 @@
 """A LiDAR's revolution as a model sees it: a view of rays, and the scan that Gaussians give."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +8,8 @@ from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.kernels.echoes import echo_values
-from drivesplat.model.gaussians import Gaussians, concatenate_shapes
+from drivesplat.kernels.regularizers import mean_opacity_and_scale
+from drivesplat.model.gaussians import Gaussians, GaussianSets
 from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
 from drivesplat.scene.scan import RenderedScan
@@ -48,17 +48,20 @@ class ScanView:
 
 @dataclass(frozen=True)
 class ScanPicture:
-    """What b beams and a firings measure of `gaussians`, which are `sets` one after the other, without colours and
-    echoes. `range` in metres, 0 where nothing is met; `returned`, the probability of a return; `intensity` in [0, 1];
-    `alpha`, of all that is met, and `alpha_before`, of what is nearer than given ranges (None: none were given)."""
+    """What b beams and a firings measure of `sets` of Gaussians: `range` in metres, 0 where nothing is met; `returned`,
+    the probability of a return; `intensity` in [0, 1]; `alpha`, of all that is met, and `alpha_before`, of what is
+    nearer than given ranges (None: none were given)."""
 
-    gaussians: Gaussians
-    sets: Sequence[Gaussians]
+    sets: GaussianSets
     range: Float[Tensor, "b a"]
     returned: Float[Tensor, "b a"]
     intensity: Float[Tensor, "b a"]
     alpha: Float[Tensor, "b a"]
     alpha_before: Float[Tensor, "b a"] | None
+
+    def mean_opacity_and_scale(self) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+        """Of the Gaussians of all sets: see `drivesplat.kernels.regularizers.mean_opacity_and_scale`."""
+        return mean_opacity_and_scale(self.sets.shapes.opacities, self.sets.shapes.scales)
 
     def rendered(self) -> RenderedScan:
         """The same as arrays."""
@@ -75,7 +78,7 @@ def view_of_scan(recorded: RecordedScan, beam_spread: tuple[float, float], devic
     return ScanView(pose, rays, linear, angular, recorded.seconds, beam_spread, blocked)
 
 
-def scan_picture(sets: Sequence[Gaussians], view: ScanView, before: Float[Tensor, "b a"] | None = None) -> ScanPicture:
+def scan_picture(sets: GaussianSets, view: ScanView, before: Float[Tensor, "b a"] | None = None) -> ScanPicture:
     """The scan of sets of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets
     nothing, or that the vehicle blocks, is not returned. Raises ResultError for Gaussians without echoes."""
     values, sensor = [], view.sensor_to_world[:3, 3]
@@ -83,14 +86,13 @@ def scan_picture(sets: Sequence[Gaussians], view: ScanView, before: Float[Tensor
         if own.echoes is None:
             raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
         values.append(echo_values(own.echoes, own.means, sensor))
-    gaussians = concatenate_shapes(sets)
-    rendering = _rasterized(gaussians, view, torch.cat(values), before)
+    rendering = _rasterized(sets.shapes, view, torch.cat(values), before)
     intensity, returned = rendering.values.unbind(dim=-1)
     if view.blocked is not None:
         returned = torch.where(view.blocked, 0.0, returned)
     met = rendering.alpha.clamp(min=NOTHING)
     nearer = rendering.alpha_before
-    return ScanPicture(gaussians, sets, rendering.range, returned, intensity / met, rendering.alpha, nearer)
+    return ScanPicture(sets, rendering.range, returned, intensity / met, rendering.alpha, nearer)
 
 
 def group_met(gaussians: Gaussians, view: ScanView, groups: Int[Tensor, " n"]) -> Int[Tensor, "b a"]:

@@ -1,7 +1,7 @@
 """A model of a scene: a list of parts, a sky, and the properties of cameras; and its rendering."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -12,34 +12,14 @@ from torch import Tensor, nn
 from drivesplat.errors import ResultError
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
-from drivesplat.model.gaussians import Gaussians, concatenate, concatenate_shapes
+from drivesplat.model.gaussians import Gaussians, GaussianSets, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
+from drivesplat.model.picture import Picture
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.model.view import View, depth_at_lines, limited_scales, where_seen
-from drivesplat.model.view_colors import rasterizer_colors
-from drivesplat.rasterization import Rendering, rasterize
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A rendering of `sets` of Gaussians, of which `shapes` are one after the other without their colours: `image` with
-    sky and the exposure of the view's camera; `splats` without sky in the model's own colours (premultiplied by their
-    `alpha`), `depth` in metres or None; `objects_alpha`, the alpha of the parts with objects alone, None where it needs
-    a second rendering. What is opaque may hide objects behind it in `objects_alpha`. `surface_depth`, in metres or
-    None, is that of the surfaces shown, 0 where there are none; it has no gradient
-    (`drivesplat.rasterization.rasterize`).
-    """
-
-    shapes: Gaussians
-    sets: Sequence[Gaussians]
-    image: Float[Tensor, "h w 3"]
-    splats: Float[Tensor, "h w 3"]
-    alpha: Float[Tensor, "h w"]
-    depth: Float[Tensor, "h w"] | None
-    info: dict[str, Any]
-    objects_alpha: Float[Tensor, "h w"] | None = None
-    surface_depth: Float[Tensor, "h w"] | None = None
+from drivesplat.model.view_colors import rasterizer_colors, viewed_sets
+from drivesplat.rasterization import Rendering, rasterize, rasterize_viewed
 
 
 class SplatModel(nn.Module):
@@ -200,13 +180,18 @@ class SplatModel(nn.Module):
         where this needs no second rendering.
         """
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
-        shown = concatenate_shapes(sets)
         seen_from = self.seen_from(view)
-        colors, degree = rasterizer_colors(sets, seen_from, sh_degree)
-        rendering = rasterize(
-            **self._placed(shown, seen_from), colors=colors, sh_degree=degree, absgrad=absgrad, with_depth=with_depth,
-            objects=self._rows_of_objects() if with_objects else None, with_surface_depth=with_surface_depth,
-        )  # fmt: skip
+        plain = not (with_surface_depth or self.antialiased or self.max_scale)
+        viewed = viewed_sets(sets, seen_from, sh_degree, with_depth) if plain else None
+        options = {"absgrad": absgrad, "objects": self._rows_of_objects() if with_objects else None}
+        if viewed is not None:
+            rendering = rasterize_viewed(viewed, seen_from.width, seen_from.height, with_depth=with_depth, **options)
+        else:
+            colors, degree = rasterizer_colors(sets, seen_from, sh_degree)
+            rendering = rasterize(
+                **self._placed(sets.shapes, seen_from), colors=colors, sh_degree=degree, with_depth=with_depth,
+                with_surface_depth=with_surface_depth, **options,
+            )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
         image = splats
         if self.sky is not None:
@@ -217,7 +202,8 @@ class SplatModel(nn.Module):
         alone = None if rendering.objects_alpha is None else rendering.objects_alpha.squeeze((0, 3))
         surfaces = rendering.surface_depth
         surfaces = None if surfaces is None else depth_at_lines(surfaces.squeeze(0), seen_from)
-        return Picture(shown, sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone, surfaces)
+        means = None if viewed is None else (viewed.mean_opacity, viewed.mean_scale)
+        return Picture(sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone, surfaces, means)
 
     def scan(
         self,
@@ -288,5 +274,5 @@ class SplatModel(nn.Module):
         return {**shapes, **camera, **size, "antialiased": self.antialiased}
 
 
-def _sets(gaussians: Gaussians | Sequence[Gaussians]) -> Sequence[Gaussians]:
-    return [gaussians] if isinstance(gaussians, Gaussians) else gaussians
+def _sets(gaussians: Gaussians | Sequence[Gaussians]) -> GaussianSets:
+    return GaussianSets([gaussians] if isinstance(gaussians, Gaussians) else gaussians)

@@ -1,4 +1,4 @@
-"""The colours of Gaussians in a view, as the rasterizer takes them."""
+"""Gaussians and their colours in a view, as the rasterizer takes them."""
 
 from collections.abc import Sequence
 
@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels.view_colors import fused_view_colors, view_colors
+from drivesplat.kernels.viewing import ColoredGaussians, PinholeView, ViewedGaussians, viewed
 from drivesplat.model.gaussians import Gaussians, with_sh_degree
 from drivesplat.model.view import View
 
@@ -21,6 +22,19 @@ def rasterizer_colors(sets: Sequence[Gaussians], view: View, sh_degree: int | No
     highest = max(own.sh_degree for own in sets)
     coefficients = [with_sh_degree(own, highest).sh for own in sets]
     return torch.cat(coefficients) if len(sets) > 1 else coefficients[0], _up_to(highest, sh_degree)
+
+
+def viewed_sets(
+    sets: Sequence[Gaussians], view: View, sh_degree: int | None = None, with_depth: bool = False
+) -> ViewedGaussians | None:
+    """Several sets, one after the other, projected and with the colours that the view's camera sees, by harmonics up to
+    `sh_degree`. None where there is no kernel for it (`drivesplat.kernels.viewing.viewed`), and for a rolling
+    shutter."""
+    if view.shutter is not None:
+        return None
+    given = [ColoredGaussians(own.means, own.quats, own.scales, own.opacities, own.sh0, own.shN) for own in sets]
+    camera = PinholeView(view.viewmat, view.camera_to_world, view.K, view.width, view.height)
+    return viewed(given, camera, [_up_to(own.sh_degree, sh_degree) for own in sets], with_depth)
 
 
 def all_view_colors(gaussians: Gaussians, view: View) -> Float[Tensor, "n 3"]:

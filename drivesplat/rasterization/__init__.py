@@ -1,6 +1,6 @@
 """Rasterization: 3D Gaussians in; images, or LiDAR scans, out."""
 
-from drivesplat.rasterization.rasterization import Rendering, rasterize
+from drivesplat.rasterization.rasterization import Rendering, rasterize, rasterize_viewed
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
 
 __all__ = [
@@ -10,4 +10,5 @@ __all__ = [
     "ScanRendering",
     "rasterize",
     "rasterize_scan",
+    "rasterize_viewed",
 ]

@@ -12,6 +12,7 @@ from drivesplat.kernels.compositing import composite
 from drivesplat.kernels.projection import project
 from drivesplat.kernels.surface_depth import surface_depth
 from drivesplat.kernels.view_colors import view_colors
+from drivesplat.kernels.viewing import ViewedGaussians
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,22 @@ def rasterize(
     if with_surface_depth:
         surfaces = surface_depth(means, quats, scales, gaussians, composited.alpha.squeeze(-1), viewmats, Ks)
     return assembled(composited, surfaces, **gaussians._asdict())
+
+
+def rasterize_viewed(
+    viewed: ViewedGaussians,
+    width: int,
+    height: int,
+    *,
+    absgrad: bool = False,
+    with_depth: bool = False,
+    objects: slice | None = None,
+) -> Rendering:
+    """Renders Gaussians as one camera sees them; arguments and result as of `rasterize`, and the last of the values is
+    depth `with_depth`."""
+    gaussians, values = viewed.gaussians, viewed.values
+    composited = composite(gaussians, values, width, height, absgrad, objects, with_depth)
+    return assembled(composited, **gaussians._asdict())
 
 
 def assembled(

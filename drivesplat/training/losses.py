@@ -8,10 +8,10 @@ from torch import Tensor
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.depth_error import mean_depth_error
-from drivesplat.kernels.regularizers import mean_opacity_and_scale
-from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import active_fraction
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.picture import Picture
+from drivesplat.model.scans import ScanPicture
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.views import LidarDepth, TrainingView
@@ -37,7 +37,7 @@ def loss_terms(
     }
     if difference.moving_l1 is not None:
         terms["dynamic"] = settings.dynamic_weight * difference.moving_l1
-    terms |= regularization(picture.shapes, model, settings)
+    terms |= regularization(picture, model, settings)
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
@@ -60,12 +60,14 @@ def loss_terms(
     return {**terms, **_dynamic_terms(picture, view, model, settings)}
 
 
-def regularization(gaussians: Gaussians, model: SplatModel, settings: TrainSettings) -> dict[str, Float[Tensor, ""]]:
-    """The weighted mean opacity and scale (metres) of a model's Gaussians at one time."""
+def regularization(
+    picture: Picture | ScanPicture, model: SplatModel, settings: TrainSettings
+) -> dict[str, Float[Tensor, ""]]:
+    """The weighted mean opacity and scale (metres) of a model's Gaussians in a picture."""
     weights = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
     if not any(weights.values()):
         return {}
-    means, active = mean_opacity_and_scale(gaussians.opacities, gaussians.scales), active_fraction(model.parts)
+    means, active = picture.mean_opacity_and_scale(), active_fraction(model.parts)
     return {name: (w / active) * mean for (name, w), mean in zip(weights.items(), means, strict=True) if w}
 
 

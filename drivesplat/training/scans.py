@@ -121,7 +121,7 @@ def scan_terms(
         terms["scan_intensity"] = weights.intensity_weight * (errors * returned).sum() / count
     if picture.alpha_before is not None:
         terms["scan_sight"] = weights.sight_weight * (picture.alpha_before * returned).sum() / count
-    return {**terms, **regularization(picture.gaussians, model, settings)}
+    return {**terms, **regularization(picture, model, settings)}
 
 
 def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan: TrainingScan) -> Float[Tensor, ""]:

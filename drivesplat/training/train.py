@@ -15,8 +15,9 @@ from drivesplat.errors import TrainingError
 from drivesplat.io import checkpoint_file
 from drivesplat.kernels.cuda_graphs import capture_stream
 from drivesplat.machine.device import device_name, explain_out_of_memory
+from drivesplat.model.picture import Picture
 from drivesplat.model.reach import bound_positions, reach_of
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.averaging import ParameterAverage

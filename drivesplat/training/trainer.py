@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.picture import Picture
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock

@@ -25,8 +25,9 @@ from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, RegionMetrics, meas
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.picture import Picture
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
 from drivesplat.readers.truth import TruthFrame, TruthView, read_truth, truth_image
 from drivesplat.scene.regions import LABELS

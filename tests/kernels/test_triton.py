@@ -458,7 +458,7 @@ def test_time_varying_colors_and_their_gradients_agree_with_torch(degree, terms)
     sh0, shN = (torch.randn(150, terms, size, 3, device=DEVICE).requires_grad_() for size in (1, k - 1))
     expected, found = both_ways(colors_in_world, sh0, shN, series, rotations, owner, owns)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    assert_same_gradients([[expected], [found]], [sh0, shN], atol=1e-5, rtol=1e-5)
+    assert_same_gradients([expected, found], [sh0, shN], atol=1e-5, rtol=1e-5)
 
 
 def stretch(model):
@@ -508,15 +508,15 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
-from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
-from drivesplat.kernels.triton import chunk_alpha, depth_error, finite, joined_chunks, object_poses, track_penalties
+from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors, viewing
+from drivesplat.kernels.triton import depth_error, finite, joined_chunks, object_poses, track_penalties
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "empty": "*i1", "index": "*i64",
               "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "exists": "*i1",
-              "places": "*i32", "reached": "*i32", "neighbours": "*i64",
+              "places": "*i32", "neighbours": "*i64",
               "radii": "*i32", "counts": "*i32", "nearest": "*i64", "ends": "*i32", "keys": "*i16"}
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each", "stride"), "i32")
@@ -533,8 +533,9 @@ DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "l
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
 SCAN[scan_chunks._copy] = RAYS
+VIEWED = {"values": FLOATS, "first": "i32", "first_block": "i32", "every": "i32"}
+SCAN |= dict.fromkeys((viewing._view, viewing._view_backward), VIEWED)
 SCAN[finite._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
-SCAN |= dict.fromkeys((chunk_alpha._alpha, chunk_alpha._alpha_backward), {"reached": FLOATS})
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
@@ -555,6 +556,9 @@ compiled(probe._increment)
 for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
     compiled(view_colors._colors, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
     compiled(view_colors._colors_backward, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
+for k, degree, depth in ((1, 0, True), (4, 1, True), (4, 0, False), (9, 1, False)):
+    for kernel in (viewing._view, viewing._view_backward):
+        compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth, BLOCK=viewing.BLOCK)
 compiled(adam._step, BLOCK=adam.BLOCK)
 compiled(echoes._values, BLOCK=echoes.BLOCK)
 compiled(echoes._values_backward, BLOCK=echoes.BLOCK)
@@ -576,10 +580,8 @@ compiled(chunks.count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
 for kernel in (chunks._split, chunks._sum_copies):
     compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
 for kernel in (joined_chunks._composite, joined_chunks._composite_backward):
-    compiled(kernel, CHANNELS=3, WIDTH=4, DEPTH=False)
-    compiled(kernel, CHANNELS=4, WIDTH=4, DEPTH=True)
-for kernel in (chunk_alpha._alpha, chunk_alpha._alpha_backward):
-    compiled(kernel)
+    compiled(kernel, CHANNELS=3, WIDTH=4, DEPTH=False, OBJECTS=False)
+    compiled(kernel, CHANNELS=4, WIDTH=4, DEPTH=True, OBJECTS=True)
 for motion, moving, parts in ((True, True, 2), (True, False, 2), (True, True, 1), (False, False, 1)):
     options = {"WITH_MOTION": motion, "MOVING": moving, "PARTS": parts, "BLOCK": scan_projection.BLOCK}
     compiled(scan_projection._project, STEPS=4, **options)

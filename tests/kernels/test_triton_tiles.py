@@ -15,7 +15,7 @@ from helpers.tile_lists import DEVICE, HEIGHT, WIDTH, ellipses, gradients, lists
 from drivesplat.kernels import capacity
 from drivesplat.kernels.composited import with_depth_apart
 from drivesplat.kernels.triton import chunks
-from drivesplat.kernels.triton.chunk_alpha import alpha_of_chunks
+from drivesplat.kernels.triton.joined_chunks import join
 from drivesplat.kernels.triton.tiles import Footprints, TileLists, tile_lists
 
 TILE = 16
@@ -135,26 +135,33 @@ def test_the_last_value_is_depth_where_it_is_wanted(channels, monkeypatch):
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_the_alpha_of_chunks_and_its_gradient_equal_those_of_torch(cameras):
-    """For tiles with no entries, one chunk, and several chunks, some of which let nothing through or do not count."""
+def test_the_alpha_of_objects_and_its_gradient_equal_those_of_torch(cameras):
+    """For tiles with no entries, one chunk, and several chunks, some of which let nothing through, end their ray or lie
+    behind its end."""
     _, lists, _ = lists_of_all_lengths(cameras, 1)
-    made = chunks.Chunks.of(lists, 4)
-    remains, reached = torch.rand(2, made.count, 256, generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    remains[::3, :100] = 0.0
-    reached[1::2, 50:150] = 0.0
-    remains.requires_grad_()
-    found = alpha_of_chunks(remains, reached, made, lists, WIDTH, HEIGHT)
+    made, generator = chunks.Chunks.of(lists, 4), torch.Generator().manual_seed(0)
+    alpha, past = torch.rand(2, made.count, 256, generator=generator).to(DEVICE)
+    past[::3, :100] = 0.0
+    alpha[::2, 50:150] *= -1.0
+    alpha[1::2, 200:] = 1.0
+    past.requires_grad_()
     firsts = made.firsts.tolist()
-    counted = torch.where(reached > 0.0, remains, 1.0)
-    tiles = [1.0 - counted[start:end].prod(dim=0) for start, end in pairwise(firsts)]
+    seen = join(alpha[..., None], alpha, made.firsts, lists.tiles, WIDTH, HEIGHT, False, past)
+    tiles, behind = [], 0
+    for start, end in pairwise(firsts):
+        passes = torch.cat([torch.ones(1, 256, device=DEVICE), (1.0 - alpha[start:end].abs()).cumprod(dim=0)])[:-1]
+        ended = torch.cat([torch.zeros(1, 256, device=DEVICE), (alpha[start:end] < 0.0).cumsum(dim=0)])[:-1]
+        counts = (passes > 1e-4) & (ended == 0)
+        behind += int((~counts).sum())
+        tiles.append(1.0 - torch.where(counts, past[start:end], 1.0).prod(dim=0))
     down, across = lists.tiles[1:]
     whole = torch.stack(tiles).reshape(cameras, down, across, 16, 16).transpose(2, 3).flatten(3, 4).flatten(1, 2)
     expected = whole[:, :HEIGHT, :WIDTH, None]
-    torch.testing.assert_close(found, expected)
-    weights = torch.rand(found.shape, generator=torch.Generator().manual_seed(1)).to(DEVICE)
-    mine, theirs = (torch.autograd.grad((weights * alpha).sum(), remains)[0] for alpha in (found, expected))
+    torch.testing.assert_close(seen.objects_alpha, expected)
+    weights = torch.rand(expected.shape, generator=torch.Generator().manual_seed(1)).to(DEVICE)
+    mine, theirs = (torch.autograd.grad((weights * own).sum(), past)[0] for own in (seen.objects_alpha, expected))
     torch.testing.assert_close(mine[: firsts[-1]], theirs[: firsts[-1]])
-    assert theirs.any()
+    assert theirs.any() and behind > 100
 
 
 @pytest.mark.parametrize("length", [1, 3, 100])

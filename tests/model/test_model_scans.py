@@ -11,7 +11,7 @@ from torch import nn
 
 from drivesplat.errors import ResultError
 from drivesplat.kernels import torch_private
-from drivesplat.model.gaussians import concatenate
+from drivesplat.model.gaussians import GaussianSets, concatenate
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanView, group_met, scan_picture, view_of_scan
 from drivesplat.model.splat_model import SplatModel
@@ -171,7 +171,7 @@ def test_a_model_trained_without_lidar_is_refused():
     gaussians = walls().gaussians_at(0.0)
     assert gaussians.echoes is None, "images need no echoes"
     with pytest.raises(ResultError):
-        scan_picture([gaussians], view())
+        scan_picture(GaussianSets([gaussians]), view())
 
 
 def test_rays_that_the_vehicle_blocks_do_not_return():

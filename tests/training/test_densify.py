@@ -15,7 +15,9 @@ from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import cpu_strategies
 from drivesplat.kernels.relocation import relocation
 from drivesplat.model.actors import Actors
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.gaussians import GaussianSets
+from drivesplat.model.picture import Picture
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import ActorSettings, CoarseToFineSettings, DefaultSettings, McmcSettings
 from drivesplat.training.densify import Densifier, coarse_cap
 from drivesplat.training.optimizers import make_optimizers
@@ -336,7 +338,9 @@ def test_each_part_grows_by_the_gradients_of_its_own_rows(wanting):
     strengths, nothing = torch.zeros(70), torch.zeros(24, 32, 3)
     strengths[wanting] = 1.0
     before, together = [len(part) for part in model.parts], model.gaussians_at(0.0)
-    trainer.densify(Picture(together, [together], nothing, nothing, nothing[..., 0], None, screen_gradients(strengths)))
+    trainer.densify(
+        Picture(GaussianSets([together]), nothing, nothing, nothing[..., 0], None, screen_gradients(strengths))
+    )
     grown = [part.at(0.0)[count:] for part, count in zip(model.parts, before, strict=True)]
     assert torch.equal(torch.cat([new.means for new in grown]), together.means[wanting])
     assert len(grown[0]) == sum(row < 30 for row in wanting)

@@ -12,8 +12,10 @@ from skimage.metrics import structural_similarity
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import masked_l1, ssim, ssim_in_torch
 from drivesplat.model.background import Background
+from drivesplat.model.gaussians import GaussianSets
+from drivesplat.model.picture import Picture
 from drivesplat.model.sky import ConstantSky, CubemapSky
-from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.training.losses import (
@@ -60,7 +62,7 @@ def a_case(model: SplatModel, sky_known: bool = True) -> tuple[Picture, Training
 def picture_of(
     model: SplatModel, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None = None
 ) -> Picture:
-    return Picture(model.gaussians_at(0.0), model.sets_at(0.0), image, image, alpha, depth, {})
+    return Picture(GaussianSets(model.sets_at(0.0)), image, image, alpha, depth, {})
 
 
 def zero_padded_ssim(image: np.ndarray, target: np.ndarray) -> float:

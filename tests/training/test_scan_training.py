@@ -24,6 +24,7 @@ from pydantic import ValidationError
 
 from drivesplat.model.background import Background
 from drivesplat.model.build import definitions, gaussian_cap, rebuild_model
+from drivesplat.model.gaussians import GaussianSets
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.part import Part
 from drivesplat.model.scans import ScanPicture
@@ -53,7 +54,7 @@ def picture_of(scan, **changes) -> ScanPicture:
     gaussians = round_gaussians([[0.0, 0.0, 5.0]]).at(0.0)
     ones = torch.ones_like(scan.range)
     exact = {"range": scan.range, "returned": scan.returned.float(), "intensity": scan.intensity, "alpha": ones}
-    return ScanPicture(**{"gaussians": gaussians, "sets": [gaussians], **exact, "alpha_before": 0.0 * ones, **changes})
+    return ScanPicture(**{"sets": GaussianSets([gaussians]), **exact, "alpha_before": 0.0 * ones, **changes})
 
 
 def terms_of(picture: ScanPicture, scan, **weights) -> dict[str, float]:

@@ -19,7 +19,6 @@ from torch.autograd.function import once_differentiable
 from drivesplat.kernels.composited import Composited
 from drivesplat.kernels.cuda.compiled import IMAGES, IMAGES_WITH_OBJECTS, LENGTH, kernels
 from drivesplat.kernels.cuda.source import PIXELS
-from drivesplat.kernels.triton.chunk_alpha import alpha_of_chunks
 from drivesplat.kernels.triton.chunks import Chunks
 from drivesplat.kernels.triton.joined_chunks import join
 from drivesplat.kernels.triton.pixels import TILE
@@ -41,10 +40,8 @@ def composite(
     alpha of the Gaussians `objects` alone, without those behind the end of a ray."""
     chunks = Chunks.of(lists, length)
     values, alpha, past_objects = _ChunkImages.apply(*gaussians, lists, chunks, objects)
-    whole, before = join(values, alpha, chunks.firsts, lists.tiles, width, height, with_depth)
-    if objects is None:
-        return whole
-    return whole._replace(objects_alpha=alpha_of_chunks(past_objects, before, chunks, lists, width, height))
+    past = None if objects is None else past_objects
+    return join(values, alpha, chunks.firsts, lists.tiles, width, height, with_depth, past)
 
 
 class _ChunkImages(torch.autograd.Function):

@@ -68,7 +68,7 @@ def composite(
     edge = TILE.value
     each = torch.arange(len(lists.ids), dtype=torch.int32, device=lists.ids.device)
     values, alpha = rasterizer(*copies, edge, edge, edge, starts, each, masks=exists, packed=True)
-    return join(values.flatten(1, 2), alpha.flatten(1), firsts, lists.tiles, width, height, with_depth)[0]
+    return join(values.flatten(1, 2), alpha.flatten(1), firsts, lists.tiles, width, height, with_depth)
 
 
 class _Split(torch.autograd.Function):

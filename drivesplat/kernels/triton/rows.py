@@ -29,6 +29,13 @@ def three(values, i, valid):
 
 @triton.jit
 @no_type_check
+def store_two(values, i, x, y, valid):
+    tl.store(values + 2 * i, x, mask=valid)
+    tl.store(values + 2 * i + 1, y, mask=valid)
+
+
+@triton.jit
+@no_type_check
 def store_three(values, i, x, y, z, valid):
     tl.store(values + 3 * i, x, mask=valid)
     tl.store(values + 3 * i + 1, y, mask=valid)

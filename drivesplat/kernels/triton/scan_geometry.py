@@ -13,6 +13,7 @@ from drivesplat.kernels.triton.vectors import (
     dot,
     rotation_rows,
     scaled,
+    times,
     turn_rows,
     turned,
     turned_back,
@@ -90,13 +91,6 @@ def met(
     )  # fmt: skip
     axes = times(x_axis, size), times(y_axis, size), times(z_axis, size)
     return center, seen, axes, rotation, to_sensor
-
-
-@triton.jit
-@no_type_check
-def times(p, q):
-    """The products of the coordinates of two vectors."""
-    return p[0] * q[0], p[1] * q[1], p[2] * q[2]
 
 
 @triton.jit

@@ -26,7 +26,6 @@ from drivesplat.kernels.triton.scan_geometry import (
     offsets_at,
     spherical,
     spherical_backward,
-    times,
     turn_of,
 )
 from drivesplat.kernels.triton.vectors import (
@@ -37,6 +36,7 @@ from drivesplat.kernels.triton.vectors import (
     rotation_gradient,
     rotation_rows,
     scaled,
+    times,
     turned_back,
 )
 

@@ -16,22 +16,24 @@ class ColorsInWorld(torch.autograd.Function):
     """`drivesplat.kernels.time_varying_colors.colors_in_world`; `series` and `rotations` are contiguous."""
 
     @staticmethod
-    def forward(ctx: Any, sh0: Tensor, shN: Tensor, series: Tensor, rotations: Tensor, owner: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, sh0: Tensor, shN: Tensor, series: Tensor, rotations: Tensor, owner: Tensor
+    ) -> tuple[Tensor, Tensor]:
         count, terms, coefficients = len(sh0), sh0.shape[1], shN.shape[2] + 1
-        colors = sh0.new_empty(count, coefficients, 3)
-        _launch(_colors, sh0, shN, series, rotations, owner, colors, count, terms, coefficients)
+        first, others = sh0.new_empty(count, 1, 3), sh0.new_empty(count, coefficients - 1, 3)
+        _launch(_colors, sh0, shN, series, rotations, owner, first, others, count, terms, coefficients)
         ctx.save_for_backward(series, rotations, owner)
-        return colors
+        return first, others
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, v_first: Tensor, v_others: Tensor) -> tuple[Tensor | None, ...]:
         series, rotations, owner = ctx.saved_tensors
-        v_colors = v_colors.contiguous()
-        (count, coefficients, _), terms = v_colors.shape, series.shape[1]
-        v_sh0 = v_colors.new_empty(count, terms, 1, 3)
-        v_shN = v_colors.new_empty(count, terms, coefficients - 1, 3)
-        _launch(_colors_backward, v_colors, series, rotations, owner, v_sh0, v_shN, count, terms, coefficients)
+        v_first, v_others = v_first.contiguous(), v_others.contiguous()
+        (count, above, _), terms = v_others.shape, series.shape[1]
+        v_sh0, v_shN = v_first.new_empty(count, terms, 1, 3), v_first.new_empty(count, terms, above, 3)
+        given = (v_first, v_others, series, rotations, owner)
+        _launch(_colors_backward, *given, v_sh0, v_shN, count, terms, above + 1)
         return v_sh0, v_shN, None, None, None
 
 
@@ -51,7 +53,7 @@ def _launch(kernel: Any, *arguments: Any) -> None:
 @triton.jit(do_not_specialize=["count"])
 @no_type_check
 def _colors(
-    sh0, shN, series, rotations, owner, colors, count,
+    sh0, shN, series, rotations, owner, first_colors, other_colors, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i, k, channel, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
@@ -61,17 +63,20 @@ def _colors(
         of_first, of_others = _places(sh0, shN, i * TERMS + term, k, channel, K)
         own += weight * (tl.load(of_first, mask=first, other=0.0) + tl.load(of_others, mask=others, other=0.0))
     rotated = tl.sum(rotation * own[:, None, :, :], axis=2)
-    tl.store(_place(colors, i, k, channel, K), rotated, mask=first | others)
+    of_first, of_others = _places(first_colors, other_colors, i, k, channel, K)
+    tl.store(of_first, rotated, mask=first)
+    tl.store(of_others, rotated, mask=others)
 
 
 @triton.jit(do_not_specialize=["count"])
 @no_type_check
 def _colors_backward(
-    v_colors, series, rotations, owner, v_sh0, v_shN, count,
+    v_first, v_others, series, rotations, owner, v_sh0, v_shN, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i, k, channel, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
-    given = tl.load(_place(v_colors, i, k, channel, K), mask=first | others, other=0.0)
+    of_first, of_others = _places(v_first, v_others, i, k, channel, K)
+    given = tl.load(of_first, mask=first, other=0.0) + tl.load(of_others, mask=others, other=0.0)
     own = tl.sum(rotation * given[:, :, None, :], axis=1)
     for term in tl.static_range(TERMS):
         value = tl.load(series + object_ * TERMS + term, mask=i < count, other=0.0)[:, None, None] * own

@@ -33,6 +33,13 @@ def scaled(factor, p):
 
 @triton.jit
 @no_type_check
+def times(p, q):
+    """The products of the coordinates of two vectors."""
+    return p[0] * q[0], p[1] * q[1], p[2] * q[2]
+
+
+@triton.jit
+@no_type_check
 def added(p, q):
     """The sum of two vectors."""
     return p[0] + q[0], p[1] + q[1], p[2] + q[2]

@@ -53,7 +53,7 @@ class ViewColors(torch.autograd.Function):
 
 @triton.jit
 @no_type_check
-def _directions(means, camera, i, k, valid):
+def directions(means, camera, i, k, valid):
     """Coordinates of the unit vectors from the camera to the means in the order of the functions of degree 1, y, z and
     x; where they stand in rows of `means`, which of them exist, and the distances to the camera."""
     at = 3 * i[:, None] + ((k + 1) % 3)[None, :]
@@ -66,14 +66,14 @@ def _directions(means, camera, i, k, valid):
 
 @triton.jit
 @no_type_check
-def _signed(k):
+def signed(k):
     """The factors of y, z and x in the functions of degree 1."""
     return tl.where(k == 1, LINEAR, -LINEAR)[None, :]
 
 
 @triton.jit
 @no_type_check
-def _indices(i, k, channel, valid, OTHERS: tl.constexpr):
+def color_indices(i, k, channel, valid, OTHERS: tl.constexpr):
     """Where the colors of Gaussians i, and their coefficients of degree 1, stand in memory, and which of them exist."""
     color, known = 3 * i[:, None] + channel[None, :], valid[:, None] & (channel < 3)[None, :]
     linear = 3 * OTHERS * i[:, None, None] + 3 * k[None, :, None] + channel[None, None, :]
@@ -84,10 +84,10 @@ def _indices(i, k, channel, valid, OTHERS: tl.constexpr):
 @no_type_check
 def _colors(means, sh0, shN, camera, colors, count, OTHERS: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr):
     i, k, channel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4), tl.arange(0, 4)
-    color, known, linear, exists = _indices(i, k, channel, i < count, OTHERS)
+    color, known, linear, exists = color_indices(i, k, channel, i < count, OTHERS)
     shown = CONSTANT * tl.load(sh0 + color, mask=known, other=0.0) + 0.5
     if DEGREE == 1:
-        functions = _signed(k) * _directions(means, camera, i, k, i < count)[0]
+        functions = signed(k) * directions(means, camera, i, k, i < count)[0]
         shown += tl.sum(functions[:, :, None] * tl.load(shN + linear, mask=exists, other=0.0), 1)
     tl.store(colors + color, tl.maximum(shown, 0.0), mask=known)
 
@@ -99,14 +99,14 @@ def _colors_backward(
     OTHERS: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i, k, channel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4), tl.arange(0, 4)
-    color, known, linear, exists = _indices(i, k, channel, i < count, OTHERS)
+    color, known, linear, exists = color_indices(i, k, channel, i < count, OTHERS)
     v_color = tl.load(v_colors + stride * i[:, None] + channel[None, :], mask=known, other=0.0)
     v_color = tl.where(tl.load(colors + color, mask=known, other=0.0) > 0.0, v_color, 0.0)
     tl.store(v_sh0 + color, CONSTANT * v_color, mask=known)
-    direction, at, inside, length = _directions(means, camera, i, k, i < count)
+    direction, at, inside, length = directions(means, camera, i, k, i < count)
     along = tl.zeros((BLOCK, 4), tl.float32)
     if DEGREE == 1:
-        tl.store(v_shN + linear, (_signed(k) * direction)[:, :, None] * v_color[:, None, :], mask=exists)
-        along = _signed(k) * tl.sum(v_color[:, None, :] * tl.load(shN + linear, mask=exists, other=0.0), 2)
+        tl.store(v_shN + linear, (signed(k) * direction)[:, :, None] * v_color[:, None, :], mask=exists)
+        along = signed(k) * tl.sum(v_color[:, None, :] * tl.load(shN + linear, mask=exists, other=0.0), 2)
     across = along - tl.sum(along * direction, 1)[:, None] * direction
     tl.store(v_means + at, across / length[:, None], mask=inside)
