@@ -476,7 +476,7 @@ def test_penalties_of_several_parts_add_up():
     standing = motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 2.0]] * 3)
     other = actors_of(track_of(standing, "other", (1.0, 1.0, 1.0)), seed=1)
     both = SplatModel([*model.parts, other], model.sky)
-    terms = loss_terms(dataclasses.replace(picture, sets=both.sets_at(0.0)), view, both, TrainSettings())
+    terms = loss_terms(dataclasses.replace(picture, sets=GaussianSets(both.sets_at(0.0))), view, both, TrainSettings())
     for name, penalty in model.parts[1].penalties().items():
         torch.testing.assert_close(terms[name], penalty + other.penalties()[name])
         assert float(penalty.detach()) > 0.0 and float(other.penalties()[name].detach()) > 0.0
