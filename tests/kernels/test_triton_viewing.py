@@ -3,6 +3,8 @@
 Without a GPU Triton's kernels run in its interpreter, see conftest.py.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -100,6 +102,7 @@ def test_viewed_sets_and_their_gradients_equal_projection_and_colors(degrees, wi
 def test_pictures_of_a_model_are_those_of_separate_kernels(monkeypatch):
     """With depth and the means that regularizers penalise."""
     model, view = untrained_street(settings_of()).to(DEVICE), a_view()
+    view = replace(view, K=view.K.to(DEVICE), camera_to_world=view.camera_to_world.to(DEVICE))
     fused = model.render(view, with_depth=True)
     assert fused.means is not None
     monkeypatch.setattr(triton_support, "usable_for", lambda tensor: False)
