@@ -109,7 +109,8 @@ class GaussianSets(tuple[Gaussians, ...]):
 
     @cached_property
     def shapes(self) -> Gaussians:
-        """All of them as one set, as `concatenate_shapes`."""
+        """All of them as one set, as `concatenate_shapes`. Computed at the first access: without gradient if that is
+        within `torch.no_grad`."""
         return concatenate_shapes(self)
 
 

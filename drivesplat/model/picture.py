@@ -16,8 +16,8 @@ class Picture:
     in the model's own colours (premultiplied by their `alpha`), `depth` in metres or None; `objects_alpha`, the alpha
     of the parts with objects alone, None where it needs a second rendering. What is opaque may hide objects behind it
     in `objects_alpha`. `surface_depth`, in metres or None, is that of the surfaces shown, 0 where there are none; it
-    has no gradient (`drivesplat.rasterization.rasterize`). `means` are the mean opacity and scale of the sets, None
-    where they were not computed beside the image.
+    has no gradient (`drivesplat.rasterization.rasterize`). `means_of_sets` are the mean opacity and scale (metres) of
+    the sets, None where they were not computed beside the image.
     """
 
     sets: GaussianSets
@@ -28,7 +28,7 @@ class Picture:
     info: dict[str, Any]
     objects_alpha: Float[Tensor, "h w"] | None = None
     surface_depth: Float[Tensor, "h w"] | None = None
-    means: tuple[Float[Tensor, ""], Float[Tensor, ""]] | None = None
+    means_of_sets: tuple[Float[Tensor, ""], Float[Tensor, ""]] | None = None
 
     @property
     def shapes(self) -> Gaussians:
@@ -37,4 +37,6 @@ class Picture:
 
     def mean_opacity_and_scale(self) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Of the Gaussians of all sets: see `drivesplat.kernels.regularizers.mean_opacity_and_scale`."""
-        return mean_opacity_and_scale(self.shapes.opacities, self.shapes.scales) if self.means is None else self.means
+        if self.means_of_sets is not None:
+            return self.means_of_sets
+        return mean_opacity_and_scale(self.shapes.opacities, self.shapes.scales)

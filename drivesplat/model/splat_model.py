@@ -18,8 +18,8 @@ from drivesplat.model.picture import Picture
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
 from drivesplat.model.view import View, depth_at_lines, limited_scales, where_seen
-from drivesplat.model.view_colors import rasterizer_colors, viewed_sets
-from drivesplat.rasterization import Rendering, rasterize, rasterize_viewed
+from drivesplat.model.view_colors import projected_sets, rasterizer_colors
+from drivesplat.rasterization import Rendering, rasterize, rasterize_projected
 
 
 class SplatModel(nn.Module):
@@ -182,10 +182,11 @@ class SplatModel(nn.Module):
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
         seen_from = self.seen_from(view)
         plain = not (with_surface_depth or self.antialiased or self.max_scale)
-        viewed = viewed_sets(sets, seen_from, sh_degree, with_depth) if plain else None
+        projected = projected_sets(sets, seen_from, sh_degree, with_depth) if plain else None
         options = {"absgrad": absgrad, "objects": self._rows_of_objects() if with_objects else None}
-        if viewed is not None:
-            rendering = rasterize_viewed(viewed, seen_from.width, seen_from.height, with_depth=with_depth, **options)
+        if projected is not None:
+            size = seen_from.width, seen_from.height
+            rendering = rasterize_projected(projected, *size, with_depth=with_depth, **options)
         else:
             colors, degree = rasterizer_colors(sets, seen_from, sh_degree)
             rendering = rasterize(
@@ -202,8 +203,8 @@ class SplatModel(nn.Module):
         alone = None if rendering.objects_alpha is None else rendering.objects_alpha.squeeze((0, 3))
         surfaces = rendering.surface_depth
         surfaces = None if surfaces is None else depth_at_lines(surfaces.squeeze(0), seen_from)
-        means = None if viewed is None else (viewed.mean_opacity, viewed.mean_scale)
-        return Picture(sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone, surfaces, means)
+        means_of_sets = None if projected is None else (projected.mean_opacity, projected.mean_scale)
+        return Picture(sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone, surfaces, means_of_sets)
 
     def scan(
         self,

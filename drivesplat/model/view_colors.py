@@ -6,8 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.colored_projection import (
+    ColoredGaussians,
+    PinholeCamera,
+    ProjectedWithColors,
+    project_with_colors,
+)
 from drivesplat.kernels.view_colors import fused_view_colors, view_colors
-from drivesplat.kernels.viewing import ColoredGaussians, PinholeView, ViewedGaussians, viewed
 from drivesplat.model.gaussians import Gaussians, with_sh_degree
 from drivesplat.model.view import View
 
@@ -24,17 +29,17 @@ def rasterizer_colors(sets: Sequence[Gaussians], view: View, sh_degree: int | No
     return torch.cat(coefficients) if len(sets) > 1 else coefficients[0], _up_to(highest, sh_degree)
 
 
-def viewed_sets(
+def projected_sets(
     sets: Sequence[Gaussians], view: View, sh_degree: int | None = None, with_depth: bool = False
-) -> ViewedGaussians | None:
+) -> ProjectedWithColors | None:
     """Several sets, one after the other, projected and with the colours that the view's camera sees, by harmonics up to
-    `sh_degree`. None where there is no kernel for it (`drivesplat.kernels.viewing.viewed`), and for a rolling
-    shutter."""
+    `sh_degree`. None where there is no kernel for it (`drivesplat.kernels.colored_projection.project_with_colors`), and
+    for a rolling shutter."""
     if view.shutter is not None:
         return None
     given = [ColoredGaussians(own.means, own.quats, own.scales, own.opacities, own.sh0, own.shN) for own in sets]
-    camera = PinholeView(view.viewmat, view.camera_to_world, view.K, view.width, view.height)
-    return viewed(given, camera, [_up_to(own.sh_degree, sh_degree) for own in sets], with_depth)
+    camera = PinholeCamera(view.viewmat, view.camera_to_world, view.K, view.width, view.height)
+    return project_with_colors(given, camera, [_up_to(own.sh_degree, sh_degree) for own in sets], with_depth)
 
 
 def all_view_colors(gaussians: Gaussians, view: View) -> Float[Tensor, "n 3"]:

@@ -1,6 +1,6 @@
 """Rasterization: 3D Gaussians in; images, or LiDAR scans, out."""
 
-from drivesplat.rasterization.rasterization import Rendering, rasterize, rasterize_viewed
+from drivesplat.rasterization.rasterization import Rendering, rasterize, rasterize_projected
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
 
 __all__ = [
@@ -9,6 +9,6 @@ __all__ = [
     "ScanMotion",
     "ScanRendering",
     "rasterize",
+    "rasterize_projected",
     "rasterize_scan",
-    "rasterize_viewed",
 ]

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.colored_projection import ProjectedWithColors
 from drivesplat.kernels.composited import Composited
 from drivesplat.kernels.compositing import composite
 from drivesplat.kernels.projection import project
 from drivesplat.kernels.surface_depth import surface_depth
 from drivesplat.kernels.view_colors import view_colors
-from drivesplat.kernels.viewing import ViewedGaussians
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ def rasterize(
     return assembled(composited, surfaces, **gaussians._asdict())
 
 
-def rasterize_viewed(
-    viewed: ViewedGaussians,
+def rasterize_projected(
+    projected: ProjectedWithColors,
     width: int,
     height: int,
     *,
@@ -150,9 +150,9 @@ def rasterize_viewed(
     with_depth: bool = False,
     objects: slice | None = None,
 ) -> Rendering:
-    """Renders Gaussians as one camera sees them; arguments and result as of `rasterize`, and the last of the values is
-    depth `with_depth`."""
-    gaussians, values = viewed.gaussians, viewed.values
+    """Renders Gaussians that are projected already; arguments and result as of `rasterize`, without the depth of
+    surfaces. With `with_depth` the last of the values is depth; the depths in `info` have no gradient."""
+    gaussians, values = projected.gaussians, projected.values
     composited = composite(gaussians, values, width, height, absgrad, objects, with_depth)
     return assembled(composited, **gaussians._asdict())
 

@@ -508,7 +508,8 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
-from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors, viewing
+from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
+from drivesplat.kernels.triton import colored_projection
 from drivesplat.kernels.triton import depth_error, finite, joined_chunks, object_poses, track_penalties
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
@@ -533,8 +534,8 @@ DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "l
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
 SCAN[scan_chunks._copy] = RAYS
-VIEWED = {"values": FLOATS, "first": "i32", "first_block": "i32", "every": "i32"}
-SCAN |= dict.fromkeys((viewing._view, viewing._view_backward), VIEWED)
+COLORED = {"values": FLOATS, "first": "i32", "first_block": "i32", "total": "i32"}
+SCAN |= dict.fromkeys((colored_projection._project, colored_projection._project_backward), COLORED)
 SCAN[finite._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
@@ -557,8 +558,8 @@ for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
     compiled(view_colors._colors, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
     compiled(view_colors._colors_backward, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
 for k, degree, depth in ((1, 0, True), (4, 1, True), (4, 0, False), (9, 1, False)):
-    for kernel in (viewing._view, viewing._view_backward):
-        compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth, BLOCK=viewing.BLOCK)
+    for kernel in (colored_projection._project, colored_projection._project_backward):
+        compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth, BLOCK=colored_projection.BLOCK)
 compiled(adam._step, BLOCK=adam.BLOCK)
 compiled(echoes._values, BLOCK=echoes.BLOCK)
 compiled(echoes._values_backward, BLOCK=echoes.BLOCK)

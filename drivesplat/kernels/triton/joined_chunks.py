@@ -31,8 +31,8 @@ def join(
     """Images and alpha of all tiles, composited from those of their chunks. `firsts` are the first chunk of each of t
     tiles, then their number; `tiles` the numbers of cameras, rows and columns. A negative alpha ends the ray in its
     chunk, and so does a transmittance below 1e-4: chunks behind the end are not shown. Gradients are those by the
-    absolute alpha. With `with_depth` the last of the values is depth. `past_objects` is the transmittance of some of
-    the Gaussians in each chunk, whose alpha is composited, too."""
+    absolute alpha. With `with_depth` the last of the values is depth. `past_objects` is the transmittance of each chunk
+    through some of its Gaussians alone, those of objects; with it the alpha of the objects is returned, too."""
     past = alpha.new_empty(0) if past_objects is None else past_objects
     image, depth, whole, objects_alpha = _Join.apply(values, alpha, past, firsts, tiles, width, height, with_depth)
     return Composited(image, whole, None if past_objects is None else objects_alpha, depth if with_depth else None)

@@ -25,7 +25,7 @@ class MeanOpacityAndScale(torch.autograd.Function):
         blocks = triton.cdiv(count, BLOCK)
         partial, opacity, scale = opacities.new_empty(2, blocks), opacities.new_empty(()), opacities.new_empty(())
         _sums[(blocks,)](opacities, scales, partial, count, BLOCK)
-        add_up(partial, opacity, scale, count)
+        write_means(partial, opacity, scale, count)
         ctx.save_for_backward(opacities)
         return opacity, scale
 
@@ -60,7 +60,7 @@ class MeanThickness(torch.autograd.Function):
         return v_scales
 
 
-def add_up(partial: Tensor, opacity: Tensor, scale: Tensor, count: int) -> None:
+def write_means(partial: Tensor, opacity: Tensor, scale: Tensor, count: int) -> None:
     """Writes the mean opacity and scale of `count` Gaussians by the sums of blocks, `partial` (2, b)."""
     _means[(1,)](partial, opacity, scale, partial.shape[1], count, BLOCK)
 

@@ -1,4 +1,4 @@
-"""Gaussians as one camera sees them, in one pass over each set of them, and the gradient in another.
+"""Gaussians projected into one camera, with their colors, in one pass over each set, and the gradient in another.
 
 The projection is that of `drivesplat.kernels.numba.projection`: with the rotation W from world to camera, a Gaussian's
 rotation R and its scales S, the rows c of W R S give the rows p and q of T = J W R S, and the covariance in the image
@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.triton.regularizers import add_up
+from drivesplat.kernels.triton.regularizers import write_means
 from drivesplat.kernels.triton.rows import store_quaternion, store_three, store_two, three, two, unit
 from drivesplat.kernels.triton.vectors import (
     added,
@@ -39,13 +39,15 @@ EXTENT = tl.constexpr(3.33)
 """Largest radius in standard deviations, as in gsplat."""
 FAINTEST = tl.constexpr(1.0 / 255.0)
 MARGIN = tl.constexpr(0.15)
-"""Fraction of the image's size beyond its border up to which Gaussians are linearised where they are."""
+"""The slope at which a Gaussian beside the image is linearised is clamped this fraction of the image's size beyond its
+border, 0.3 of half the size, as in gsplat."""
 
 
-class Viewing(torch.autograd.Function):
-    """`drivesplat.kernels.viewing.viewed`: means2d (1, n, 2), depths (1, n), conics (1, n, 3), radii (1, n, 2),
-    opacities (1, n), values (1, n, 3 or 4), the mean opacity and the mean scale. `sets` holds TENSORS tensors of each
-    set, `degrees` the degree up to which harmonics of each are evaluated. Gradients reach all of `sets`."""
+class ColoredProjection(torch.autograd.Function):
+    """`drivesplat.kernels.colored_projection.project_with_colors`: means2d (1, n, 2), depths (1, n), conics (1, n, 3),
+    radii (1, n, 2), opacities (1, n), values (1, n, 3 or 4), the mean opacity and the mean scale. `sets` holds TENSORS
+    tensors of each set, `degrees` the degree up to which harmonics of each are evaluated. Gradients reach all of
+    `sets`."""
 
     @staticmethod
     def forward(
@@ -64,12 +66,12 @@ class Viewing(torch.autograd.Function):
         for own, degree in zip(_by_set(given), degrees, strict=True):
             programs = triton.cdiv(len(own[0]), BLOCK)
             if programs:
-                _view[(programs,)](
+                _project[(programs,)](
                     *own, *camera, means2d, depths, conics, radii, opacities, values, partial, len(own[0]), first,
                     first_block, blocks, *size, own[5].shape[1], degree, with_depth, BLOCK,
                 )  # fmt: skip
             first, first_block = first + len(own[0]), first_block + programs
-        add_up(partial, mean_opacity, mean_scale, count)
+        write_means(partial, mean_opacity, mean_scale, count)
         ctx.save_for_backward(*camera, radii, values, *given)
         ctx.options = (size, degrees, with_depth)
         ctx.mark_non_differentiable(depths, radii)
@@ -88,7 +90,7 @@ class Viewing(torch.autograd.Function):
             v_own = [torch.empty_like(tensor) for tensor in own[:5]]
             v_own.append(torch.empty_like(own[5]) if above == 3 * degree else torch.zeros_like(own[5]))
             if programs:
-                _view_backward[(programs,)](
+                _project_backward[(programs,)](
                     *own, *camera, radii, values, v_means2d, v_conics, *others, *v_own, len(own[0]), first,
                     radii.shape[1], *size, above, degree, with_depth, BLOCK,
                 )  # fmt: skip
@@ -135,22 +137,22 @@ def _axes(quat, size, viewmat):
 @triton.jit
 @no_type_check
 def _slope(along, z, focal, center, extent):
-    """The slope along / z at which a Gaussian is linearised, and whether it is its own."""
-    own, margin = along / z, MARGIN * extent / focal
-    limited = tl.minimum(tl.maximum(own, -center / focal - margin), (extent - center) / focal + margin)
-    return limited, limited == own
+    """The slope along / z, clamped to the image and MARGIN beyond it, and whether it lies within these limits."""
+    slope, margin = along / z, MARGIN * extent / focal
+    clamped = tl.minimum(tl.maximum(slope, -center / focal - margin), (extent - center) / focal + margin)
+    return clamped, clamped == slope
 
 
 @triton.jit
 @no_type_check
 def _in_image(axes, at, K, width, height):
-    """The rows p and q of T, and the slopes at which a Gaussian is linearised, each with whether it is its own."""
+    """The rows p and q of T, and the slopes x / z and y / z, each as `_slope` returns it."""
     fx, cx, fy, cy = tl.load(K), tl.load(K + 2), tl.load(K + 4), tl.load(K + 5)
-    across, free_x = _slope(at[0], at[2], fx, cx, width)
-    down, free_y = _slope(at[1], at[2], fy, cy, height)
+    across, within_x = _slope(at[0], at[2], fx, cx, width)
+    down, within_y = _slope(at[1], at[2], fy, cy, height)
     p = scaled(fx / at[2], added(axes[0], scaled(-across, axes[2])))
     q = scaled(fy / at[2], added(axes[1], scaled(-down, axes[2])))
-    return p, q, across, free_x, down, free_y
+    return p, q, across, within_x, down, within_y
 
 
 @triton.jit
@@ -165,13 +167,14 @@ def _covariance(p, q):
 
 @triton.jit(do_not_specialize=["count", "first", "first_block", "blocks", "width", "height"])
 @no_type_check
-def _view(
+def _project(
     means, quats, scales, opacities, sh0, shN, viewmat, K, camera_to_world, means2d, depths, conics, radii, opacities2d,
     values, partial, count, first, first_block, blocks, width, height,
     OTHERS: tl.constexpr, DEGREE: tl.constexpr, DEPTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes a set to rows `first` and later, its sums of opacities and of scales of what is not transparent to entries
-    `first_block` and later. Of Gaussians out of view only radii, 0, and opacities are written."""
+    """Writes the rows of one set, from row `first` on. A block writes its sum of opacities to the first row of
+    `partial`, from `first_block` on, and its sum of scales, without those of Gaussians of opacity 0, to the second. For
+    Gaussians out of view it writes only the opacity and a radius of 0."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid, row = i < count, first + i
     opacity, size = tl.load(opacities + i, mask=valid, other=0.0), three(scales, i, valid)
@@ -211,19 +214,19 @@ def _view(
     tl.store(values + place, shown, mask=seen[:, None] & (channel < 3 + DEPTH)[None, :])
 
 
-@triton.jit(do_not_specialize=["count", "first", "every", "width", "height"])
+@triton.jit(do_not_specialize=["count", "first", "total", "width", "height"])
 @no_type_check
-def _view_backward(
+def _project_backward(
     means, quats, scales, opacities, sh0, shN, viewmat, K, camera_to_world, radii, values, v_means2d, v_conics,
     v_opacities2d, v_values, v_mean_opacity, v_mean_scale, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN,
-    count, first, every, width, height,
+    count, first, total, width, height,
     OTHERS: tl.constexpr, DEGREE: tl.constexpr, DEPTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the gradients of a set, which has rows `first` and later of `every` row."""
+    """Writes the gradients of one set, whose first row is `first` of `total` rows."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid, row = i < count, first + i
     present = tl.load(opacities + i, mask=valid, other=0.0) > 0.0
-    by_opacity = tl.load(v_opacities2d + row, mask=valid, other=0.0) + tl.load(v_mean_opacity) / every
+    by_opacity = tl.load(v_opacities2d + row, mask=valid, other=0.0) + tl.load(v_mean_opacity) / total
     tl.store(v_opacities + i, by_opacity, mask=valid)
     wide, high = two(radii, row, valid)
     seen = (wide > 0) & (high > 0)
@@ -248,7 +251,7 @@ def _view_backward(
     w, x, y, z, length = unit(quats, i, seen)
     size = three(scales, i, seen)
     axes = _axes((w, x, y, z), size, viewmat)
-    p, q, across, free_x, down, free_y = _in_image(axes, at, K, width, height)
+    p, q, across, within_x, down, within_y = _in_image(axes, at, K, width, height)
     xx, xy, yy, determinant, normal = _covariance(p, q)
     by_conic = three(v_conics, row, seen)
     by_yy, by_xy, by_xx = by_conic[0] / determinant, -by_conic[1] / determinant, by_conic[2] / determinant
@@ -266,8 +269,8 @@ def _view_backward(
         added(scaled(-near_x * across, by_p), scaled(-near_y * down, by_q)),
     )
     by_u, by_v = two(v_means2d, row, seen)
-    by_across = fx * by_u - tl.where(free_x, near_x * dot(by_p, axes[2]), 0.0)
-    by_down = fy * by_v - tl.where(free_y, near_y * dot(by_q, axes[2]), 0.0)
+    by_across = fx * by_u - tl.where(within_x, near_x * dot(by_p, axes[2]), 0.0)
+    by_down = fy * by_v - tl.where(within_y, near_y * dot(by_q, axes[2]), 0.0)
     by_z = -(by_across * at[0] / at[2] + by_down * at[1] / at[2] + dot(by_p, p) + dot(by_q, q)) / at[2]
     if DEPTH:
         by_z += tl.load(v_values + 4 * row + 3, mask=seen, other=0.0)
@@ -284,7 +287,7 @@ def _view_backward(
         turned_back(by_axes, (to_camera[0][2], to_camera[1][2], to_camera[2][2])),
     )
     by_size = added(times(by_rows[0], rows[0]), added(times(by_rows[1], rows[1]), times(by_rows[2], rows[2])))
-    mean = tl.where(present, tl.load(v_mean_scale) / (3.0 * every), 0.0)
+    mean = tl.where(present, tl.load(v_mean_scale) / (3.0 * total), 0.0)
     store_three(
         v_scales, i, tl.where(seen, by_size[0], 0.0) + mean, tl.where(seen, by_size[1], 0.0) + mean,
         tl.where(seen, by_size[2], 0.0) + mean, valid,
