@@ -15,11 +15,12 @@ from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.triton.regularizers import write_means
 from drivesplat.kernels.triton.rows import store_quaternion, store_three, store_two, three, two, unit
+from drivesplat.kernels.triton.tiles import MIN_ALPHA
 from drivesplat.kernels.triton.vectors import (
     added,
+    axes_gradient,
     cross,
     dot,
-    rotation_gradient,
     rotation_rows,
     scaled,
     times,
@@ -37,7 +38,6 @@ EPS2D = tl.constexpr(0.3)
 NEAR_PLANE, FAR_PLANE = tl.constexpr(0.01), tl.constexpr(1e10)
 EXTENT = tl.constexpr(3.33)
 """Largest radius in standard deviations, as in gsplat."""
-FAINTEST = tl.constexpr(1.0 / 255.0)
 MARGIN = tl.constexpr(0.15)
 """The slope at which a Gaussian beside the image is linearised is clamped this fraction of the image's size beyond its
 border, 0.3 of half the size, as in gsplat."""
@@ -185,14 +185,14 @@ def _project(
 
     at = _in_camera(three(means, i, valid), viewmat)
     z = at[2]
-    seen = valid & (z >= NEAR_PLANE) & (z <= FAR_PLANE) & (opacity >= FAINTEST)
+    seen = valid & (z >= NEAR_PLANE) & (z <= FAR_PLANE) & (opacity >= MIN_ALPHA)
     at = at[0], at[1], tl.where(seen, z, 1.0)
     w, x, y, z_, _ = unit(quats, i, seen)
     p, q, _, _, _, _ = _in_image(_axes((w, x, y, z_), size, viewmat), at, K, width, height)
     xx, xy, yy, determinant, _ = _covariance(p, q)
     u = tl.load(K) * at[0] / at[2] + tl.load(K + 2)
     v = tl.load(K + 4) * at[1] / at[2] + tl.load(K + 5)
-    extent = tl.minimum(EXTENT, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))))
+    extent = tl.minimum(EXTENT, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0))))
     wide, high = tl.ceil(extent * tl.sqrt(xx)), tl.ceil(extent * tl.sqrt(yy))
     seen = seen & (u + wide > 0.0) & (u - wide < width) & (v + high > 0.0) & (v - high < height)
     seen = seen & ((wide > 0.0) | (high > 0.0))
@@ -280,20 +280,18 @@ def _project_backward(
     by_place = tl.where(axis == 0, by_mean[0][:, None], tl.where(axis == 1, by_mean[1][:, None], by_mean[2][:, None]))
     tl.store(v_means + place, tl.where(seen[:, None], by_color + by_place, 0.0), mask=valid[:, None] & (k < 3)[None, :])
 
-    rows = rotation_rows(w, x, y, z)
     by_rows = (
         turned_back(by_axes, (to_camera[0][0], to_camera[1][0], to_camera[2][0])),
         turned_back(by_axes, (to_camera[0][1], to_camera[1][1], to_camera[2][1])),
         turned_back(by_axes, (to_camera[0][2], to_camera[1][2], to_camera[2][2])),
     )
-    by_size = added(times(by_rows[0], rows[0]), added(times(by_rows[1], rows[1]), times(by_rows[2], rows[2])))
+    by_size, by_quat = axes_gradient(by_rows, size, w, x, y, z, length)
     mean = tl.where(present, tl.load(v_mean_scale) / (3.0 * total), 0.0)
     store_three(
         v_scales, i, tl.where(seen, by_size[0], 0.0) + mean, tl.where(seen, by_size[1], 0.0) + mean,
         tl.where(seen, by_size[2], 0.0) + mean, valid,
     )  # fmt: skip
-    by_rotation = times(by_rows[0], size), times(by_rows[1], size), times(by_rows[2], size)
-    gw, gx, gy, gz = rotation_gradient(w, x, y, z, by_rotation)
-    radial, known = gw * w + gx * x + gy * y + gz * z, tl.where(seen, 1.0 / length, 0.0)
-    gw, gx, gy, gz = gw - radial * w, gx - radial * x, gy - radial * y, gz - radial * z
-    store_quaternion(v_quats, i, known * gw, known * gx, known * gy, known * gz, valid)
+    store_quaternion(
+        v_quats, i, tl.where(seen, by_quat[0], 0.0), tl.where(seen, by_quat[1], 0.0), tl.where(seen, by_quat[2], 0.0),
+        tl.where(seen, by_quat[3], 0.0), valid,
+    )  # fmt: skip

@@ -31,12 +31,10 @@ from drivesplat.kernels.triton.scan_geometry import (
 from drivesplat.kernels.triton.vectors import (
     added,
     atan2,
+    axes_gradient,
     cross,
     dot,
-    rotation_gradient,
-    rotation_rows,
     scaled,
-    times,
     turned_back,
 )
 
@@ -183,7 +181,6 @@ def _project_backward(
     v_center = zero, zero, zero
     v_rows = v_center, v_center, v_center
     w, x, y, z, length = unit(quats, i, valid)
-    rotation, size = rotation_rows(w, x, y, z), three(scales, i, valid)
     for part in tl.static_range(PARTS):
         offset = tl.load(offsets + part * room.to(tl.int64) + i, mask=valid, other=0.0)
         given = (
@@ -209,11 +206,6 @@ def _project_backward(
             added(v_rows[2], turned_back(by_axes, (to_sensor[0][2], to_sensor[1][2], to_sensor[2][2]))),
         )
     store_three(v_means, i, v_center[0], v_center[1], v_center[2], valid)
-    by_first, by_second = times(v_rows[0], rotation[0]), times(v_rows[1], rotation[1])
-    by_scale = added(by_first, added(by_second, times(v_rows[2], rotation[2])))
+    by_scale, by_quat = axes_gradient(v_rows, three(scales, i, valid), w, x, y, z, length)
     store_three(v_scales, i, by_scale[0], by_scale[1], by_scale[2], valid)
-    by_rotation = times(v_rows[0], size), times(v_rows[1], size), times(v_rows[2], size)
-    gw, gx, gy, gz = rotation_gradient(w, x, y, z, by_rotation)
-    radial = gw * w + gx * x + gy * y + gz * z
-    gw, gx, gy, gz = gw - radial * w, gx - radial * x, gy - radial * y, gz - radial * z
-    store_quaternion(v_quats, i, gw / length, gx / length, gy / length, gz / length, valid)
+    store_quaternion(v_quats, i, by_quat[0], by_quat[1], by_quat[2], by_quat[3], valid)

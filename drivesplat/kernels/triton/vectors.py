@@ -110,6 +110,20 @@ def rotation_gradient(w, x, y, z, rows):
 
 @triton.jit
 @no_type_check
+def axes_gradient(rows, size, w, x, y, z, length):
+    """The gradients of scales and of a quaternion by that of the rows of R S. The unit quaternion w, x, y, z is given
+    with its length before normalization."""
+    rotation = rotation_rows(w, x, y, z)
+    by_size = added(times(rows[0], rotation[0]), added(times(rows[1], rotation[1]), times(rows[2], rotation[2])))
+    by_rotation = times(rows[0], size), times(rows[1], size), times(rows[2], size)
+    gw, gx, gy, gz = rotation_gradient(w, x, y, z, by_rotation)
+    radial = gw * w + gx * x + gy * y + gz * z
+    gw, gx, gy, gz = gw - radial * w, gx - radial * x, gy - radial * y, gz - radial * z
+    return by_size, (gw / length, gx / length, gy / length, gz / length)
+
+
+@triton.jit
+@no_type_check
 def turn_rows(velocity, seconds):
     """The rows of the rotation by an angular velocity over times, after Rodrigues."""
     speed = tl.maximum(tl.sqrt(dot(velocity, velocity)), 1e-12)
