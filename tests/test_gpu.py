@@ -57,6 +57,7 @@ from drivesplat.settings.train import DefaultSettings, DeformableSettings, Gauss
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training import trainer as trainer_module
 from drivesplat.training.dropout import with_dropout
+from drivesplat.training.iteration_sets import sets_of_iteration
 from drivesplat.training.scans import initial_echo, load_scans
 from drivesplat.training.trainer import Trainer
 
@@ -558,7 +559,7 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, night
 
 @pytest.mark.parametrize("field", ["lattice", "network"])
 def test_people_are_captured_and_learn_what_they_learn_without_graphs(field, caplog):
-    deformable = DeformableSettings(field=field, network=NetworkSettings(layers=2, width=32))
+    deformable = DeformableSettings(field=field, network=NetworkSettings(layers=2, width=32), mirrored=0.0)
     captured, mine = trained_with(True, people=True, deformable=deformable)
     eager, theirs = trained_with(False, people=True, deformable=deformable)
     assert not caplog.records, "nothing was refused"
@@ -659,6 +660,29 @@ def test_each_replay_drops_out_other_gaussians():
     torch.cuda.synchronize()
     assert all(a.any() and not torch.equal(a, b) for a, b in pairwise(left_out))
     trainer, losses = trained_with(True, dropout=0.1)
+    assert len(trainer.graphs._graphs) == 1 and losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_each_replay_mirrors_objects_at_random(degree):
+    people = DeformableSettings(mirrored=0.5, sh_degree=degree)
+    model = untrained_street(settings_of(deformable=people), people=True).to(GPU)
+    view, states = recorded_views(1, device=GPU)[0].view, model.time_states(0.5)
+
+    def shown() -> torch.Tensor:
+        return sets_of_iteration(model, view, states, 0.0)[1].means
+
+    torch.manual_seed(0)
+    with capture_stream(GPU), torch.no_grad():
+        shown()  # constants are made where nothing is captured
+        graph = capture(shown, [], new_pool(), GPU, "mirrored")
+        assert graph is not None
+        places = set()
+        for _ in range(40):
+            graph.replay()
+            places.add(round(float(graph.result.sum()), 3))
+    assert len(places) == 4, "two objects, each on two sides"
+    trainer, losses = trained_with(True, people=True, deformable=people)
     assert len(trainer.graphs._graphs) == 1 and losses[-1] < losses[0]
 
 

@@ -214,7 +214,8 @@ class Actors(Part):
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
         p, owner, owns = self.params, self.params["owner"], self._owns
         # colors rotate by a few degrees: their gradient would add only noise to the track
-        rotations = rotation_of_harmonics_by(poses.quats, p["shN"].shape[2] + 1)
+        side = state.side if self.mirrored else None
+        rotations = rotation_of_harmonics_by(poses.quats, p["shN"].shape[2] + 1, side)
         colors = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
         return Gaussians(*place(self.local(state), poses, owner, owns), *colors)
 

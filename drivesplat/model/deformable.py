@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from drivesplat.kernels.placement import LocalGaussians, of_owners
+from drivesplat.kernels.placement import LocalGaussians, mirrored, of_owners
 from drivesplat.kernels.quaternions import turned
 from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.actors import Actors
@@ -50,7 +50,7 @@ class Deformable(Actors):
     ):
         super().__init__(params, tracks, settings, gaussians)
         self._gait, self._field = settings.gait, field_of(settings)
-        self._out_of_box_weight = settings.out_of_box_weight
+        self._out_of_box_weight, self.mirrored = settings.out_of_box_weight, settings.mirrored
         self.penalties_depend_on_time = settings.out_of_box_weight > 0
         initial = self._field.initial(len(tracks))
         self._field_names = tuple(initial)
@@ -72,13 +72,14 @@ class Deformable(Actors):
         return self._strides * torch.exp(self.shared["stride"])
 
     def cycles(self, state: TimeState) -> Float[Tensor, " a"]:
-        """The phase of each actor's gait at a time state, in cycles."""
+        """The phase of each actor's gait at a time state, in cycles; of a mirrored one half a cycle later, so that its
+        steps are those of its other side."""
         before, here, after = self._knots  # (m,) each
         x = state.walked.index_select(0, self._annotated_actor)
         hats = torch.minimum((x - before) / (here - before), (after - x) / (after - here)).clamp(0.0, 1.0)
         weights = hats * self._annotated
         corrections = (weights @ self.shared["phase"]) / weights.sum(dim=1).clamp(min=1e-6)
-        return state.walked / self.cycle_lengths + corrections
+        return state.walked / self.cycle_lengths + corrections + 0.25 * (1.0 - state.side)
 
     def basis(self, state: TimeState) -> Float[Tensor, "a k"]:
         """The k functions that deform each actor at a time state: cosine and sine of the phase and of its multiples,
@@ -93,8 +94,10 @@ class Deformable(Actors):
         p = self.params
         gaussians = Undeformed(p["means"], p["owner"], self._owns, self._reach)
         moved = self._field.deformation(dict(self.shared.items()), gaussians, self.basis(state))
-        quats = turned(p["quats"], moved.turns)
-        return LocalGaussians(p["means"] + moved.shifts, quats, p["scales"], p["opacities"])
+        means, quats = p["means"] + moved.shifts, turned(p["quats"], moved.turns)
+        if self.mirrored:
+            means, quats = mirrored(means, quats, of_owners(state.side, self._owns))
+        return LocalGaussians(means, quats, p["scales"], p["opacities"])
 
     @torch.no_grad()
     def shapes(self, track_id: str, times: Sequence[float]) -> Shapes | None:

@@ -31,9 +31,16 @@ def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) 
     return inverse @ sh_basis(coefficients, turned) * same_degree
 
 
-def rotation_of_harmonics_by(quats: Float[Tensor, "a 4"], coefficients: int) -> Float[Tensor, "a k k"]:
-    """`rotation_of_harmonics` by unit quaternions (w, x, y, z), object to world. Without gradient."""
+def rotation_of_harmonics_by(
+    quats: Float[Tensor, "a 4"], coefficients: int, side: Float[Tensor, " a"] | None = None
+) -> Float[Tensor, "a k k"]:
+    """`rotation_of_harmonics` by unit quaternions (w, x, y, z), object to world, of objects that are mirrored before
+    (y to -y) where their `side` is -1. Without gradient."""
     quats = quats.detach()
+    if side is not None and coefficients > 1:
+        mirrors = torch.ones_like(quats[:, :3])
+        mirrors[:, 1] = side
+        return rotation_of_harmonics(rotation_matrix(quats) * mirrors[:, None], coefficients)
     fused = fused_rotation_of_harmonics(quats, coefficients)
     return rotation_of_harmonics(rotation_matrix(quats), coefficients) if fused is None else fused
 

@@ -91,6 +91,8 @@ class Part(nn.Module, ABC):
     """Whether its Gaussians belong to objects with tracks."""
     penalties_depend_on_time = False
     """Whether it has `penalties_at` times."""
+    mirrored = 0.0
+    """The probability with which an iteration of a training mirrors an object of it."""
     geometry: tuple[str, ...] = GEOMETRY
     """Those of `params` that both images and LiDAR scans fit."""
     decaying: tuple[str, ...] = ("means",)

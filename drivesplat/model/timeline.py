@@ -34,7 +34,8 @@ class TimeState(NamedTuple):
 
     `quats` (w, x, y, z) and `translations` (metres) are the annotated object to world; `weights` the interpolation
     weight of each annotation in its actor's position; `series` cos(i pi t / T), t running from 0 to T over an actor's
-    annotations; `walked` the length (metres) of an actor's horizontal path since its first annotation.
+    annotations; `walked` the length (metres) of an actor's horizontal path since its first annotation; `side` 1, or -1
+    for an actor that is mirrored about the plane through its x and z axes.
     """
 
     quats: Float[Tensor, "a 4"]
@@ -43,6 +44,7 @@ class TimeState(NamedTuple):
     weights: Float[Tensor, " m"]
     series: Float[Tensor, "a f"]
     walked: Float[Tensor, " a"]
+    side: Float[Tensor, " a"]
 
 
 class Timeline:
@@ -111,6 +113,6 @@ class Timeline:
             progress[:, i] = np.clip((at - motion.times[0]) / (np.ptp(motion.times) or np.inf), 0.0, 1.0)
         series = np.cos(np.pi * progress[..., None] * np.arange(self._terms))
         quats = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
-        values = (quats.reshape(*shape, 4), poses[..., :3, 3], present, weights, series, walked)
+        values = (quats.reshape(*shape, 4), poses[..., :3, 3], present, weights, series, walked, np.ones(shape))
         tensors = (torch.from_numpy(value if value.dtype == bool else value.astype(np.float32)) for value in values)
         return [TimeState(*each) for each in zip(*(tensor.to(device).unbind() for tensor in tensors), strict=True)]

@@ -120,6 +120,9 @@ class DeformableSettings(ActorSettings):
     """Number of Fourier coefficients over time of every colour coefficient, and of shapes beside the gait. 1 = colours
     are constant in time, and shapes change with the gait alone, so that who stands does not move. More of them overfit
     (docs/measured.md)."""
+    mirrored: float = Field(0.5, ge=0, le=1)
+    """Probability with which an iteration mirrors an object, left for right and half a cycle later in its gait, so that
+    each side learns from images of the other."""
     field: FieldName = "lattice"
     """What deforms them."""
     out_of_box_weight: float = Field(0.0, ge=0)

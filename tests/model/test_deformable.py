@@ -9,10 +9,12 @@ import torch
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
 from helpers.records import training_record_of
 
+from drivesplat.kernels.placement import LocalGaussians
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.model.build import ModelInit, build_model, definitions, rebuild_model
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.deformation import Undeformed
+from drivesplat.model.harmonics import rotated
 from drivesplat.model.lattice import LatticeField, roughness
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import ActorTrack
@@ -183,6 +185,39 @@ def test_gaussians_turn_with_their_limb():
     state = part.time_state(0.0)
     turned = rotation_matrix(torch.nn.functional.normalize(part.local(state).quats, dim=1)).detach()
     assert turned[:, 0, 2].mean() == pytest.approx(math.sin(0.3), abs=1e-5)
+
+
+def test_a_mirrored_person_is_the_mirror_image_of_half_a_cycle_later():
+    """Centres and covariances of the first of two, who alone is mirrored."""
+    part = people_of(walker("first"), walker("second", 1.1), mirrored=0.5)
+    state, half = part.time_state(1.3), torch.tensor([0.5 * STRIDE, 0.0])
+    here, later = part.local(state), part.local(state._replace(walked=state.walked + half))
+    shown = part.local(state._replace(side=torch.tensor([-1.0, 1.0])))
+    mirror, first = torch.diag(torch.tensor([1.0, -1.0, 1.0])), part.of_track("first")
+    torch.testing.assert_close(shown.means[first], later.means[first] @ mirror, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(
+        covariances(shown)[first], mirror @ covariances(later)[first] @ mirror, atol=1e-6, rtol=1e-4
+    )
+    for found, expected in zip(shown, here, strict=True):
+        assert torch.equal(found[~first], expected[~first])
+    assert (shown.means - here.means)[first].norm(dim=1).median() > 0.1
+
+
+def covariances(gaussians: LocalGaussians) -> torch.Tensor:
+    axes = rotation_matrix(torch.nn.functional.normalize(gaussians.quats, dim=1)) * gaussians.scales.exp()[:, None]
+    return (axes @ axes.mT).detach()
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_colours_are_mirrored_too(degree):
+    part, time = people_of(walker(), mirrored=0.5, sh_degree=degree), 1.3
+    with torch.no_grad():
+        part.params["shN"].normal_(generator=torch.Generator().manual_seed(6))
+    state, mirror = part.time_state(time), np.diag([1.0, -1.0, 1.0])
+    half_later = state._replace(walked=state.walked + 0.5 * STRIDE)
+    here, shown = (part.at_time_state(s).sh.detach() for s in (half_later, state._replace(side=-state.side)))
+    expected = rotated(here, torch.from_numpy(mirror))
+    torch.testing.assert_close(shown, expected, atol=1e-5, rtol=0.0)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from helpers.hand_made import about_z
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from drivesplat.model.harmonics import rotated, rotation_of_harmonics
+from drivesplat.model.harmonics import rotated, rotation_of_harmonics, rotation_of_harmonics_by
 
 ROTATIONS = Rotation.random(5, random_state=0).as_matrix()
 COUNTS = [1, 4, 9, 16]
@@ -41,6 +41,18 @@ def test_rotated_coefficients_give_the_colours_of_the_object_frame(coefficients)
     directions, sh = random_directions(), np.random.default_rng(2).normal(size=(coefficients, 3))
     for rotation, turned in zip(ROTATIONS, maps(ROTATIONS, coefficients) @ sh, strict=True):
         in_object = basis(directions @ rotation, coefficients) @ sh  # rows are R^T d
+        np.testing.assert_allclose(basis(directions, coefficients) @ turned, in_object, atol=1e-5)
+
+
+@pytest.mark.parametrize("coefficients", COUNTS)
+def test_a_mirrored_object_has_the_colours_of_its_other_side(coefficients):
+    """Every second object is mirrored: along d it has the colour that it had along d with its own y reversed."""
+    directions, sh = random_directions(), np.random.default_rng(3).normal(size=(coefficients, 3))
+    quats = torch.from_numpy(Rotation.from_matrix(ROTATIONS).as_quat(scalar_first=True))
+    side = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0]).double()
+    turns = rotation_of_harmonics_by(quats, coefficients, side).numpy()
+    for rotation, own, turned in zip(ROTATIONS, side.numpy(), turns @ sh, strict=True):
+        in_object = basis(directions @ rotation * [1.0, own, 1.0], coefficients) @ sh
         np.testing.assert_allclose(basis(directions, coefficients) @ turned, in_object, atol=1e-5)
 
 

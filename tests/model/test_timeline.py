@@ -137,6 +137,6 @@ def test_a_time_state_of_30_actors_takes_less_than_10_kilobytes():
     """Each with 40 annotations, all the key frames of a drive: so many times are kept that it matters."""
     annotated = motion_through(0.5 * np.arange(40), np.zeros((40, 3)))
     state = Timeline([track_of(annotated, str(i)) for i in range(30)], 5).at(1.7, CPU)
-    shapes = [(30, 4), (30, 3), (30,), (30 * len(annotated.times),), (30, 5), (30,)]
+    shapes = [(30, 4), (30, 3), (30,), (30 * len(annotated.times),), (30, 5), (30,), (30,)]
     assert [tuple(value.shape) for value in state] == shapes
     assert sum(value.untyped_storage().nbytes() for value in state) < 10_000
