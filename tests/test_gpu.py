@@ -53,11 +53,12 @@ from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.shutter import Shutter
 from drivesplat.settings.deformable import NetworkSettings
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.train import DefaultSettings, DeformableSettings, GaussianSettings, McmcSettings, TrainSettings
+from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings, TrainSettings
+from drivesplat.settings.train_objects import DeformableSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training import trainer as trainer_module
 from drivesplat.training.dropout import with_dropout
-from drivesplat.training.iteration_sets import sets_of_iteration
+from drivesplat.training.mirroring import sets_with_mirrored_objects
 from drivesplat.training.scans import initial_echo, load_scans
 from drivesplat.training.trainer import Trainer
 
@@ -559,7 +560,7 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, night
 
 @pytest.mark.parametrize("field", ["lattice", "network"])
 def test_people_are_captured_and_learn_what_they_learn_without_graphs(field, caplog):
-    deformable = DeformableSettings(field=field, network=NetworkSettings(layers=2, width=32), mirrored=0.0)
+    deformable = DeformableSettings(field=field, network=NetworkSettings(layers=2, width=32))
     captured, mine = trained_with(True, people=True, deformable=deformable)
     eager, theirs = trained_with(False, people=True, deformable=deformable)
     assert not caplog.records, "nothing was refused"
@@ -665,12 +666,12 @@ def test_each_replay_drops_out_other_gaussians():
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_each_replay_mirrors_objects_at_random(degree):
-    people = DeformableSettings(mirrored=0.5, sh_degree=degree)
-    model = untrained_street(settings_of(deformable=people), people=True).to(GPU)
-    view, states = recorded_views(1, device=GPU)[0].view, model.time_states(0.5)
+    model = untrained_street(settings_of(deformable=DeformableSettings(sh_degree=degree)), people=True)
+    model.parts[1].mirrored = torch.full((2,), 0.5)
+    view, states = recorded_views(1, device=GPU)[0].view, model.to(GPU).time_states(0.5)
 
     def shown() -> torch.Tensor:
-        return sets_of_iteration(model, view, states, 0.0)[1].means
+        return sets_with_mirrored_objects(model, view, states)[1].means
 
     torch.manual_seed(0)
     with capture_stream(GPU), torch.no_grad():
@@ -682,7 +683,20 @@ def test_each_replay_mirrors_objects_at_random(degree):
             graph.replay()
             places.add(round(float(graph.result.sum()), 3))
     assert len(places) == 4, "two objects, each on two sides"
-    trainer, losses = trained_with(True, people=True, deformable=people)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_training_with_mirrored_people_is_captured(degree, monkeypatch, caplog):
+    street = untrained_street
+
+    def mirrored(*arguments):
+        model = street(*arguments)
+        model.parts[1].mirrored = torch.full((2,), 0.5)
+        return model
+
+    monkeypatch.setitem(globals(), "untrained_street", mirrored)
+    trainer, losses = trained_with(True, people=True, deformable=DeformableSettings(sh_degree=degree))
+    assert not caplog.records, "nothing was refused"
     assert len(trainer.graphs._graphs) == 1 and losses[-1] < losses[0]
 
 

@@ -27,7 +27,8 @@ from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGro
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.model.track_penalties import track_penalties
 from drivesplat.scene.motion import HALF_STEP, Motion
-from drivesplat.settings.train import ActorSettings, GaussianSettings
+from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train_objects import ActorSettings
 
 MAX_SPREAD = 0.6
 """Maximum standard deviation of a Gaussian along an axis of its box, as a fraction of half the size of the box with its
@@ -214,7 +215,7 @@ class Actors(Part):
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
         p, owner, owns = self.params, self.params["owner"], self._owns
         # colors rotate by a few degrees: their gradient would add only noise to the track
-        side = state.side if self.mirrored else None
+        side = None if self.mirrored is None else state.side
         rotations = rotation_of_harmonics_by(poses.quats, p["shN"].shape[2] + 1, side)
         colors = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
         return Gaussians(*place(self.local(state), poses, owner, owns), *colors)

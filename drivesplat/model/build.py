@@ -20,7 +20,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train import ActorSettings, PartName, SkyKind, TrainSettings
+from drivesplat.settings.train import PartName, SkyKind, TrainSettings
+from drivesplat.settings.train_objects import ActorSettings
 
 EXPOSURE_PREFIX = "exposure.first."
 """Prefix of the initial gains of exposures in a model's state; the camera name follows."""

@@ -24,7 +24,8 @@ from drivesplat.model.lattice import LatticeField
 from drivesplat.model.parameters import make_parameters
 from drivesplat.model.part import ActorPlacement, Shapes
 from drivesplat.model.timeline import ActorTrack, TimeState
-from drivesplat.settings.train import DeformableSettings, GaussianSettings
+from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train_objects import DeformableSettings
 
 MIN_STEP, FAR = 0.01, 1e6
 """Metres: the least distance between two annotations where the phase is interpolated, and one that is never walked."""
@@ -50,7 +51,7 @@ class Deformable(Actors):
     ):
         super().__init__(params, tracks, settings, gaussians)
         self._gait, self._field = settings.gait, field_of(settings)
-        self._out_of_box_weight, self.mirrored = settings.out_of_box_weight, settings.mirrored
+        self._out_of_box_weight = settings.out_of_box_weight
         self.penalties_depend_on_time = settings.out_of_box_weight > 0
         initial = self._field.initial(len(tracks))
         self._field_names = tuple(initial)
@@ -95,7 +96,7 @@ class Deformable(Actors):
         gaussians = Undeformed(p["means"], p["owner"], self._owns, self._reach)
         moved = self._field.deformation(dict(self.shared.items()), gaussians, self.basis(state))
         means, quats = p["means"] + moved.shifts, turned(p["quats"], moved.turns)
-        if self.mirrored:
+        if self.mirrored is not None:
             means, quats = mirrored(means, quats, of_owners(state.side, self._owns))
         return LocalGaussians(means, quats, p["scales"], p["opacities"])
 

@@ -91,8 +91,8 @@ class Part(nn.Module, ABC):
     """Whether its Gaussians belong to objects with tracks."""
     penalties_depend_on_time = False
     """Whether it has `penalties_at` times."""
-    mirrored = 0.0
-    """The probability with which an iteration of a training mirrors an object of it."""
+    mirrored: Float[Tensor, " a"] | None
+    """The probabilities with which an iteration of a training mirrors each of its a objects; None: never."""
     geometry: tuple[str, ...] = GEOMETRY
     """Those of `params` that both images and LiDAR scans fit."""
     decaying: tuple[str, ...] = ("means",)
@@ -110,6 +110,7 @@ class Part(nn.Module, ABC):
         self.shared = nn.ParameterDict()
         self._preallocated = 0
         self.register_buffer("count_on_device", torch.zeros(()), persistent=False)
+        self.register_buffer("mirrored", None, persistent=False)
 
     def precompute(self, times: Sequence[float]) -> None:
         """Precomputes state for the given times, which may be faster for many times together than one by one."""

@@ -4,7 +4,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drivesplat.kernels.track_penalties import sums_of_squares
-from drivesplat.settings.train import TrackSettings
+from drivesplat.settings.train_objects import TrackSettings
 
 
 def track_penalties(

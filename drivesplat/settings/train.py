@@ -6,10 +6,10 @@ from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
-from drivesplat.settings.deformable import FieldName, GaitSettings, LatticeSettings, NetworkSettings
 from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train_cameras import CameraPoseSettings, ExposureSettings
 from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
+from drivesplat.settings.train_objects import ActorSettings, DeformableSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 
 PartName = Literal["background", "actors", "deformable", "drifting"]
@@ -66,74 +66,6 @@ class GaussianSettings(Settings):
     """Learning rate of LiDAR's logits of intensity and return, where LiDAR is rendered (train.scans)."""
     lr_shN: float = Field(1.25e-4, gt=0)
     """Learning rate of the colours' view-dependent terms."""
-
-
-class TrackSettings(Settings):
-    """Learned corrections of the annotated poses of actors. Poses between annotations are interpolated smoothly."""
-
-    corrected: bool = True
-    """Correct annotated positions and headings."""
-    lr_translation: float = Field(1e-3, gt=0)
-    """Learning rate of the position corrections (metres)."""
-    lr_yaw: float = Field(5e-4, gt=0)
-    """Learning rate of the heading corrections (radians)."""
-    size_weight: float = Field(0.001, ge=0)
-    """Loss weight of the mean square of the corrections, in units of `sigma_translation` and `sigma_yaw`."""
-    bend_weight: float = Field(0.001, ge=0)
-    """Loss weight of the mean square of their second differences along a track, in the same units. It keeps corrections
-    smooth, so that they hold for the held-out frames in between (docs/street.md)."""
-    sigma_translation: float = Field(0.1, gt=0)
-    """Expected error of an annotated position (metres)."""
-    sigma_yaw: float = Field(0.03, gt=0)
-    """Expected error of an annotated heading (radians)."""
-
-
-class ActorSettings(Settings):
-    """The part `actors`: moving vehicles, each a set of Gaussians in the frame of its box."""
-
-    cap_max: int = Field(200_000, ge=1, le=20_000_000)
-    """Maximum number of Gaussians of all actors together. Each actor keeps at least four."""
-    least: int = Field(500, ge=1)
-    """Number of Gaussians that every actor may have. Beyond it, train.pixels_per_gaussian limits an actor by the number
-    of training pixels in its box."""
-    sh_degree: int = Field(1, ge=0, le=3)
-    """Degree of the spherical harmonics of their colours, in the object's frame."""
-    fourier: int = Field(5, ge=1, le=16)
-    """Number of Fourier coefficients over time of every colour coefficient. 1 = colours constant in time."""
-    box_margin: float = Field(0.1, ge=0, le=2)
-    """Gaussians with centres farther than this (metres) outside their box are faded out."""
-    tracks: TrackSettings = TrackSettings()
-
-    def for_scene(self, cap: int, objects: int, views: int) -> "ActorSettings":
-        """The settings for so many `objects`, of at most `cap` Gaussians, in a scene of so many training `views`."""
-        return self.model_copy(update={"cap_max": min(self.cap_max, cap)})
-
-
-class DeformableSettings(ActorSettings):
-    """The part `deformable`: people, animals and cyclists, each a set of Gaussians in the frame of its box that deform
-    with the distance walked and with time (docs/street.md)."""
-
-    sh_degree: int = Field(0, ge=0, le=3)
-    """Degree of the spherical harmonics of their colours. 0 = the same colour from all directions. Higher degrees
-    overfit (docs/measured.md)."""
-    fourier: int = Field(1, ge=1, le=16)
-    """Number of Fourier coefficients over time of every colour coefficient, and of shapes beside the gait. 1 = colours
-    are constant in time, and shapes change with the gait alone, so that who stands does not move. More of them overfit
-    (docs/measured.md)."""
-    mirrored: float = Field(0.5, ge=0, le=1)
-    """Probability with which an iteration mirrors an object, left for right and half a cycle later in its gait, so that
-    each side learns from images of the other."""
-    field: FieldName = "lattice"
-    """What deforms them."""
-    out_of_box_weight: float = Field(0.0, ge=0)
-    """Loss weight of the mean distance (metres) by which deformed Gaussians leave their box and its margin."""
-    gait: GaitSettings = GaitSettings()
-    lattice: LatticeSettings = LatticeSettings()
-    network: NetworkSettings = NetworkSettings()
-
-    def for_scene(self, cap: int, objects: int, views: int) -> "ActorSettings":
-        lattice = self.lattice.for_scene(objects, views)
-        return super().for_scene(cap, objects, views).model_copy(update={"lattice": lattice})
 
 
 class McmcSettings(Settings):

@@ -33,6 +33,7 @@ from drivesplat.training import resume_state
 from drivesplat.training.dropout import dropout_share
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
+from drivesplat.training.mirroring import choose_mirrored
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
 from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
@@ -195,6 +196,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     if job.train.scans.per_image and not scans:
         raise TrainingError("no LiDAR scan is there to train with; set train.scans.per_image to 0")
     model = build_model(init, job.parts, job.sky, settings)
+    choose_mirrored(model, record, settings.deformable)
     priors = geometry_priors(inputs.record, inputs.free_space, settings)
     return Prepared(model, views, settings, priors, curves, scans)
 

@@ -23,9 +23,10 @@ from drivesplat.training.cuda_graph.iteration_graphs import (
 )
 from drivesplat.training.cuda_graph.scan_inputs import SharedScanInputs
 from drivesplat.training.densify import Densifier
+from drivesplat.training.dropout import with_dropout
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
-from drivesplat.training.iteration_sets import sets_of_iteration
 from drivesplat.training.losses import loss_terms
+from drivesplat.training.mirroring import sets_with_mirrored_objects
 from drivesplat.training.monitor import FiniteGuard, readable
 from drivesplat.training.optimizers import (
     DeviceSchedule,
@@ -180,10 +181,13 @@ class Trainer:
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # gradients of an iteration that ran out of memory
         with stage("render"):
+            sets = sets_with_mirrored_objects(self.model, view.view, states)
+            if self.settings.dropout:
+                sets = with_dropout(sets, self.model, self.settings.dropout)
             picture = self.model.render(
                 view.view,
                 self.sh_degree(),
-                gaussians=sets_of_iteration(self.model, view.view, states, self.settings.dropout),
+                gaussians=sets,
                 absgrad=by_gradient and self.settings.default.absgrad,
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
                 with_objects=self._has_entropy and self.settings.entropy_weight > 0 and not by_gradient,

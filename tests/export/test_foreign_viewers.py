@@ -27,7 +27,8 @@ from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.export import MAX_DISTANCE, SplatJob
-from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainSettings
+from drivesplat.settings.train_objects import ActorSettings
 
 FOREIGN = Path(__file__).parent / "foreign"
 INSTALL = f"npm install --prefix {FOREIGN.relative_to(REPOSITORY)}"

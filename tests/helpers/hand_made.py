@@ -23,7 +23,8 @@ from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
-from drivesplat.settings.train import ActorSettings, GaussianSettings
+from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train_objects import ActorSettings
 
 BLACK = (0.0, 0.0, 0.0)
 

@@ -19,7 +19,8 @@ from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.render import FilmFormat
-from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainJob, TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
+from drivesplat.settings.train_objects import ActorSettings
 from helpers.classed import classed
 from helpers.hand_made import about_z, round_gaussians
 from helpers.hand_made import actors_of as made_actors

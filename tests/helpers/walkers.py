@@ -6,7 +6,8 @@ import torch
 from drivesplat.model.deformable import Deformable
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.deformable import LatticeSettings
-from drivesplat.settings.train import DeformableSettings, GaussianSettings
+from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train_objects import DeformableSettings
 from helpers.hand_made import motion_through, track_of
 from helpers.hand_made_traffic import TURNING
 

@@ -16,7 +16,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.motion import Motion
-from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings, TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainSettings
+from drivesplat.settings.train_objects import ActorSettings, TrackSettings
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 

@@ -14,7 +14,8 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.track_penalties import track_penalties
-from drivesplat.settings.train import ActorSettings, DefaultSettings, GaussianSettings, McmcSettings, TrackSettings
+from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
+from drivesplat.settings.train_objects import ActorSettings, TrackSettings
 from drivesplat.training.optimizers import make_optimizers
 
 TIMES = np.linspace(1.0, 3.0, 5)

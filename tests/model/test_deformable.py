@@ -20,7 +20,8 @@ from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.motion import HALF_STEP
 from drivesplat.settings.deformable import GaitSettings, LatticeSettings, NetworkSettings
-from drivesplat.settings.train import DeformableSettings, GaussianSettings, TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainSettings
+from drivesplat.settings.train_objects import DeformableSettings
 
 SIZE, SPEED = (0.8, 0.6, 1.8), 1.5
 STRIDE = 0.83 * SIZE[2]
@@ -189,7 +190,8 @@ def test_gaussians_turn_with_their_limb():
 
 def test_a_mirrored_person_is_the_mirror_image_of_half_a_cycle_later():
     """Centres and covariances of the first of two, who alone is mirrored."""
-    part = people_of(walker("first"), walker("second", 1.1), mirrored=0.5)
+    part = people_of(walker("first"), walker("second", 1.1))
+    part.mirrored = torch.full((2,), 0.5)
     state, half = part.time_state(1.3), torch.tensor([0.5 * STRIDE, 0.0])
     here, later = part.local(state), part.local(state._replace(walked=state.walked + half))
     shown = part.local(state._replace(side=torch.tensor([-1.0, 1.0])))
@@ -210,7 +212,8 @@ def covariances(gaussians: LocalGaussians) -> torch.Tensor:
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_colours_are_mirrored_too(degree):
-    part, time = people_of(walker(), mirrored=0.5, sh_degree=degree), 1.3
+    part, time = people_of(walker(), sh_degree=degree), 1.3
+    part.mirrored = torch.full((1,), 0.5)
     with torch.no_grad():
         part.params["shN"].normal_(generator=torch.Generator().manual_seed(6))
     state, mirror = part.time_state(time), np.diag([1.0, -1.0, 1.0])

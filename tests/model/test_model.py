@@ -26,7 +26,8 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainJob, TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
+from drivesplat.settings.train_objects import ActorSettings
 
 SH_C0 = 0.5 / np.sqrt(np.pi)
 SKY_COLOR = np.array([0.2, 0.4, 0.8])

@@ -14,7 +14,8 @@ from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import RollingShutter, View, where_seen
 from drivesplat.scene.shutter import Shutter
-from drivesplat.settings.train import ActorSettings, GaussianSettings
+from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train_objects import ActorSettings
 
 WIDTH, HEIGHT, TIME = 64, 48, 1.0
 VELOCITY = np.array([1.0, 0.0, 8.0, 0.02, 0.5, -0.1])

@@ -18,7 +18,8 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.gaussians import GaussianSets
 from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.settings.train import ActorSettings, CoarseToFineSettings, DefaultSettings, McmcSettings
+from drivesplat.settings.train import CoarseToFineSettings, DefaultSettings, McmcSettings
+from drivesplat.settings.train_objects import ActorSettings
 from drivesplat.training.densify import Densifier, coarse_cap
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.trainer import Trainer

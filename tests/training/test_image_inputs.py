@@ -18,7 +18,8 @@ from helpers.trainings import (
 from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
-from drivesplat.settings.train import DeformableSettings, McmcSettings
+from drivesplat.settings.train import McmcSettings
+from drivesplat.settings.train_objects import DeformableSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.cuda_graph.image_inputs import SharedImageInputs, can_share
 from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs, Recording

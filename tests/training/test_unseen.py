@@ -15,7 +15,8 @@ from drivesplat.model.sky import ConstantSky, CubemapSky, logit_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.train import ActorSettings, GaussianSettings
+from drivesplat.settings.train import GaussianSettings
+from drivesplat.settings.train_objects import ActorSettings
 from drivesplat.training.run import run_training
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import TrainingView

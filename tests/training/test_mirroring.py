@@ -1,0 +1,118 @@
+"""Mirrored objects: which an iteration mirrors, and how often."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import motion_through, track_of
+from helpers.records import training_record_of
+from helpers.trainings import recorded_views, settings_of, untrained_street
+
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import RollingShutter, View
+from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.train_objects import DeformableSettings
+from drivesplat.training.mirroring import choose_mirrored, mirrored_shares, sets_with_mirrored_objects
+
+
+def street(mirrored: float) -> SplatModel:
+    """Background, and two objects that deform, mirrored with this probability."""
+    model = untrained_street(settings_of(), people=True)
+    model.parts[1].mirrored = torch.full((2,), mirrored) if mirrored else None
+    return model
+
+
+def one_view(rolling: bool = False) -> View:
+    view = recorded_views()[1].view
+    shutter = RollingShutter(torch.tensor([0.0, 0.03, 0.0]), torch.zeros(3, 4))
+    return dataclasses.replace(view, shutter=shutter) if rolling else view
+
+
+def are_equal(found: Gaussians, expected: Gaussians) -> bool:
+    return all(torch.equal(found.tensors[name], values) for name, values in expected.tensors.items())
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7])
+@pytest.mark.parametrize("looked_up", [True, False])
+def test_objects_are_mirrored_at_random(share, looked_up):
+    """Each for itself, in its share of the iterations; nothing else changes."""
+    torch.manual_seed(0)
+    model, view = street(share), one_view()
+    states = None if looked_up else model.time_states(view.time)
+    recorded = model.sets_in(view)
+    shown = [sets_with_mirrored_objects(model, view, states) for _ in range(300)]
+    assert all(are_equal(static, recorded[0]) for static, _ in shown)
+    moved = torch.stack([(objects.means - recorded[1].means).norm(dim=1) > 1e-4 for _, objects in shown])
+    tracks = [model.parts[1].of_track(track.id) for track in model.parts[1].timeline.tracks]
+    often = torch.stack([moved[:, own].any(dim=1) for own in tracks]).double()
+    np.testing.assert_allclose(often.mean(dim=1), share, atol=0.08)
+    np.testing.assert_allclose((often[0] * often[1]).mean(), share**2, atol=0.08)
+
+
+def test_without_mirroring_the_gaussians_are_those_of_the_time_and_no_random_number_is_drawn():
+    model, view = street(0.0), one_view()
+    torch.manual_seed(3)
+    first = torch.rand(())
+    torch.manual_seed(3)
+    for states in (None, model.time_states(view.time)):
+        for found, expected in zip(sets_with_mirrored_objects(model, view, states), model.sets_in(view), strict=True):
+            assert are_equal(found, expected)
+    assert torch.rand(()) == first
+
+
+@pytest.mark.parametrize("mirrored", [0.0, 1.0])
+def test_a_rolling_shutter_has_the_velocities_of_what_is_shown(mirrored):
+    model, view, step = street(mirrored), one_view(rolling=True), 1e-2
+    static, objects = sets_with_mirrored_objects(model, view, None)
+    earlier, later = (
+        sets_with_mirrored_objects(model, dataclasses.replace(view, time=view.time + after), None)[1].means.detach()
+        for after in (-step, step)
+    )
+    assert static.velocities is None or not static.velocities.any()
+    torch.testing.assert_close(objects.velocities, (later - earlier) / (2.0 * step), atol=0.05, rtol=0.02)
+    assert objects.velocities.norm(dim=1).max() > 0.1
+
+
+def images_of(count: int, cameras: int = 1, hz: float = 2.0) -> TrainingRecord:
+    """A record of so many training images of each camera, `hz` a second."""
+    names = [f"CAM_{i}" for i in range(cameras)]
+    frames = np.repeat(np.arange(count), cameras)
+    splits = {"train": np.arange(count * cameras)}
+    return training_record_of(
+        count * cameras, camera_names=names, camera_indices=np.arange(count * cameras) % cameras, splits=splits,
+        timestamps=(1e6 / hz * frames).astype(np.int64),
+    )  # fmt: skip
+
+
+def seen_for(seconds: float) -> ActorTrack:
+    """A track with annotations twice a second, the last after so many seconds."""
+    times = np.arange(0.0, seconds + 0.25, 0.5)
+    return track_of(motion_through(times, np.zeros((len(times), 3)), np.zeros(len(times))), f"{seconds} s")
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize(("images", "expected"), [(5, 0.6), (30, 0.6), (45, 0.3), (60, 0.0), (200, 0.0)])
+def test_objects_in_many_images_of_a_camera_are_mirrored_less(images, expected, cameras):
+    settings, whole = DeformableSettings(mirrored=0.6), seen_for(100.0)
+    found = mirrored_shares([whole], images_of(images, cameras), settings)
+    np.testing.assert_allclose(found, [expected], atol=0.02)
+
+
+def test_the_images_count_in_which_an_object_is_present():
+    """Of two hundred images of a camera, one shows the first object in twenty, the other in all."""
+    model, record = street(0.0), images_of(200)
+    tracks = [seen_for(9.5), seen_for(100.0)]
+    shares = mirrored_shares(tracks, record, DeformableSettings(mirrored=0.4))
+    np.testing.assert_allclose(shares, [0.4, 0.0], atol=1e-9)
+    half = DeformableSettings(mirrored=0.4, mirrored_images=15)
+    assert 0.0 < mirrored_shares(tracks, record, half)[0] < 0.4
+    model.parts[1].timeline.tracks = tuple(tracks)
+    choose_mirrored(model, record, DeformableSettings(mirrored=0.4))
+    np.testing.assert_allclose(model.parts[1].mirrored, shares, atol=1e-6)
+    choose_mirrored(model, record, DeformableSettings(mirrored=0.0))
+    assert model.parts[1].mirrored is None
+    choose_mirrored(model, images_of(0), DeformableSettings(mirrored=0.4))
+    assert (model.parts[1].mirrored == 0.4).all(), "without images, as a LiDAR alone"
