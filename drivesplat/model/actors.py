@@ -65,8 +65,7 @@ class Actors(Part):
         self.shared = make_parameters(corrections).requires_grad_(settings.tracks.corrected)
         self.extent = float(np.median([np.linalg.norm(track.size) for track in tracks]))
         self.cap_max = settings.cap_max
-        self._settings = settings
-        self._gaussians = gaussians
+        self._settings, self._gaussians = settings, gaussians
         self._known_owners: tuple[Tensor | None, int, Tensor | None] = (None, 0, None)
         sizes = torch.from_numpy(np.stack([track.size for track in tracks])).float()
         self.register_buffer("_reach", 0.5 * sizes + settings.box_margin, persistent=False)
