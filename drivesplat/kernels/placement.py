@@ -53,13 +53,12 @@ def place(
     )
 
 
-def mirrored(
-    means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], side: Float[Tensor, " n"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
-    """Means and quaternions (w, x, y, z, of any length) of Gaussians in the frames of their objects, reflected about
-    the plane y = 0 where `side` is -1, and unchanged where it is 1."""
+def mirrored(gaussians: LocalGaussians, side: Float[Tensor, " n"]) -> LocalGaussians:
+    """Gaussians in the frames of their objects, reflected about the plane y = 0 where `side` is -1, and unchanged where
+    it is 1."""
     same = torch.ones_like(side)
-    return means * torch.stack([same, side, same], dim=1), quats * torch.stack([same, side, same, side], dim=1)
+    means = gaussians.means * torch.stack([same, side, same], dim=1)
+    return gaussians._replace(means=means, quats=gaussians.quats * torch.stack([same, side, same, side], dim=1))
 
 
 def of_owners(values: Float[Tensor, "a *v"], owns: Float[Tensor, "n a"]) -> Float[Tensor, "n *v"]:

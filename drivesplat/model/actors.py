@@ -16,7 +16,7 @@ from torch.nn.functional import normalize, one_hot
 
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.object_poses import corrected
-from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
+from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, mirrored, of_owners, place
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
 from drivesplat.model.actor_placements import placement_sets, with_placements
@@ -108,9 +108,9 @@ class Actors(Part):
 
     def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
         state = TimeState(*time_state)
-        poses, owner, owns = self.poses(state), self.params["owner"], self._owns
+        poses = self.poses(state)
         echoes = self._echoes(poses) if "echoes" in self.params else None
-        return without_colors(*place(self.local(state), poses, owner, owns), echoes)
+        return without_colors(*self._in_world(state, poses), echoes)
 
     def poses(self, state: TimeState) -> ObjectPoses:
         """The annotated poses of the actors with their learned corrections."""
@@ -137,7 +137,7 @@ class Actors(Part):
         """The velocities of its Gaussians, m/s, by states and poses HALF_STEP seconds before and after; 0 for actors
         that are absent then."""
         there = of_owners(before[1].presence * after[1].presence, self._owns)[:, None]
-        return there * (self._positions(*after) - self._positions(*before)) / (2.0 * HALF_STEP)
+        return there * (self._in_world(*after)[0] - self._in_world(*before)[0]) / (2.0 * HALF_STEP)
 
     def _echoes(self, poses: ObjectPoses) -> Float[Tensor, "n 4 2"]:
         """The echoes of actors at these poses along directions in the world."""
@@ -145,9 +145,12 @@ class Actors(Part):
         turned = (of_owners(turns, self._owns)[..., None] * own[:, None, 1:]).sum(dim=2)  # faster than small matrices
         return torch.cat([own[:, :1], turned], dim=1)
 
-    def _positions(self, state: TimeState, poses: ObjectPoses) -> Float[Tensor, "n 3"]:
-        """The centres of its Gaussians in the world."""
-        return place(self.local(state), poses, self.params["owner"], self._owns)[0]
+    def _in_world(self, state: TimeState, poses: ObjectPoses) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, unit quaternions, scales and opacities of its Gaussians in the world, mirrored by a state's `side`."""
+        local = self.local(state)
+        if self.mirrored is not None:
+            local = mirrored(local, of_owners(state.side, self._owns))
+        return place(local, poses, self.params["owner"], self._owns)
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         state, known = self.time_state(time), self._known
@@ -212,12 +215,11 @@ class Actors(Part):
 
     def placed(self, state: TimeState, poses: ObjectPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
-        p, owner, owns = self.params, self.params["owner"], self._owns
+        p, side = self.params, None if self.mirrored is None else state.side
         # colors rotate by a few degrees: their gradient would add only noise to the track
-        side = None if self.mirrored is None else state.side
         rotations = rotation_of_harmonics_by(poses.quats, p["shN"].shape[2] + 1, side)
-        colors = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
-        return Gaussians(*place(self.local(state), poses, owner, owns), *colors)
+        colors = colors_in_world(p["sh0"], p["shN"], state.series, rotations, p["owner"], self._owns)
+        return Gaussians(*self._in_world(state, poses), *colors)
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
@@ -238,18 +240,16 @@ class Actors(Part):
         return colors_in_object(self.params["sh0"], self.params["shN"], state.series, self._owns)
 
     def learning_rates(self) -> dict[str, float]:
-        tracks = self._settings.tracks
-        own = learning_rates(self._gaussians, self.extent)
+        own, tracks = learning_rates(self._gaussians, self.extent), self._settings.tracks
         return {**own, "translation": tracks.lr_translation, "yaw": tracks.lr_yaw}
 
     def definition(self) -> PartDefinition:
         return PartDefinition(self.name, self.extent, self.timeline.tracks)
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
-        tracks = self._settings.tracks
-        if not tracks.corrected:
-            return {}
-        return track_penalties(self.shared["translation"], self.shared["yaw"], self._neighbours, tracks)
+        tracks, shared = self._settings.tracks, self.shared
+        corrections = shared["translation"], shared["yaw"]
+        return track_penalties(*corrections, self._neighbours, tracks) if tracks.corrected else {}
 
     @torch.no_grad()
     def confine(self) -> None:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from drivesplat.kernels.placement import LocalGaussians, mirrored, of_owners
+from drivesplat.kernels.placement import LocalGaussians, of_owners
 from drivesplat.kernels.quaternions import turned
 from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.actors import Actors
@@ -95,10 +95,8 @@ class Deformable(Actors):
         p = self.params
         gaussians = Undeformed(p["means"], p["owner"], self._owns, self._reach)
         moved = self._field.deformation(dict(self.shared.items()), gaussians, self.basis(state))
-        means, quats = p["means"] + moved.shifts, turned(p["quats"], moved.turns)
-        if self.mirrored is not None:
-            means, quats = mirrored(means, quats, of_owners(state.side, self._owns))
-        return LocalGaussians(means, quats, p["scales"], p["opacities"])
+        quats = turned(p["quats"], moved.turns)
+        return LocalGaussians(p["means"] + moved.shifts, quats, p["scales"], p["opacities"])
 
     @torch.no_grad()
     def shapes(self, track_id: str, times: Sequence[float]) -> Shapes | None:

@@ -196,7 +196,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     if job.train.scans.per_image and not scans:
         raise TrainingError("no LiDAR scan is there to train with; set train.scans.per_image to 0")
     model = build_model(init, job.parts, job.sky, settings)
-    choose_mirrored(model, record, settings.deformable)
+    choose_mirrored(model, record, settings)
     priors = geometry_priors(inputs.record, inputs.free_space, settings)
     return Prepared(model, views, settings, priors, curves, scans)
 

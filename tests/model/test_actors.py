@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.kernels.placement import ObjectPoses
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix, turned
 from drivesplat.model.actors import Actors
+from drivesplat.model.harmonics import rotated
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.track_penalties import track_penalties
@@ -53,6 +54,34 @@ def matrices(quats: torch.Tensor) -> np.ndarray:
 
 def doubled(actors: Actors) -> dict[str, np.ndarray]:
     return {name: value.detach().double().numpy() for name, value in (*actors.params.items(), *actors.shared.items())}
+
+
+# ---- mirror images
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_a_mirrored_vehicle_is_its_mirror_image(degree):
+    """In the frame of its box: what is at y is at -y, in its shape and its colours. The other vehicle stays."""
+    actors = actors_of(van(), car(), settings=ActorSettings(sh_degree=degree))
+    actors.mirrored = torch.full((2,), 0.5)
+    state = actors.time_state(2.7)
+    here, found = (
+        actors.at_time_state(each) for each in (state, state._replace(side=torch.tensor([-1.0, 1.0])))
+    )  # fmt: skip
+    pose, rows = actors.poses(state), actors.of_track("van")
+    turn, place = torch.from_numpy(matrices(pose.quats)[0]).float(), pose.translations[0].detach()
+    reflected = turn @ torch.diag(torch.tensor([1.0, -1.0, 1.0])) @ turn.T
+    for name, values in here.tensors.items():
+        assert torch.equal(found.tensors[name][~rows], values[~rows]), name
+    expected = (here.means[rows].detach() - place) @ reflected + place
+    torch.testing.assert_close(found.means[rows].detach(), expected, atol=1e-4, rtol=0.0)
+    axes, mirrored = (
+        torch.from_numpy(matrices(own.quats[rows])).float() * own.scales[rows, None] for own in (here, found)
+    )
+    covariances = reflected @ axes @ axes.mT @ reflected
+    torch.testing.assert_close((mirrored @ mirrored.mT).detach(), covariances.detach(), atol=1e-4, rtol=1e-4)
+    colors = rotated(here.sh[rows].detach(), reflected)
+    torch.testing.assert_close(found.sh[rows].detach(), colors, atol=1e-4, rtol=0.0)
 
 
 # ---- rotations

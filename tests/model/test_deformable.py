@@ -9,11 +9,11 @@ import torch
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
 from helpers.records import training_record_of
 
-from drivesplat.kernels.placement import LocalGaussians
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.model.build import ModelInit, build_model, definitions, rebuild_model
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.deformation import Undeformed
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.lattice import LatticeField, roughness
 from drivesplat.model.part import ActorPlacement
@@ -189,24 +189,24 @@ def test_gaussians_turn_with_their_limb():
 
 
 def test_a_mirrored_person_is_the_mirror_image_of_half_a_cycle_later():
-    """Centres and covariances of the first of two, who alone is mirrored."""
+    """Of two people, who walk along x, the first is mirrored."""
     part = people_of(walker("first"), walker("second", 1.1))
     part.mirrored = torch.full((2,), 0.5)
     state, half = part.time_state(1.3), torch.tensor([0.5 * STRIDE, 0.0])
-    here, later = part.local(state), part.local(state._replace(walked=state.walked + half))
-    shown = part.local(state._replace(side=torch.tensor([-1.0, 1.0])))
+    later, sides = state._replace(walked=state.walked + half), state._replace(side=torch.tensor([-1.0, 1.0]))
+    places = part.poses(state).translations[part.params["owner"]]
+    placed = [part.at_time_state(each) for each in (state, later, sides)]
+    here, expected, found = (gaussians.means.detach() - places for gaussians in placed)
+    _, covariances, mirrored = map(covariances_of, placed)
     mirror, first = torch.diag(torch.tensor([1.0, -1.0, 1.0])), part.of_track("first")
-    torch.testing.assert_close(shown.means[first], later.means[first] @ mirror, atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(
-        covariances(shown)[first], mirror @ covariances(later)[first] @ mirror, atol=1e-6, rtol=1e-4
-    )
-    for found, expected in zip(shown, here, strict=True):
-        assert torch.equal(found[~first], expected[~first])
-    assert (shown.means - here.means)[first].norm(dim=1).median() > 0.1
+    torch.testing.assert_close(found[first], expected[first] @ mirror, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(mirrored[first], mirror @ covariances[first] @ mirror, atol=1e-6, rtol=1e-4)
+    assert torch.equal(found[~first], here[~first]) and torch.equal(mirrored[~first], covariances[~first])
+    assert (found - here)[first].norm(dim=1).median() > 0.1
 
 
-def covariances(gaussians: LocalGaussians) -> torch.Tensor:
-    axes = rotation_matrix(torch.nn.functional.normalize(gaussians.quats, dim=1)) * gaussians.scales.exp()[:, None]
+def covariances_of(gaussians: Gaussians) -> torch.Tensor:
+    axes = rotation_matrix(gaussians.quats) * gaussians.scales[:, None]
     return (axes @ axes.mT).detach()
 
 

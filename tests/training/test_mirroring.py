@@ -14,7 +14,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train_objects import DeformableSettings
+from drivesplat.settings.train_objects import ActorSettings, DeformableSettings
 from drivesplat.training.mirroring import choose_mirrored, mirrored_shares, sets_with_mirrored_objects
 
 
@@ -110,9 +110,17 @@ def test_the_images_count_in_which_an_object_is_present():
     half = DeformableSettings(mirrored=0.4, mirrored_images=15)
     assert 0.0 < mirrored_shares(tracks, record, half)[0] < 0.4
     model.parts[1].timeline.tracks = tuple(tracks)
-    choose_mirrored(model, record, DeformableSettings(mirrored=0.4))
+    choose_mirrored(model, record, settings_of(deformable=DeformableSettings(mirrored=0.4)))
     np.testing.assert_allclose(model.parts[1].mirrored, shares, atol=1e-6)
-    choose_mirrored(model, record, DeformableSettings(mirrored=0.0))
+    choose_mirrored(model, record, settings_of(deformable=DeformableSettings(mirrored=0.0)))
     assert model.parts[1].mirrored is None
-    choose_mirrored(model, images_of(0), DeformableSettings(mirrored=0.4))
+    choose_mirrored(model, images_of(0), settings_of(deformable=DeformableSettings(mirrored=0.4)))
     assert (model.parts[1].mirrored == 0.4).all(), "without images, as a LiDAR alone"
+
+
+def test_each_part_has_its_own_probability():
+    rigid = untrained_street(settings_of())
+    choose_mirrored(rigid, images_of(10), settings_of(actors=ActorSettings(mirrored=0.3)))
+    torch.testing.assert_close(rigid.parts[1].mirrored, torch.full((2,), 0.3))
+    choose_mirrored(rigid, images_of(10), settings_of())
+    assert rigid.parts[1].mirrored is None and rigid.parts[0].mirrored is None, "vehicles are not mirrored by default"
