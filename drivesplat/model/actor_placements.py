@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from drivesplat.kernels.placement import ObjectPoses
+from drivesplat.model.gaussians import Gaussians, recolored
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import TimeState
 
@@ -40,6 +41,18 @@ def with_walked(
         if placement.phase:
             walked[i] += placement.phase * cycles[i]
     return state._replace(walked=walked)
+
+
+def with_colors(
+    gaussians: Gaussians, ids: Sequence[str], owner: Int[Tensor, " n"], placements: Sequence[ActorPlacement]
+) -> Gaussians:
+    """The n Gaussians of the actors `ids`, those of placements with a colour matrix in its colours. `owner` is the
+    actor of every Gaussian."""
+    for placement in placements:
+        if placement.color_matrix is not None:
+            matrix = torch.from_numpy(placement.color_matrix).to(gaussians.sh0)
+            gaussians = recolored(gaussians, matrix, owner == ids.index(placement.source))
+    return gaussians
 
 
 def placement_sets(

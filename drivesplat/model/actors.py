@@ -19,8 +19,8 @@ from drivesplat.kernels.object_poses import corrected
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, mirrored, of_owners, place
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
-from drivesplat.model.actor_placements import placement_sets, with_placements
-from drivesplat.model.gaussians import Gaussians, concatenate, recolored, without_colors
+from drivesplat.model.actor_placements import placement_sets, with_colors, with_placements
+from drivesplat.model.gaussians import Gaussians, concatenate, without_colors
 from drivesplat.model.harmonics import rotation_of_harmonics_by
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
@@ -65,7 +65,8 @@ class Actors(Part):
         self.shared = make_parameters(corrections).requires_grad_(settings.tracks.corrected)
         self.extent = float(np.median([np.linalg.norm(track.size) for track in tracks]))
         self.cap_max = settings.cap_max
-        self._settings, self._gaussians = settings, gaussians
+        self._settings = settings
+        self._gaussians = gaussians
         self._known_owners: tuple[Tensor | None, int, Tensor | None] = (None, 0, None)
         sizes = torch.from_numpy(np.stack([track.size for track in tracks])).float()
         self.register_buffer("_reach", 0.5 * sizes + settings.box_margin, persistent=False)
@@ -158,7 +159,7 @@ class Actors(Part):
         for chosen, rows in self._sets(placements):  # few: transforming all actors for each copy costs little
             own = [placements[i] for i in chosen]
             there = self._state_with(state, own), with_placements(poses, known, own)
-            sets.append(self._recolored(self.placed(*there), own)[rows])
+            sets.append(with_colors(self.placed(*there), known, self.params["owner"], own)[rows])
         return concatenate(sets)
 
     @torch.no_grad()
@@ -201,14 +202,6 @@ class Actors(Part):
         """The ids of its tracks."""
         return [track.id for track in self.timeline.tracks]
 
-    def _recolored(self, gaussians: Gaussians, placements: Sequence[ActorPlacement]) -> Gaussians:
-        """All rows of `gaussians`, those of placements with a colour matrix in its colours."""
-        for placement in placements:
-            if placement.color_matrix is not None:
-                matrix = torch.from_numpy(placement.color_matrix).to(gaussians.sh0)
-                gaussians = recolored(gaussians, matrix, self.of_track(placement.source))
-        return gaussians
-
     def _state_with(self, state: TimeState, placements: Sequence[ActorPlacement]) -> TimeState:
         """The time state that placements give their actors; rigid ones have no limbs that would follow a path."""
         return state
@@ -240,16 +233,18 @@ class Actors(Part):
         return colors_in_object(self.params["sh0"], self.params["shN"], state.series, self._owns)
 
     def learning_rates(self) -> dict[str, float]:
-        own, tracks = learning_rates(self._gaussians, self.extent), self._settings.tracks
+        tracks = self._settings.tracks
+        own = learning_rates(self._gaussians, self.extent)
         return {**own, "translation": tracks.lr_translation, "yaw": tracks.lr_yaw}
 
     def definition(self) -> PartDefinition:
         return PartDefinition(self.name, self.extent, self.timeline.tracks)
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
-        tracks, shared = self._settings.tracks, self.shared
-        corrections = shared["translation"], shared["yaw"]
-        return track_penalties(*corrections, self._neighbours, tracks) if tracks.corrected else {}
+        tracks = self._settings.tracks
+        if not tracks.corrected:
+            return {}
+        return track_penalties(self.shared["translation"], self.shared["yaw"], self._neighbours, tracks)
 
     @torch.no_grad()
     def confine(self) -> None:

@@ -82,6 +82,11 @@ class TrainingRecord:
         """The indices of the training images."""
         return self.splits["train"].tolist()
 
+    @property
+    def train_cameras(self) -> set[str]:
+        """The names of the cameras that have training images."""
+        return {self.camera_name(i) for i in self.train_images}
+
     def image_size(self, index: int) -> tuple[int, int]:
         """Width and height in pixels at which an image is trained and evaluated."""
         width, height = self.image_sizes[index].tolist()

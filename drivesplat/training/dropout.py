@@ -14,9 +14,8 @@ from drivesplat.settings.train import TrainSettings
 def dropout_share(record: TrainingRecord, settings: TrainSettings) -> float:
     """The share of the static Gaussians that iterations leave out: `dropout`, or less where the cameras have more than
     `dropout_images` training images each, in the mean."""
-    images = record.train_images
-    cameras = len({record.camera_name(i) for i in images})
-    return settings.dropout * min(1.0, settings.dropout_images * cameras / max(1, len(images)))
+    images, cameras = len(record.train_images), len(record.train_cameras)
+    return settings.dropout * min(1.0, settings.dropout_images * cameras / max(1, images))
 
 
 def with_dropout(sets: Sequence[Gaussians], model: SplatModel, share: float) -> list[Gaussians]:

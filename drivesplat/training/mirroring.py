@@ -34,10 +34,8 @@ def mirrored_shares(
 ) -> Float[np.ndarray, " a"]:
     """The probability with which iterations mirror each object: `mirrored`, or less for one that is present in more
     than `mirrored_images` training images of each camera, in the mean."""
-    images = record.train_images
-    times = np.array([record.seconds(i) for i in images])
-    cameras = max(1, len({record.camera_name(i) for i in images}))
-    present = np.array([track.motion.present(times).sum() for track in tracks]) / cameras
+    times = np.array([record.seconds(i) for i in record.train_images])
+    present = np.array([track.motion.present(times).sum() for track in tracks]) / max(1, len(record.train_cameras))
     return settings.mirrored * np.clip(2.0 - present / settings.mirrored_images, 0.0, 1.0)
 
 

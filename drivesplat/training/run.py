@@ -91,7 +91,7 @@ class TrainingInputs:
         """The cameras whose exposure `job` learns: all with training images but the reference camera."""
         if job.reference_camera is None:
             return ()
-        seen = {self.record.camera_name(i) for i in self.record.train_images}
+        seen = self.record.train_cameras
         return tuple(sorted(seen - {job.reference_camera}))
 
     def _moving(self, index: int) -> np.ndarray:
