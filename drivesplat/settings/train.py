@@ -104,7 +104,8 @@ class TrainSettings(Settings):
     strategy: Literal["mcmc", "default"] = "mcmc"
     """Densification: 'mcmc', or 'default' (by gradient), which fills the space in front of sparse cameras."""
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
-    """Maximum number of Gaussians. GPU memory: about 0.4 GB per million, and as much again while rendering."""
+    """Maximum number of Gaussians of the background. Those of objects come on top (`actors.cap_max` and
+    `deformable.cap_max`). GPU memory: about 0.4 GB per million, and as much again while rendering."""
     pixels_per_gaussian: float = Field(20.0, ge=0)
     """Minimum number of training pixels per Gaussian (0 disables the limit). More Gaussians overfit single views."""
     max_distance: float | None = Field(1000.0, gt=0)
