@@ -16,6 +16,7 @@ from drivesplat.model.view import RollingShutter, View
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train_objects import ActorSettings, DeformableSettings
 from drivesplat.training.mirroring import choose_mirrored, mirrored_shares, sets_with_mirrored_objects
+from drivesplat.training.trainer import Trainer
 
 
 def street(mirrored: float) -> SplatModel:
@@ -74,6 +75,17 @@ def test_a_rolling_shutter_has_the_velocities_of_what_is_shown(mirrored):
     assert static.velocities is None or not static.velocities.any()
     torch.testing.assert_close(objects.velocities, (later - earlier) / (2.0 * step), atol=0.05, rtol=0.02)
     assert objects.velocities.norm(dim=1).max() > 0.1
+
+
+def test_an_iteration_leaves_out_static_gaussians_and_mirrors_objects():
+    model, views = street(1.0), recorded_views()
+    trainer = Trainer.begin(model, views, settings_of(dropout=0.5), 0, torch.device("cpu"))
+    _, picture, view = trainer.fit_one()
+    recorded = street(0.0).sets_in(view.view)[1]
+    static, objects = picture.sets
+    assert 0.2 < float((static.opacities == 0.0).float().mean()) < 0.8
+    assert not (objects.opacities == 0.0).all()
+    assert ((objects.means - recorded.means).norm(dim=1) > 1e-4).any()
 
 
 def images_of(count: int, cameras: int = 1, hz: float = 2.0) -> TrainingRecord:
