@@ -74,6 +74,8 @@ static void run_block(int threads) {
 static Barrier& own_warp() { return barriers[1 + threadIdx.x / 32]; }
 static void __syncthreads() { wait_at(barriers[0]); }
 static void __syncwarp() { wait_at(own_warp()); }
+static void __threadfence() {}
+template <class T> static T __ldcg(const T* at) { return *at; }
 static int __syncthreads_and(int value) {
     integers[threadIdx.x] = value; __syncthreads();
     int found = 1;

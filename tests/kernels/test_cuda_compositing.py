@@ -267,6 +267,22 @@ def test_chunks_behind_the_end_by_the_source_compiled_for_a_processor(on_the_pro
     check_chunks_behind_the_end()
 
 
+@pytest.mark.parametrize("place", range(1, 6))
+def test_pixels_whose_rays_have_ended_are_left_out_of_later_chunks(place, on_the_processor):
+    """A processor composites chunks one after the other. The first one ends the rays on the left of a tile: values that
+    are no numbers in another chunk do not reach the image there. On the right they do."""
+    length, count = 4, 24
+    means, conics = torch.full((1, count, 2), 8.0), torch.tensor([1e-3, 0.0, 1e-3]).repeat(1, count, 1)
+    means[:, :length, 0], conics[:, :length, 0] = 2.0, 0.1
+    values = torch.ones(1, count, 3)
+    values[:, length * place : length * (place + 1)] = torch.nan
+    given = Footprints(means, conics, values, torch.full((1, count), 0.99))
+    ids, ends = torch.arange(count), torch.tensor([0, count], dtype=torch.int32)
+    image, alpha = compositing.composite(given, TileLists(ids.int(), ids, ends, (1, 1, 1)), TILE, TILE, length)[:2]
+    assert float(alpha[:, :, 1:3].min()) > 0.99
+    assert bool(image[:, :, 1:3].isfinite().all()) and bool(image[:, :, 12:].isnan().all()) == (place == 1)
+
+
 @gpu
 @needs_gpu
 @pytest.mark.parametrize(("cameras", "channels"), [(1, 3), (2, 1)])

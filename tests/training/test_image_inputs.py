@@ -172,7 +172,7 @@ def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
 
 @pytest.mark.parametrize(
     ("cameras", "images", "by_camera", "measured"),
-    [(1, 40, True, 16), (6, 40, False, 16), (6, 40, True, 4), (2, 40, True, 8), (3, 2, True, 2), (3, 1, True, 1)],
+    [(1, 40, True, 8), (6, 40, False, 8), (6, 40, True, 4), (2, 40, True, 4), (3, 2, True, 2), (3, 1, True, 1)],
 )
 def test_cameras_with_their_own_graphs_share_the_images_that_are_measured(cameras, images, by_camera, measured):
     one = guided_views()[0]

@@ -6,7 +6,8 @@ together, in 16 shuffles, in place of five for each. The alpha of some of the Ga
 image.
 
 Chunks are composited at the same time, also those behind the end of a ray. The image does not show these, and their
-gradients are skipped.
+gradients are skipped. So that little is composited in vain, blocks begin with the first chunks of all tiles, and leave
+out pixels whose rays have ended in chunks that are already done. The image is the same whichever these are.
 """
 
 from typing import Any
@@ -18,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.composited import Composited
 from drivesplat.kernels.cuda.compiled import IMAGES, IMAGES_WITH_OBJECTS, LENGTH, kernels
-from drivesplat.kernels.cuda.source import PIXELS
+from drivesplat.kernels.cuda.source import PIXELS, WAVES
 from drivesplat.kernels.triton.chunks import Chunks
 from drivesplat.kernels.triton.joined_chunks import join
 from drivesplat.kernels.triton.pixels import TILE
@@ -63,8 +64,9 @@ class _ChunkImages(torch.autograd.Function):
         own = (0, 0) if objects is None else (objects.start, objects.stop)
         ctx.chunks, ctx.sizes = chunks, (len(chunks.firsts) - 1, down * across, across, *own)
         ctx.program = IMAGES if objects is None else IMAGES_WITH_OBJECTS
-        written = (images, alphas, transmittances, lasts, past_objects)
-        _launch(ctx, "composite_chunks", values, *read, *written, *ctx.sizes)
+        written = (images, alphas, transmittances, lasts, past_objects, lasts.new_zeros(chunks.count))
+        blocks = chunks.count + (WAVES - 1) * ctx.sizes[0]
+        _launch(ctx, "composite_chunks", blocks, values, *read, *written, *ctx.sizes)
         ctx.save_for_backward(*read, transmittances, lasts, past_objects)
         return images, alphas, past_objects
 
@@ -74,12 +76,12 @@ class _ChunkImages(torch.autograd.Function):
         saved, values = ctx.saved_tensors, ctx.saved_tensors[2]
         summed = [torch.zeros_like(given) for given in saved[:4]]
         above = [gradient.contiguous() for gradient in gradients]
-        _launch(ctx, "composite_chunks_backward", values, *saved, *above, *summed, *ctx.sizes)
+        _launch(ctx, "composite_chunks_backward", ctx.chunks.count, values, *saved, *above, *summed, *ctx.sizes)
         return *summed, None, None, None
 
 
-def _launch(ctx: Any, kernel: str, values: Tensor, *arguments: Tensor | int) -> None:
-    """Runs a kernel of `ctx.program` for `ctx.chunks` of Gaussians with `values` (c, n, v), which have to be on the
+def _launch(ctx: Any, kernel: str, blocks: int, values: Tensor, *arguments: Tensor | int) -> None:
+    """Runs so many `blocks` of a kernel of `ctx.program`. The `values` (c, n, v) of its Gaussians have to be on the
     current device."""
     run = kernels(ctx.program, values.shape[-1], ctx.chunks.length, values.device.index)[kernel]
-    run(ctx.chunks.count, THREADS, arguments)
+    run(blocks, THREADS, arguments)

@@ -11,6 +11,9 @@ KERNELS = ("composite_chunks", "composite_chunks_backward")
 
 PIXELS = 2
 """Pixels of a thread."""
+WAVES = 4
+"""The blocks of an image begin with the first chunk of every tile, then take the second ones, and so on; in the last of
+WAVES come all other chunks."""
 
 SOURCE = (
     f"""
@@ -18,6 +21,7 @@ SOURCE = (
 #define OBJECTS 0
 #endif
 #define PIXELS {PIXELS}
+#define WAVES {WAVES}
 #define GRADIENTS (CHANNELS + 6)            // of a Gaussian: values, mean, conic, opacity
 {WARPS}"""
     + r"""
@@ -39,21 +43,35 @@ struct Lists {
     int tiles, per_camera, across;
 };
 
+// The chunk that a block composites, or -1. Blocks begin in the order of their numbers: with the first chunks of all
+// tiles, then the second ones, up to WAVES - 1, then all others. The chunks before a block's own are thus mostly done.
+__device__ __forceinline__ int chunk_of(const Lists& lists, int block) {
+    int wave = block / lists.tiles;
+    if (wave < WAVES - 1) {
+        int tile = block % lists.tiles, chunk = lists.firsts[tile] + wave;
+        return chunk < lists.firsts[tile + 1] ? chunk : -1;
+    }
+    int chunk = block - (WAVES - 1) * lists.tiles;
+    if (chunk >= lists.firsts[lists.tiles]) return -1;
+    return chunk - lists.firsts[lists.tile_of[chunk]] >= WAVES - 1 ? chunk : -1;
+}
+
 struct Batch {                              // in shared memory: a Gaussian for each thread
     float x[THREADS], y[THREADS], a[THREADS], b[THREADS], c[THREADS], opacity[THREADS];
     float values[THREADS][CHANNELS];
     int id[THREADS];
-    float wide[THREADS], high[THREADS];     // half the size of the box around its ellipse, in pixels
+    float reach[THREADS];                   // the largest exponent within its ellipse; negative for none
 };
 
-// The chunk of a block: its first and last entry, and the corner of its tile in pixels.
+// A chunk: the first chunk of its tile, its first and last entry, and the corner of its tile in pixels.
 struct Chunk {
-    int start, end;
+    int first, start, end;
     float left, top;
 
     __device__ Chunk(const Lists& lists, int chunk) {
         int tile = lists.tile_of[chunk], within = tile % lists.per_camera;
-        start = lists.offsets[tile] + (chunk - lists.firsts[tile]) * LENGTH;
+        first = lists.firsts[tile];
+        start = lists.offsets[tile] + (chunk - first) * LENGTH;
         end = min(start + LENGTH, lists.offsets[tile + 1]);
         left = float(within % lists.across * TILE);
         top = float(within / lists.across * TILE);
@@ -68,11 +86,16 @@ __device__ __forceinline__ int row_of(int thread, int pixel) {
     return (thread / WARP / 2 * PIXELS + pixel) * 4 + thread % WARP / 8;
 }
 
+// The place of a thread's pixel among those of all chunks.
+__device__ __forceinline__ long long pixel_of(int chunk, int thread, int pixel) {
+    return (long long)chunk * TILE * TILE + row_of(thread, pixel) * TILE + column_of(thread);
+}
+
 __device__ __forceinline__ void load(
     Batch& batch, const Gaussians& g, const Lists& lists, const Chunk& chunk, int entry
 ) {
     int thread = threadIdx.x;
-    batch.wide[thread] = -1e9f;
+    batch.reach[thread] = -1e9f;
     if (entry >= chunk.end) return;
     int i = lists.ids[lists.order[entry]];
     long long at = i;
@@ -84,20 +107,29 @@ __device__ __forceinline__ void load(
     batch.c[thread] = g.conics[3 * at + 2];
     float opacity = g.opacities[at];
     batch.opacity[thread] = opacity;
-    float reach = __logf(opacity / MIN_ALPHA) + SLACK, a = batch.a[thread], b = batch.b[thread], c = batch.c[thread];
-    float scale = 2.0f * reach / fmaxf(a * c - b * b, 1e-20f);
-    batch.wide[thread] = sqrtf(fmaxf(scale * c, 0.0f)) + SLACK;
-    batch.high[thread] = sqrtf(fmaxf(scale * a, 0.0f)) + SLACK;
+    batch.reach[thread] = __logf(opacity / MIN_ALPHA) + SLACK;
     #pragma unroll
     for (int k = 0; k < CHANNELS; ++k) batch.values[thread][k] = g.values[CHANNELS * at + k];
 }
 
-// The lanes whose Gaussians, those from `first` on, reach the pixels of this warp.
+// The least of 0.5 (a u^2 + c v^2) + b u v over v in [low, high], with a, c > 0.
+__device__ __forceinline__ float least_along(float a, float b, float c, float u, float low, float high) {
+    float v = fminf(fmaxf(__fdividef(-b * u, c), low), high);
+    return 0.5f * (a * u * u + c * v * v) + b * u * v;
+}
+
+// The lanes whose Gaussians, those from `first` on, reach the pixels of this warp: where the exponent is least over the
+// rectangle of the pixels' centres, at the centre of the Gaussian or on an edge that faces it.
 __device__ __forceinline__ unsigned reaching(const Batch& batch, int first) {
     int j = first + threadIdx.x % WARP, warp = threadIdx.x / WARP;
-    float over_x = fabsf(batch.x[j] - (warp % 2 * 8 + 4.0f)) - 3.5f;
-    float over_y = fabsf(batch.y[j] - (warp / 2 * PIXELS * 4 + 2.0f * PIXELS)) - (2.0f * PIXELS - 0.5f);
-    return __ballot_sync(EVERY_LANE, over_x <= batch.wide[j] && over_y <= batch.high[j]);
+    float left = warp % 2 * 8 + 0.5f - batch.x[j], right = left + 7.0f;
+    float top = warp / 2 * PIXELS * 4 + 0.5f - batch.y[j], bottom = top + PIXELS * 4 - 1.0f;
+    float x = fminf(fmaxf(0.0f, left), right), y = fminf(fmaxf(0.0f, top), bottom);  // nearest to the centre
+    float a = batch.a[j], b = batch.b[j], c = batch.c[j], reach = batch.reach[j];
+    bool reaches = x == 0.0f && y == 0.0f;
+    reaches |= x != 0.0f && least_along(a, b, c, x, top, bottom) <= reach;
+    reaches |= y != 0.0f && least_along(c, b, a, y, left, right) <= reach;
+    return __ballot_sync(EVERY_LANE, reaches && reach >= 0.0f);
 }
 
 // The alpha of Gaussian j at the offset (dx, dy) of a pixel, 0 below MIN_ALPHA; falloff is its part without opacity.
@@ -113,31 +145,54 @@ __device__ __forceinline__ bool of_object(const Batch& batch, int j, int first_o
     return OBJECTS && batch.id[j] >= first_object && batch.id[j] < end_object;
 }
 
+// Whether another block has published chunk k: what it wrote before can be read.
+__device__ __forceinline__ bool published(const int* done, int k) {
+    bool is = *(const volatile int*)(done + k);
+    __threadfence();
+    return is;
+}
+
 // Composites each chunk by itself: premultiplied values (m, 256, CHANNELS), alpha and transmittance (m, 256) by pixel,
 // the last entry of the chunk that a pixel shows (-1: none), and the transmittance of objects alone (m, 256). Alpha is
-// negative where the ray ends.
+// negative where the ray ends. Rays that have ended in chunks before, as far as these are `done` (m; 0 at first), show
+// nothing: where chunks are joined, these pixels do not count.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, float* images, float* alphas,
-    float* transmittances, int* lasts, float* object_transmittances, int tiles, int per_camera, int across,
+    float* transmittances, int* lasts, float* object_transmittances, int* done, int tiles, int per_camera, int across,
     int first_object, int end_object
 ) {
-    if ((int)blockIdx.x >= firsts[tiles]) return;
     __shared__ Batch batch;
     Gaussians g = {means, conics, values, opacities};
     Lists lists = {ids, order, offsets, firsts, tile_of, tiles, per_camera, across};
-    Chunk chunk(lists, blockIdx.x);
+    int number = chunk_of(lists, blockIdx.x);
+    if (number < 0) return;
+    Chunk chunk(lists, number);
     int thread = threadIdx.x;
     float x = column_of(thread) + 0.5f;
     float y[PIXELS], passes[PIXELS], past_objects[PIXELS], total[PIXELS][CHANNELS] = {};
     int last[PIXELS];
-    bool ended[PIXELS], all_ended = false;
+    bool ended[PIXELS], all_ended = true;
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
         y[p] = row_of(thread, p) + 0.5f;
         passes[p] = past_objects[p] = 1.0f;
         last[p] = -1;
         ended[p] = false;
+    }
+    for (int k = chunk.first; k < number; ++k) {
+        if (!published(done, k)) continue;
+        #pragma unroll
+        for (int p = 0; p < PIXELS; ++p) {
+            float alpha = __ldcg(alphas + pixel_of(k, thread, p));
+            passes[p] *= 1.0f - fabsf(alpha);
+            ended[p] |= alpha < 0.0f || passes[p] <= MIN_TRANSMITTANCE;
+        }
+    }
+    #pragma unroll
+    for (int p = 0; p < PIXELS; ++p) {
+        passes[p] = 1.0f;
+        all_ended &= ended[p];
     }
     for (int begin = chunk.start; begin < chunk.end; begin += THREADS) {
         if (__syncthreads_and(all_ended)) break;
@@ -172,7 +227,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     }
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
-        long long at = (long long)blockIdx.x * TILE * TILE + row_of(thread, p) * TILE + column_of(thread);
+        long long at = pixel_of(number, thread, p);
         #pragma unroll
         for (int k = 0; k < CHANNELS; ++k) images[at * CHANNELS + k] = total[p][k];
         alphas[at] = ended[p] ? passes[p] - 1.0f : 1.0f - passes[p];
@@ -180,6 +235,9 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
         if (OBJECTS) object_transmittances[at] = past_objects[p];
         lasts[at] = last[p];
     }
+    __threadfence();
+    __syncthreads();
+    if (thread == 0) *(volatile int*)(done + number) = 1;
 }
 
 // Adds the gradients of all Gaussians, given those of each chunk's values, absolute alpha and transmittance of objects
@@ -206,7 +264,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks_backward(
     int last[PIXELS], last_of_warp = -1;
     #pragma unroll
     for (int p = 0; p < PIXELS; ++p) {
-        long long at = (long long)blockIdx.x * TILE * TILE + row_of(thread, p) * TILE + column_of(thread);
+        long long at = pixel_of(blockIdx.x, thread, p);
         y[p] = row_of(thread, p) + 0.5f;
         passes[p] = transmittances[at];
         behind[p] = -passes[p] * v_alphas[at];

@@ -18,7 +18,7 @@ from drivesplat.model.time_states import TimeStates
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.views import LidarDepth, TrainingView
 
-MEASURED, MEASURED_OF_CAMERA = 16, 4
+MEASURED, MEASURED_OF_CAMERA = 8, 4
 """Iterations with images before one is captured: they measure the entries that the lists of any need. Where each camera
 has graphs of its own, a camera's share of the first, but no fewer than the second."""
 
