@@ -145,17 +145,19 @@ __device__ __forceinline__ bool of_object(const Batch& batch, int j, int first_o
     return OBJECTS && batch.id[j] >= first_object && batch.id[j] < end_object;
 }
 
-// Whether another block has published chunk k: what it wrote before can be read.
-__device__ __forceinline__ bool published(const int* done, int k) {
-    bool is = *(const volatile int*)(done + k);
+// The lanes whose chunks, those from `first` on, stand before chunk `number` and are done: what was written of them can
+// be read.
+__device__ __forceinline__ unsigned done_before(const int* done, int first, int number) {
+    int k = first + threadIdx.x % WARP;
+    unsigned lanes = __ballot_sync(EVERY_LANE, k < number && *(const volatile int*)(done + k));
     __threadfence();
-    return is;
+    return lanes;
 }
 
 // Composites each chunk by itself: premultiplied values (m, 256, CHANNELS), alpha and transmittance (m, 256) by pixel,
 // the last entry of the chunk that a pixel shows (-1: none), and the transmittance of objects alone (m, 256). Alpha is
-// negative where the ray ends. Rays that have ended in chunks before, as far as these are `done` (m; 0 at first), show
-// nothing: where chunks are joined, these pixels do not count.
+// negative where the ray ends. Rays that have ended in the first chunks of the tile, as far as these are `done` (m; all
+// 0 before), show nothing: where chunks are joined, these pixels do not count.
 extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
     const float* means, const float* conics, const float* values, const float* opacities, const int* ids,
     const long long* order, const int* offsets, const int* firsts, const int* tile_of, float* images, float* alphas,
@@ -180,8 +182,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) composite_chunks(
         last[p] = -1;
         ended[p] = false;
     }
-    for (int k = chunk.first; k < number; ++k) {
-        if (!published(done, k)) continue;
+    for (unsigned lanes = done_before(done, chunk.first, number); lanes; lanes &= lanes - 1) {
+        int k = chunk.first + __ffs(lanes) - 1;
         #pragma unroll
         for (int p = 0; p < PIXELS; ++p) {
             float alpha = __ldcg(alphas + pixel_of(k, thread, p));
