@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.composited import Composited
 from drivesplat.kernels.cuda.compiled import IMAGES, IMAGES_WITH_OBJECTS, LENGTH, kernels
-from drivesplat.kernels.cuda.source import PIXELS, WAVES
+from drivesplat.kernels.cuda.tiles import PIXELS, WAVES
 from drivesplat.kernels.triton.chunks import Chunks
 from drivesplat.kernels.triton.joined_chunks import join
 from drivesplat.kernels.triton.pixels import TILE
