@@ -270,7 +270,7 @@ def test_chunks_behind_the_end_by_the_source_compiled_for_a_processor(on_the_pro
 @pytest.mark.parametrize("place", range(1, 6))
 def test_pixels_whose_rays_have_ended_are_left_out_of_later_chunks(place, on_the_processor):
     """A processor composites chunks one after the other. The first one ends the rays on the left of a tile: values that
-    are no numbers in another chunk do not reach the image there. On the right they do."""
+    are no numbers in another chunk do not reach the image there. On the right those of the second chunk do."""
     length, count = 4, 24
     means, conics = torch.full((1, count, 2), 8.0), torch.tensor([1e-3, 0.0, 1e-3]).repeat(1, count, 1)
     means[:, :length, 0], conics[:, :length, 0] = 2.0, 0.1

@@ -3,8 +3,8 @@
 PIXELS = 2
 """Pixels of a thread."""
 WAVES = 4
-"""The blocks of an image begin with the first chunk of every tile, then take the second ones, and so on; in the last of
-WAVES come all other chunks."""
+"""The order of blocks: first those of the first chunks of all tiles, then those of the second ones, and so on. The last
+of WAVES groups has all other chunks."""
 
 TILES = (
     f"""
