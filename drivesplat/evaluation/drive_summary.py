@@ -3,6 +3,7 @@ images, and brightness."""
 
 from typing import Any
 
+import cv2
 import numpy as np
 
 from drivesplat.evaluation.metrics import psnr
@@ -41,10 +42,11 @@ def _group(recording: PreparedDrive, camera: str, images: list[int]) -> dict[str
     distances = np.linalg.norm(places[images][:, None] - places[training], axis=2)
     lumas, count, sums, squares = [], 0, np.zeros(3), np.zeros(3)
     for index in images:
-        image = recording.image(index)
-        lumas.append(float((image @ REC_709).mean()))
-        static = image[region_mask(recording.labels(index), "static")]
-        count, sums, squares = count + len(static), sums + static.sum(axis=0), squares + (static**2).sum(axis=0)
+        image, static = recording.image(index), region_mask(recording.labels(index), "static")
+        lumas.append(float(np.array(cv2.mean(image)[:3]) @ REC_709))
+        mean, deviation = (values[:, 0] for values in cv2.meanStdDev(image, mask=static.astype(np.uint8)))
+        pixels = np.count_nonzero(static)
+        count, sums, squares = count + pixels, sums + pixels * mean, squares + pixels * (mean**2 + deviation**2)
     variance = (squares / max(count, 1) - (sums / max(count, 1)) ** 2).mean()
     return {
         "from_training_m": float(distances.min(axis=1).mean()) if training else None,

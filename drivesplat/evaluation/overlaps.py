@@ -14,16 +14,15 @@ def seen_by_others(record: TrainingRecord, index: int) -> np.ndarray:
     Only directions count, as for distant points: cameras are about a metre apart, and no reconstructed depth is needed.
     """
     width, height = record.image_size(index)
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
-    rays = pixels @ np.linalg.inv(record.Ks[index]).T @ record.camtoworlds[index][:3, :3].T
+    columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+    to_world = record.camtoworlds[index][:3, :3] @ np.linalg.inv(record.Ks[index])
     seen = np.zeros((height, width), dtype=bool)
     for other in _simultaneous(record, index):
-        projected = rays @ record.camtoworlds[other][:3, :3] @ record.Ks[other].T
-        depth = np.where(projected[..., 2] > 0, projected[..., 2], np.nan)
-        x, y = projected[..., 0] / depth, projected[..., 1] / depth
+        homography = record.Ks[other] @ record.camtoworlds[other][:3, :3].T @ to_world
+        x, y, depth = (of_column * columns + (of_row * rows + constant) for of_column, of_row, constant in homography)
         other_width, other_height = record.image_size(other)
-        seen |= (x >= 0) & (x < other_width) & (y >= 0) & (y < other_height)
+        inside = (x >= 0) & (x < other_width * depth) & (y >= 0) & (y < other_height * depth)
+        seen |= inside & (depth > 0)
     return seen
 
 

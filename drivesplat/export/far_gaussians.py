@@ -16,7 +16,7 @@ Either way no Gaussian is left beyond the distance.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,11 +28,13 @@ from torch import Tensor
 from drivesplat.io.array_file import read_arrays, write_arrays
 from drivesplat.io.storage import Provenance, unreadable
 from drivesplat.io.typed_record import typed_record
-from drivesplat.model.checkpoint import TrainedCheckpoint
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.reach import INSIDE, reach_of
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import View
+from drivesplat.model.view import View, view_of
+from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.device import DeviceSettings
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +60,24 @@ class FarGaussians:
     provenance: Provenance
 
 
+def find_far_in(
+    checkpoint: TrainedCheckpoint,
+    record: TrainingRecord,
+    max_distance: float,
+    provenance: Provenance,
+    device_settings: Callable[[], DeviceSettings],
+) -> FarGaussians:
+    """`find_far` of the model in a checkpoint, by the training views of `record`. The device of `device_settings` is
+    opened, and the settings are asked for, only where a Gaussian lies too far away."""
+    model, device = trained_model(checkpoint), torch.device("cpu")
+    views = [view_of(record, index, device) for index in record.train_images]
+    reach, distances = _reach_and_distances(model, views, max_distance)
+    if (distances > reach).any():
+        model, device = open_model(checkpoint, device_settings())
+        views = [view_of(record, index, device) for index in record.train_images]
+    return find_far(model, views, max_distance, provenance)
+
+
 @torch.no_grad()
 def find_far(model: SplatModel, views: Sequence[View], max_distance: float, provenance: Provenance) -> FarGaussians:
     """Decides on the Gaussians of a model that lie too far away, by its training `views` on the model's device.
@@ -65,11 +85,9 @@ def find_far(model: SplatModel, views: Sequence[View], max_distance: float, prov
     Static Gaussians are measured from the world's origin; those of objects from the centre of their box, and removed.
     Positions that are NaN or Inf are not considered: exports drop them.
     """
-    reach = reach_of(torch.stack([view.camera_to_world[:3, 3] for view in views]), max_distance)
-    distances = torch.cat([part.params["means"].double().norm(dim=1) for part in model.parts])
-    far = distances.isfinite() & (distances > reach)
-    rows = far.nonzero()[:, 0]
-    summary = f"{len(rows)} of {len(far)} Gaussians lie beyond {reach:.0f} m"
+    reach, distances = _reach_and_distances(model, views, max_distance)
+    rows = (distances > reach).nonzero()[:, 0]
+    summary = f"{len(rows)} of {len(distances)} Gaussians lie beyond {reach:.0f} m"
     if len(rows) == 0:
         log.info("%s", summary)
         return _changes(rows, provenance)
@@ -94,8 +112,20 @@ def find_far(model: SplatModel, views: Sequence[View], max_distance: float, prov
     return changes
 
 
+@torch.no_grad()
+def _reach_and_distances(
+    model: SplatModel, views: Sequence[View], max_distance: float
+) -> tuple[float, Float[Tensor, " n"]]:
+    """How far Gaussians may lie, and how far those of all parts do, in metres; 0 for positions that are NaN or Inf."""
+    reach = reach_of(torch.stack([view.camera_to_world[:3, 3] for view in views]), max_distance)
+    distances = torch.cat([part.params["means"].double().norm(dim=1) for part in model.parts])
+    return reach, torch.where(distances.isfinite(), distances, 0.0)
+
+
 def within_reach(checkpoint: TrainedCheckpoint, far: FarGaussians) -> TrainedCheckpoint:
     """A checkpoint with the changes of `far`, which was found in its model."""
+    if not len(far.removed) and not len(far.moved):
+        return checkpoint
     state, first = dict(checkpoint.model), 0
     for i in range(len(checkpoint.parts)):
         names = [name for name in state if name.startswith(f"parts.{i}.params.")]

@@ -34,6 +34,8 @@ class SampledGroup:
 
     def of_rows(self, chosen: Bool[Tensor, " n"]) -> "SampledGroup":
         """The same with a part of its Gaussians, by mask."""
+        if chosen.all():
+            return self
         shapes = None if self.shapes is None else self.shapes.of_rows(chosen.cpu().numpy())
         return replace(self, gaussians=self.gaussians[chosen], shapes=shapes)
 

@@ -2,8 +2,10 @@
 
 import logging
 import os
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 
+import torch
 from torch import Tensor
 
 log = logging.getLogger(__name__)
@@ -17,15 +19,32 @@ def usable_for(tensor: Tensor) -> bool:
     return tensor.is_cuda and compiles()
 
 
+def start_check(device: torch.device) -> None:
+    """Starts the check of `compiles` in a thread where `device` is a GPU. It takes half a second, in which Triton reads
+    its own files."""
+    if device.type == "cuda" and not _switched_off():
+        _check()
+
+
 @cache
 def compiles() -> bool:
     """Whether Triton compiles for the GPU of this process. Logs one warning where it does not."""
-    if os.environ.get(SWITCH) == "0":
+    if _switched_off():
         return False
-    reason = problem()
+    reason = _check().result()
     if reason is not None:
         log.warning("Triton cannot be used (%s): trainings take longer; see docs/troubleshooting.md", reason)
     return reason is None
+
+
+def _switched_off() -> bool:
+    return os.environ.get(SWITCH) == "0"
+
+
+@cache
+def _check() -> "Future[str | None]":
+    """The result of `problem`, computed once in a thread."""
+    return ThreadPoolExecutor(1).submit(problem)
 
 
 def problem() -> str | None:

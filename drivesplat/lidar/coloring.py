@@ -78,22 +78,22 @@ def color_by_visibility(
     and the number (n,) of views that see each point.
     """
 
-    def seen_by(view: ColorView) -> tuple[np.ndarray, np.ndarray, int]:
-        """The points that a view sees, their colours in it, and its time."""
+    def seen_by(view: ColorView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The points that a view sees, their colours in it, and how far from its own time (microseconds) theirs are."""
         shown, shape = view.where_seen(points), view.pixels.shape[:2]
         index, rows, columns, _ = visible(shown, view.world_to_camera, view.intrinsics, shape)
         usable = view.usable[rows, columns]
-        return index[usable], view.pixels[rows[usable], columns[usable]], view.timestamp
+        index = index[usable]
+        return index, view.pixels[rows[usable], columns[usable]], np.abs(times[index] - view.timestamp)
 
     colors = np.zeros((len(points), 3), dtype=np.uint8)
     best = np.full(len(points), np.inf)
     seen = np.zeros(len(points), dtype=np.int64)
-    for index, in_view, timestamp in prefetch(seen_by, views):
+    for index, in_view, apart in prefetch(seen_by, views):
         seen[index] += 1
-        distance = np.abs(times[index] - timestamp)
-        better = distance < best[index]
-        best[index[better]] = distance[better]
-        colors[index[better]] = in_view[better]
+        better = np.flatnonzero(apart < best[index])
+        improved = index[better]
+        best[improved], colors[improved] = apart[better], in_view[better]
     return colors, seen
 
 

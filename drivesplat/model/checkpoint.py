@@ -11,6 +11,7 @@ import torch
 from drivesplat.io.array_file import read_arrays, write_arrays
 from drivesplat.io.storage import Provenance, unreadable
 from drivesplat.io.typed_record import typed_record
+from drivesplat.kernels import triton_support
 from drivesplat.machine.device import choose_device, explain_out_of_memory
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.part import PartDefinition
@@ -75,6 +76,7 @@ def open_model(checkpoint: TrainedCheckpoint, device_settings: DeviceSettings) -
     (torch.Size([360, 640, 3]), torch.Size([360, 640]))
     """
     device = choose_device(device_settings, min_free_gb=0.0)
+    triton_support.start_check(device)
     model = trained_model(checkpoint)
     with explain_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device

@@ -97,8 +97,8 @@ def log_colors(seen: Sequence[Sightings], step: float) -> np.ndarray:
     shared = keys[cameras > 1]
     found = np.full((len(seen), len(shared), 3), np.nan)
     for row, (own, colors) in zip(found, means, strict=True):
-        also = np.isin(own, shared)
-        row[np.searchsorted(shared, own[also])] = np.log(colors[also] / 255.0)
+        also, at = _found_in(shared, own)
+        row[at] = np.log(colors[also] / 255.0)
     return found
 
 
@@ -107,6 +107,14 @@ def _means_by_key(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.
     unique, at = np.unique(keys, return_inverse=True)
     sums = [np.bincount(at, weights=column, minlength=len(unique)) for column in values.T]
     return unique, np.stack(sums, axis=1) / np.bincount(at, minlength=len(unique))[:, None]
+
+
+def _found_in(keys: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which (m,) bool of the `wanted` keys are among `keys`, which ascend, and where these are there."""
+    at = np.searchsorted(keys, wanted)
+    found = at < len(keys)
+    found[found] = keys[at[found]] == wanted[found]
+    return found, at[found]
 
 
 def log_gains(observed: np.ndarray, known: np.ndarray) -> np.ndarray:

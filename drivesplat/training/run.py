@@ -14,6 +14,7 @@ import torch
 from drivesplat.errors import TrainingError
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import Provenance, canonical_json, read_record, sha256_text, write_json
+from drivesplat.kernels import triton_support
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.machine.device import choose_device, explain_out_of_memory, flush_denormals
@@ -231,6 +232,7 @@ def run_training(
     started_by = os.getppid()
     with resume_state.training_lock(files.resume):
         device = choose_device(device_settings)
+        triton_support.start_check(device)
         if job.train.scans.per_image:  # images never show some of the Gaussians that scans do
             flush_denormals()
         begun = prepare(inputs, job, device)

@@ -95,9 +95,9 @@ def _shown(model: SplatModel, view: TrainingView, has_objects: bool) -> _Shown:
     with torch.enable_grad():
         rendering = model.composited(gaussians, torch.cat([colors, objects], dim=1), view.view)
         splats, share = rendering.image.squeeze(0).split([3, 1], dim=2)
-    static = share.detach().squeeze(2) < COVERED
-    static = static if view.ego_mask is None else static & ~view.ego_mask
-    (weights,) = torch.autograd.grad(share, objects, static[..., None].to(share))
+        static = share.detach().squeeze(2) < COVERED
+        static = static if view.ego_mask is None else static & ~view.ego_mask
+        (weights,) = torch.autograd.grad((share.squeeze(2) * static).sum(), objects)
     return _Shown(splats.detach(), rendering.alpha.detach().squeeze(0), static, weights[:, 0])
 
 
@@ -164,7 +164,7 @@ def _nearest_means(
     distances, nearest = tree.query(wanted[of_wanted].cpu().numpy(), k=count, workers=torch.get_num_threads())
     weights = 1.0 / (distances**2 + 1e-6)
     weights /= weights.sum(axis=1, keepdims=True)
-    means = (weights[..., None] * values[of_places].cpu().numpy()[nearest]).sum(axis=1)
+    means = np.einsum("mk,mkv->mv", weights, values[of_places].cpu().numpy()[nearest])
     found = torch.empty(len(wanted), values.shape[1], dtype=values.dtype, device=values.device)
     found[of_wanted] = torch.from_numpy(means).to(values)
     return found

@@ -7,6 +7,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -638,12 +639,44 @@ def test_without_triton_torch_is_used(switch, monkeypatch, caplog):
 
     monkeypatch.setenv(triton_support.SWITCH, switch)
     monkeypatch.setattr(probe, "run", fail)
-    triton_support.compiles.cache_clear()
-    try:
+    with unchecked():
         assert not triton_support.compiles() and not triton_support.compiles()
         assert [record.message.count("Failed to find C compiler.") for record in caplog.records] == [1] * int(switch)
+
+
+@pytest.mark.parametrize(("device", "switch", "checks"), [("cuda", "1", 1), ("cuda", "0", 0), ("cpu", "1", 0)])
+def test_triton_is_checked_once_in_a_thread_where_there_is_a_gpu(device, switch, checks, monkeypatch):
+    from drivesplat.kernels.triton import probe
+
+    begun, released, ran = threading.Event(), threading.Event(), []
+
+    def wait() -> None:
+        ran.append(threading.current_thread())
+        begun.set()
+        released.wait(60.0)
+
+    monkeypatch.setenv(triton_support.SWITCH, switch)
+    monkeypatch.setattr(probe, "run", wait)
+    with unchecked():
+        triton_support.start_check(torch.device(device))
+        assert begun.wait(60.0 if checks else 0.1) == bool(checks)
+        released.set()
+        assert triton_support.compiles() == (switch == "1")
+        triton_support.start_check(torch.device(device))
+        assert len(ran) == int(switch) and threading.current_thread() not in ran
+
+
+@contextmanager
+def unchecked() -> Iterator[None]:
+    """Forgets before and after it whether Triton compiles."""
+    cached = triton_support.compiles, triton_support._check
+    for function in cached:
+        function.cache_clear()
+    try:
+        yield
     finally:
-        triton_support.compiles.cache_clear()
+        for function in cached:
+            function.cache_clear()
 
 
 def test_triton_is_not_used_for_tensors_on_a_cpu():
