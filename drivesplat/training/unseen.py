@@ -97,7 +97,8 @@ def _shown(model: SplatModel, view: TrainingView, has_objects: bool) -> _Shown:
         splats, share = rendering.image.squeeze(0).split([3, 1], dim=2)
         static = share.detach().squeeze(2) < COVERED
         static = static if view.ego_mask is None else static & ~view.ego_mask
-        (weights,) = torch.autograd.grad((share.squeeze(2) * static).sum(), objects)
+        shown = (share.squeeze(2) * static).sum()  # with a gradient for `share` itself, torch would import sympy
+        (weights,) = torch.autograd.grad(shown, objects)
     return _Shown(splats.detach(), rendering.alpha.detach().squeeze(0), static, weights[:, 0])
 
 
