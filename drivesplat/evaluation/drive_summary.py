@@ -43,7 +43,7 @@ def _group(recording: PreparedDrive, camera: str, images: list[int]) -> dict[str
     lumas, count, sums, squares = [], 0, np.zeros(3), np.zeros(3)
     for index in images:
         image, static = recording.image(index), region_mask(recording.labels(index), "static")
-        lumas.append(float(cv2.meanStdDev(image)[0][:, 0] @ REC_709))
+        lumas.append(float(np.dot(cv2.mean(image)[:3], REC_709)))
         mean, deviation = (values[:, 0] for values in cv2.meanStdDev(image, mask=static.astype(np.uint8)))
         pixels = np.count_nonzero(static)
         count, sums, squares = count + pixels, sums + pixels * mean, squares + pixels * (mean**2 + deviation**2)

@@ -69,12 +69,11 @@ def find_far_in(
 ) -> FarGaussians:
     """`find_far` of the model in a checkpoint, by the training views of `record`. The device of `device_settings` is
     opened, and the settings are asked for, only where a Gaussian lies too far away."""
-    model, device = trained_model(checkpoint), torch.device("cpu")
-    views = [view_of(record, index, device) for index in record.train_images]
+    model, views = trained_model(checkpoint), _training_views(record, torch.device("cpu"))
     reach, distances = _reach_and_distances(model, views, max_distance)
     if (distances > reach).any():
         model, device = open_model(checkpoint, device_settings())
-        views = [view_of(record, index, device) for index in record.train_images]
+        views = _training_views(record, device)
     return find_far(model, views, max_distance, provenance)
 
 
@@ -110,6 +109,10 @@ def find_far(model: SplatModel, views: Sequence[View], max_distance: float, prov
         summary, len(means), 255 * changes.largest_change,
     )  # fmt: skip
     return changes
+
+
+def _training_views(record: TrainingRecord, device: torch.device) -> list[View]:
+    return [view_of(record, index, device) for index in record.train_images]
 
 
 @torch.no_grad()
