@@ -17,7 +17,8 @@ class Picture:
     of the parts with objects alone, None where it needs a second rendering. What is opaque may hide objects behind it
     in `objects_alpha`. `surface_depth`, in metres or None, is that of the surfaces shown, 0 where there are none; it
     has no gradient (`drivesplat.rasterization.rasterize`). `means_of_sets` are the mean opacity and scale (metres) of
-    the sets, None where they were not computed beside the image.
+    the sets, and `road_distance` (metres) is the mean distance of the static set from a road; None where they were not
+    computed beside the image.
     """
 
     sets: GaussianSets
@@ -29,6 +30,7 @@ class Picture:
     objects_alpha: Float[Tensor, "h w"] | None = None
     surface_depth: Float[Tensor, "h w"] | None = None
     means_of_sets: tuple[Float[Tensor, ""], Float[Tensor, ""]] | None = None
+    road_distance: Float[Tensor, ""] | None = None
 
     @property
     def shapes(self) -> Gaussians:

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from drivesplat.errors import ResultError
+from drivesplat.kernels.colored_projection import SetOnRoad
+from drivesplat.kernels.road_distance import Road
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, GaussianSets, concatenate
@@ -172,17 +174,20 @@ class SplatModel(nn.Module):
         with_depth: bool = False,
         with_objects: bool = False,
         with_surface_depth: bool = False,
+        road: Road | None = None,
     ) -> Picture:
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
         `gaussians`, a set or several, replace `sets_in(view)`. Of a picture with other sets than one of each part,
         neither `objects_alpha` nor the terms of static parts can be computed. `with_objects` computes the former, too,
-        where this needs no second rendering.
+        where this needs no second rendering, and with a `road` the distance of static Gaussians from it, where a kernel
+        does so in passing.
         """
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
         seen_from = self.seen_from(view)
         plain = not (with_surface_depth or self.antialiased or self.max_scale)
-        projected = projected_sets(sets, seen_from, sh_degree, with_depth) if plain else None
+        on_road = self._on_road(road)
+        projected = projected_sets(sets, seen_from, sh_degree, with_depth, on_road) if plain else None
         options = {"absgrad": absgrad, "objects": self._rows_of_objects() if with_objects else None}
         if projected is not None:
             size = seen_from.width, seen_from.height
@@ -203,8 +208,11 @@ class SplatModel(nn.Module):
         alone = None if rendering.objects_alpha is None else rendering.objects_alpha.squeeze((0, 3))
         surfaces = rendering.surface_depth
         surfaces = None if surfaces is None else depth_at_lines(surfaces.squeeze(0), seen_from)
-        means_of_sets = None if projected is None else (projected.mean_opacity, projected.mean_scale)
-        return Picture(sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone, surfaces, means_of_sets)
+        picture = Picture(sets, image, splats, alpha.squeeze(2), depth, rendering.info, alone, surfaces)
+        if projected is None:
+            return picture
+        means = projected.mean_opacity, projected.mean_scale
+        return replace(picture, means_of_sets=means, road_distance=projected.road_distance)
 
     def scan(
         self,
@@ -246,6 +254,11 @@ class SplatModel(nn.Module):
             return None
         alone = concatenate(objects)
         return self.composited(alone, alone.means.new_ones(len(alone), 1), view).alpha.squeeze((0, 3))
+
+    def _on_road(self, road: Road | None) -> SetOnRoad | None:
+        """The set of the static part, with a road; None without a road, and where several parts are static."""
+        static = [index for index, part in enumerate(self.parts) if not part.moves]
+        return SetOnRoad(static[0], road) if road is not None and len(static) == 1 else None
 
     def _rows_of_objects(self) -> slice | None:
         """The rows of the parts with objects; None without any, or where rows of other parts lie between them."""

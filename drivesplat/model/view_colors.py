@@ -10,6 +10,7 @@ from drivesplat.kernels.colored_projection import (
     ColoredGaussians,
     PinholeCamera,
     ProjectedWithColors,
+    SetOnRoad,
     project_with_colors,
 )
 from drivesplat.kernels.view_colors import fused_view_colors, view_colors
@@ -30,16 +31,21 @@ def rasterizer_colors(sets: Sequence[Gaussians], view: View, sh_degree: int | No
 
 
 def projected_sets(
-    sets: Sequence[Gaussians], view: View, sh_degree: int | None = None, with_depth: bool = False
+    sets: Sequence[Gaussians],
+    view: View,
+    sh_degree: int | None = None,
+    with_depth: bool = False,
+    on_road: SetOnRoad | None = None,
 ) -> ProjectedWithColors | None:
     """Several sets, one after the other, projected and with the colours that the view's camera sees, by harmonics up to
-    `sh_degree`. None where there is no kernel for it (`drivesplat.kernels.colored_projection.project_with_colors`), and
-    for a rolling shutter."""
+    `sh_degree`, and the distance of a set from a road. None for a rolling shutter, and where there is no kernel for it
+    (`drivesplat.kernels.colored_projection.project_with_colors`)."""
     if view.shutter is not None:
         return None
     given = [ColoredGaussians(own.means, own.quats, own.scales, own.opacities, own.sh0, own.shN) for own in sets]
     camera = PinholeCamera(view.viewmat, view.camera_to_world, view.K, view.width, view.height)
-    return project_with_colors(given, camera, [_up_to(own.sh_degree, sh_degree) for own in sets], with_depth)
+    degrees = [_up_to(own.sh_degree, sh_degree) for own in sets]
+    return project_with_colors(given, camera, degrees, with_depth, on_road)
 
 
 def all_view_colors(gaussians: Gaussians, view: View) -> Float[Tensor, "n 3"]:

@@ -44,10 +44,14 @@ def geometry_priors(record: TrainingRecord, space: FreeSpace | None, settings: T
 
 
 def geometry_terms(
-    sets: Sequence[Gaussians], model: SplatModel, priors: GeometryPriors, settings: TrainSettings
+    sets: Sequence[Gaussians],
+    model: SplatModel,
+    priors: GeometryPriors,
+    settings: TrainSettings,
+    from_road: Float[Tensor, ""] | None = None,
 ) -> dict[str, Float[Tensor, ""]]:
-    """The weighted loss terms of the surfaces of static parts, from the `sets` of Gaussians of all parts at one
-    time."""
+    """The weighted loss terms of the surfaces of static parts, from the `sets` of Gaussians of all parts at one time.
+    `from_road` is the distance of these sets from the road of `priors`, None where it is not known yet."""
     if not settings.flatness_weight and priors.road is None:
         return {}
     parts = [(part, own) for part, own in zip(model.parts, sets, strict=True) if not part.moves]
@@ -57,7 +61,8 @@ def geometry_terms(
         thickness = mean_thickness(static.scales)
         terms["flatness"] = settings.flatness_weight * thickness / active_fraction([part for part, _ in parts])
     if priors.road is not None:
-        terms["road"] = settings.road_weight * road_loss(static, priors.road)
+        distance = road_loss(static, priors.road) if from_road is None else from_road
+        terms["road"] = settings.road_weight * distance
     return terms
 
 

@@ -191,14 +191,14 @@ class Trainer:
                 absgrad=by_gradient and self.settings.default.absgrad,
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
                 with_objects=self._has_entropy and self.settings.entropy_weight > 0 and not by_gradient,
+                road=self.priors.road,
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self._image_settings())
-            terms |= geometry_terms(picture.sets, self.model, self.priors, self.settings)
-            loss = torch.stack(list(terms.values())).sum()
+            terms |= geometry_terms(picture.sets, self.model, self.priors, self.settings, picture.road_distance)
         if by_gradient:
             picture.info["means2d"].retain_grad()
-        return self._follow(loss, terms, step, rates), picture
+        return self._follow(terms, step, rates), picture
 
     def _learn_scan(
         self,
@@ -218,21 +218,20 @@ class Trainer:
             terms = scan_terms(picture, scan, self.model, self.settings)
             if not self.images.views:
                 terms |= geometry_terms(picture.sets, self.model, self.priors, self.settings)
-            loss = torch.stack(list(terms.values())).sum()
-        return self._follow(loss, terms, step, rates, self._limit_gradients)
+        return self._follow(terms, step, rates, self._limit_gradients)
 
     def _follow(
         self,
-        loss: Tensor,
         terms: Terms,
         step: int | Tensor,
         rates: Mapping[str, Tensor] | None,
         limit_gradients: Callable[[], None] = lambda: None,
     ) -> Terms:
-        """The step down the gradient of a loss, limited by `limit_gradients`; returns its terms without gradients."""
+        """The step down the gradient of the sum of the terms, limited by `limit_gradients`; returns the terms without
+        gradients."""
         stage = self.clock.stage
         with stage("backward"):
-            loss.backward()
+            torch.stack(list(terms.values())).sum().backward()
             limit_gradients()
         with stage("optimizer"):
             watched = self.optimizers.step(rates)

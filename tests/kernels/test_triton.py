@@ -510,7 +510,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
 from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
-from drivesplat.kernels.triton import colored_projection
+from drivesplat.kernels.triton import colored_projection, road_distance
 from drivesplat.kernels.triton import depth_error, finite, joined_chunks, object_poses, track_penalties
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles
@@ -537,6 +537,9 @@ SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLO
 SCAN[scan_chunks._copy] = RAYS
 COLORED = {"values": FLOATS, "first": "i32", "first_block": "i32", "total": "i32"}
 SCAN |= dict.fromkeys((colored_projection._project, colored_projection._project_backward), COLORED)
+ROAD = {"offsets": FLOATS, "keys": "*i64", "known": "i32", "edge": "fp32", "reach": "fp32", "roughness": "fp32",
+        "cells": "*i32"}
+SCAN |= dict.fromkeys((road_distance._distances, road_distance._distances_backward), ROAD)
 SCAN[finite._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
@@ -561,6 +564,10 @@ for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
 for k, degree, depth in ((1, 0, True), (4, 1, True), (4, 0, False), (9, 1, False)):
     for kernel in (colored_projection._project, colored_projection._project_backward):
         compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth, BLOCK=colored_projection.BLOCK)
+compiled(road_distance._distances, STEPS=17, BLOCK=road_distance.BLOCK)
+compiled(road_distance._mean, BLOCK=road_distance.SUMS)
+for add in (False, True):
+    compiled(road_distance._distances_backward, ADD=add, BLOCK=road_distance.BLOCK)
 compiled(adam._step, BLOCK=adam.BLOCK)
 compiled(echoes._values, BLOCK=echoes.BLOCK)
 compiled(echoes._values_backward, BLOCK=echoes.BLOCK)

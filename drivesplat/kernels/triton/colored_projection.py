@@ -1,8 +1,7 @@
 """Gaussians projected into one camera, with their colors, in one pass over each set, and the gradient in another.
 
-The projection is that of `drivesplat.kernels.numba.projection`: with the rotation W from world to camera, a Gaussian's
-rotation R and its scales S, the rows c of W R S give the rows p and q of T = J W R S, and the covariance in the image
-is T Tᵀ. Its determinant is |p × q|², whose gradients are 2 q × (p × q) for p and 2 (p × q) × p for q.
+The projection is that of `drivesplat.kernels.numba.projection`, in the terms of `drivesplat.kernels.triton.pinhole`.
+The gradients of the determinant |p × q|² are 2 q × (p × q) for p and 2 (p × q) × p for q.
 """
 
 from typing import Any, no_type_check
@@ -13,7 +12,9 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from drivesplat.kernels.triton.pinhole import EPS2D, axes_in_camera, covariance, in_camera, in_image, rotation
 from drivesplat.kernels.triton.regularizers import write_means
+from drivesplat.kernels.triton.road_distance import distance_from_road, write_gradients
 from drivesplat.kernels.triton.rows import store_quaternion, store_three, store_two, three, two, unit
 from drivesplat.kernels.triton.tiles import MIN_ALPHA
 from drivesplat.kernels.triton.vectors import (
@@ -21,10 +22,7 @@ from drivesplat.kernels.triton.vectors import (
     axes_gradient,
     cross,
     dot,
-    rotation_rows,
     scaled,
-    times,
-    turned,
     turned_back,
 )
 from drivesplat.kernels.triton.view_colors import CONSTANT, color_indices, directions, signed
@@ -33,27 +31,23 @@ BLOCK = 128
 """Gaussians per program."""
 TENSORS = 6
 """Tensors of a set: means, quaternions, scales, opacities, and harmonics of degree 0 and above."""
-EPS2D = tl.constexpr(0.3)
-"""Variance in square pixels that the 2D filter adds, as in gsplat."""
 NEAR_PLANE, FAR_PLANE = tl.constexpr(0.01), tl.constexpr(1e10)
 EXTENT = tl.constexpr(3.33)
 """Largest radius in standard deviations, as in gsplat."""
-MARGIN = tl.constexpr(0.15)
-"""The slope at which a Gaussian beside the image is linearised is clamped this fraction of the image's size beyond its
-border, 0.3 of half the size, as in gsplat."""
 
 
 class ColoredProjection(torch.autograd.Function):
     """`drivesplat.kernels.colored_projection.project_with_colors`: means2d (1, n, 2), depths (1, n), conics (1, n, 3),
-    radii (1, n, 2), opacities (1, n), values (1, n, 3 or 4), the mean opacity and the mean scale. `sets` holds TENSORS
-    tensors of each set, `degrees` the degree up to which harmonics of each are evaluated. Gradients reach all of
-    `sets`."""
+    radii (1, n, 2), opacities (1, n), values (1, n, 3 or 4), the mean opacity, the mean scale, and the mean distance
+    from a road, None without `road`. `sets` holds TENSORS tensors of each set, `degrees` the degree up to which
+    harmonics of each are evaluated; `road` is the index of the set that lies on a road, that road, and its roughness.
+    Gradients reach all of `sets`."""
 
     @staticmethod
     def forward(
         ctx: Any, viewmat: Tensor, K: Tensor, camera_to_world: Tensor, size: tuple[int, int], degrees: tuple[int, ...],
-        with_depth: bool, *sets: Tensor,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
+        with_depth: bool, road: tuple[int, Any, float] | None, *sets: Tensor,
+    ) -> tuple[Tensor | None, ...]:  # fmt: skip
         camera = tuple(values.contiguous() for values in (viewmat, K, camera_to_world))
         given = tuple(values.contiguous() for values in sets)
         count, new = sum(len(means) for means in given[::TENSORS]), viewmat.new_empty
@@ -72,20 +66,27 @@ class ColoredProjection(torch.autograd.Function):
                 )  # fmt: skip
             first, first_block = first + len(own[0]), first_block + programs
         write_means(partial, mean_opacity, mean_scale, count)
-        ctx.save_for_backward(*camera, radii, values, *given)
+        distance, on_road = None, ()
+        if road is not None:
+            distance, on_road = distance_from_road(*_by_set(given)[road[0]][:4], *road[1:])
+        ctx.save_for_backward(*camera, radii, values, *on_road, *given)
         ctx.options = (size, degrees, with_depth)
+        ctx.road = (None, 0.0, 0) if road is None else (road[0], road[2], len(on_road))
         ctx.mark_non_differentiable(depths, radii)
-        return means2d, depths, conics, radii, opacities, values, mean_opacity, mean_scale
+        return means2d, depths, conics, radii, opacities, values, mean_opacity, mean_scale, distance
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (*camera, radii, values), sets = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        on_road_at, roughness, count = ctx.road
+        (*camera, radii, values), saved = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
+        on_road, sets = saved[:count], saved[count:]
         size, degrees, with_depth = ctx.options
-        v_means2d, _, v_conics, _, *others = (gradient.contiguous() for gradient in gradients)
+        *given, v_distance = gradients
+        v_means2d, _, v_conics, _, *others = (gradient.contiguous() for gradient in given)
         found: list[Tensor] = []
         first = 0
-        for own, degree in zip(_by_set(sets), degrees, strict=True):
+        for index, (own, degree) in enumerate(zip(_by_set(sets), degrees, strict=True)):
             programs, above = triton.cdiv(len(own[0]), BLOCK), own[5].shape[1]
             v_own = [torch.empty_like(tensor) for tensor in own[:5]]
             v_own.append(torch.empty_like(own[5]) if above == 3 * degree else torch.zeros_like(own[5]))
@@ -94,75 +95,14 @@ class ColoredProjection(torch.autograd.Function):
                     *own, *camera, radii, values, v_means2d, v_conics, *others, *v_own, len(own[0]), first,
                     radii.shape[1], *size, above, degree, with_depth, BLOCK,
                 )  # fmt: skip
+            if index == on_road_at:
+                write_gradients(own[:3], on_road, v_distance, v_own[:3], roughness, add=True)
             found, first = found + v_own, first + len(own[0])
-        return None, None, None, None, None, None, *found
+        return None, None, None, None, None, None, None, *found
 
 
 def _by_set(tensors: tuple[Tensor, ...]) -> list[tuple[Tensor, ...]]:
     return [tensors[at : at + TENSORS] for at in range(0, len(tensors), TENSORS)]
-
-
-@triton.jit
-@no_type_check
-def _rotation(viewmat):
-    """The rows of the rotation from world to camera."""
-    return (
-        (tl.load(viewmat), tl.load(viewmat + 1), tl.load(viewmat + 2)),
-        (tl.load(viewmat + 4), tl.load(viewmat + 5), tl.load(viewmat + 6)),
-        (tl.load(viewmat + 8), tl.load(viewmat + 9), tl.load(viewmat + 10)),
-    )
-
-
-@triton.jit
-@no_type_check
-def _in_camera(mean, viewmat):
-    """Centres in the camera's frame."""
-    shift = tl.load(viewmat + 3), tl.load(viewmat + 7), tl.load(viewmat + 11)
-    return added(turned(_rotation(viewmat), mean), shift)
-
-
-@triton.jit
-@no_type_check
-def _axes(quat, size, viewmat):
-    """The rows of W R S."""
-    rows = rotation_rows(quat[0], quat[1], quat[2], quat[3])
-    to_camera = _rotation(viewmat)
-    return (
-        times(turned_back(rows, to_camera[0]), size),
-        times(turned_back(rows, to_camera[1]), size),
-        times(turned_back(rows, to_camera[2]), size),
-    )
-
-
-@triton.jit
-@no_type_check
-def _slope(along, z, focal, center, extent):
-    """The slope along / z, clamped to the image and MARGIN beyond it, and whether it lies within these limits."""
-    slope, margin = along / z, MARGIN * extent / focal
-    clamped = tl.minimum(tl.maximum(slope, -center / focal - margin), (extent - center) / focal + margin)
-    return clamped, clamped == slope
-
-
-@triton.jit
-@no_type_check
-def _in_image(axes, at, K, width, height):
-    """The rows p and q of T, and the slopes x / z and y / z, each as `_slope` returns it."""
-    fx, cx, fy, cy = tl.load(K), tl.load(K + 2), tl.load(K + 4), tl.load(K + 5)
-    across, within_x = _slope(at[0], at[2], fx, cx, width)
-    down, within_y = _slope(at[1], at[2], fy, cy, height)
-    p = scaled(fx / at[2], added(axes[0], scaled(-across, axes[2])))
-    q = scaled(fy / at[2], added(axes[1], scaled(-down, axes[2])))
-    return p, q, across, within_x, down, within_y
-
-
-@triton.jit
-@no_type_check
-def _covariance(p, q):
-    """The entries xx, xy and yy of the filtered covariance, its determinant, and p × q."""
-    normal = cross(p, q)
-    xx, yy = dot(p, p), dot(q, q)
-    determinant = dot(normal, normal) + EPS2D * (xx + yy + EPS2D)
-    return xx + EPS2D, dot(p, q), yy + EPS2D, determinant, normal
 
 
 @triton.jit(do_not_specialize=["count", "first", "first_block", "blocks", "width", "height"])
@@ -183,13 +123,13 @@ def _project(
     tl.store(partial + first_block + tl.program_id(0), tl.sum(opacity))
     tl.store(partial + blocks + first_block + tl.program_id(0), tl.sum(length))
 
-    at = _in_camera(three(means, i, valid), viewmat)
+    at = in_camera(three(means, i, valid), viewmat)
     z = at[2]
     seen = valid & (z >= NEAR_PLANE) & (z <= FAR_PLANE) & (opacity >= MIN_ALPHA)
     at = at[0], at[1], tl.where(seen, z, 1.0)
     w, x, y, z_, _ = unit(quats, i, seen)
-    p, q, _, _, _, _ = _in_image(_axes((w, x, y, z_), size, viewmat), at, K, width, height)
-    xx, xy, yy, determinant, _ = _covariance(p, q)
+    p, q, _, _, _, _ = in_image(axes_in_camera((w, x, y, z_), size, viewmat), at, K, width, height)
+    xx, xy, yy, determinant, _ = covariance(p, q)
     u = tl.load(K) * at[0] / at[2] + tl.load(K + 2)
     v = tl.load(K + 4) * at[1] / at[2] + tl.load(K + 5)
     extent = tl.minimum(EXTENT, tl.sqrt(2.0 * tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0))))
@@ -246,13 +186,13 @@ def _project_backward(
         along = signed(k) * tl.sum(v_color[:, None, :] * tl.load(shN + linear, mask=exists, other=0.0), 2)
     by_color = (along - tl.sum(along * direction, 1)[:, None] * direction) / distance[:, None]
 
-    at = _in_camera(three(means, i, seen), viewmat)
+    at = in_camera(three(means, i, seen), viewmat)
     at = at[0], at[1], tl.where(seen, at[2], 1.0)
     w, x, y, z, length = unit(quats, i, seen)
     size = three(scales, i, seen)
-    axes = _axes((w, x, y, z), size, viewmat)
-    p, q, across, within_x, down, within_y = _in_image(axes, at, K, width, height)
-    xx, xy, yy, determinant, normal = _covariance(p, q)
+    axes = axes_in_camera((w, x, y, z), size, viewmat)
+    p, q, across, within_x, down, within_y = in_image(axes, at, K, width, height)
+    xx, xy, yy, determinant, normal = covariance(p, q)
     by_conic = three(v_conics, row, seen)
     by_yy, by_xy, by_xx = by_conic[0] / determinant, -by_conic[1] / determinant, by_conic[2] / determinant
     by_determinant = -(by_yy * yy + by_xy * xy + by_xx * xx) / determinant
@@ -274,7 +214,7 @@ def _project_backward(
     by_z = -(by_across * at[0] / at[2] + by_down * at[1] / at[2] + dot(by_p, p) + dot(by_q, q)) / at[2]
     if DEPTH:
         by_z += tl.load(v_values + 4 * row + 3, mask=seen, other=0.0)
-    to_camera = _rotation(viewmat)
+    to_camera = rotation(viewmat)
     by_mean = turned_back(to_camera, (by_across / at[2], by_down / at[2], by_z))
     axis = ((k + 1) % 3)[None, :]  # as `directions`: y, z and x
     by_place = tl.where(axis == 0, by_mean[0][:, None], tl.where(axis == 1, by_mean[1][:, None], by_mean[2][:, None]))

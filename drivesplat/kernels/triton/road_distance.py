@@ -1,5 +1,6 @@
 """The distance of Gaussians from a road in one pass, and its gradients in another."""
 
+from collections.abc import Sequence
 from typing import Any, no_type_check
 
 import torch
@@ -8,10 +9,21 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.triton.vectors import dot, rotation_gradient, rotation_rows, scaled, turned_back
+from drivesplat.kernels.triton.rows import quaternion, store_quaternion, store_three, three, unit
+from drivesplat.kernels.triton.vectors import (
+    added,
+    dot,
+    rotation_gradient,
+    rotation_rows,
+    scaled,
+    times,
+    turned_back,
+)
 
-BLOCK = 256
-"""Gaussians per program."""
+BLOCK, SUMS = 256, 1024
+"""Gaussians per program, and sums of such blocks that are read at a time."""
+MIN_WEIGHT = tl.constexpr(1e-6)
+"""Distances are divided by the sum of their weights, at least by this."""
 
 
 class RoadDistance(torch.autograd.Function):
@@ -22,29 +34,52 @@ class RoadDistance(torch.autograd.Function):
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, road: Any, roughness: float
     ) -> Tensor:
         given = tuple(values.contiguous() for values in (means, quats, scales))
-        planes = road.normals.contiguous(), road.offsets.contiguous(), road.weights.contiguous()
-        count, blocks = len(means), triton.cdiv(len(means), BLOCK)
-        cells = torch.empty(count, dtype=torch.int32, device=means.device)
-        partial = means.new_empty(2, blocks)
-        grid, (rows, columns) = road.cells, road.cells.shape
-        _distances[(blocks,)](
-            *given, opacities.contiguous(), *planes, grid.keys, grid.lower, cells, partial, count, len(grid.keys),
-            rows, columns, grid.edge, road.reach, roughness, len(grid.keys).bit_length(), BLOCK,
-        )  # fmt: skip
-        total, weight = partial.sum(dim=1)
-        weight = weight.clamp(min=1e-6)
-        ctx.save_for_backward(*given, *planes, cells, weight)
+        distance, on_road = distance_from_road(*given, opacities.contiguous(), road, roughness)
+        ctx.save_for_backward(*given, *on_road)
         ctx.roughness = roughness
-        return total / weight
+        return distance
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_distance: Tensor) -> tuple[Tensor | None, ...]:
-        means, quats, scales, *others = ctx.saved_tensors
-        gradients = tuple(torch.empty_like(values) for values in (means, quats, scales))
-        arguments = means, quats, scales, *others, v_distance, *gradients, len(means), ctx.roughness, BLOCK
-        _distances_backward[(triton.cdiv(len(means), BLOCK),)](*arguments)
+        given, on_road = ctx.saved_tensors[:3], ctx.saved_tensors[3:]
+        gradients = tuple(torch.empty_like(values) for values in given)
+        write_gradients(given, on_road, v_distance, gradients, ctx.roughness, add=False)
         return *gradients, None, None, None
+
+
+def distance_from_road(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, road: Any, roughness: float
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """The distance of `RoadDistance`, of contiguous tensors, and what `write_gradients` reads of the road: its planes,
+    the cell of each Gaussian, and the sum of weights."""
+    planes = road.normals.contiguous(), road.offsets.contiguous(), road.weights.contiguous()
+    count, blocks = len(means), triton.cdiv(len(means), BLOCK)
+    cells = torch.empty(count, dtype=torch.int32, device=means.device)
+    partial, distance, weight = means.new_empty(2, blocks), means.new_empty(()), means.new_empty(())
+    grid, (rows, columns) = road.cells, road.cells.shape
+    _distances[(blocks,)](
+        means, quats, scales, opacities, *planes, grid.keys, grid.lower, cells, partial, count, len(grid.keys),
+        rows, columns, grid.edge, road.reach, roughness, len(grid.keys).bit_length(), BLOCK,
+    )  # fmt: skip
+    _mean[(1,)](partial, distance, weight, blocks, SUMS)
+    return distance, (*planes, cells, weight)
+
+
+def write_gradients(
+    given: Sequence[Tensor],
+    on_road: Sequence[Tensor],
+    v_distance: Tensor,
+    gradients: Sequence[Tensor],
+    roughness: float,
+    add: bool,
+) -> None:
+    """Writes the gradients of means, quaternions and scales, which are `given`. With `add` adds those of Gaussians of
+    the road to what is there, and leaves others as they are."""
+    count = len(given[0])
+    _distances_backward[(triton.cdiv(count, BLOCK),)](
+        *given, *on_road, v_distance, *gradients, count, roughness, add, BLOCK
+    )
 
 
 @triton.jit(do_not_specialize=["count", "known", "rows", "columns", "edge", "reach", "roughness"])
@@ -57,7 +92,7 @@ def _distances(
     weights."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     opaque = tl.load(opacities + i, mask=i < count, other=0.0) > 0.0
-    x, y, z = _load(means, i, opaque)
+    x, y, z = three(means, i, opaque)
     row = tl.floor((x - tl.load(lower)) / edge)
     column = tl.floor((y - tl.load(lower + 1)) / edge)
     inside = opaque & (row >= 0.0) & (row < rows) & (column >= 0.0) & (column < columns)
@@ -71,7 +106,7 @@ def _distances(
         first = tl.where(smaller, middle + 1, first)
     inside = inside & (first < known)
     inside = inside & (tl.load(keys + first, mask=inside, other=-1) == key)
-    normal = _load(normals, first, inside)
+    normal = three(normals, first, inside)
     height = dot((x, y, z), normal) - tl.load(offsets + first, mask=inside, other=0.0)
     inside = inside & (tl.abs(height) < reach)
     _, _, _, _, along = _along(quats, scales, i, inside, normal)
@@ -82,34 +117,53 @@ def _distances(
     tl.store(partial + tl.num_programs(0) + tl.program_id(0), tl.sum(weight))
 
 
+@triton.jit(do_not_specialize=["blocks"])
+@no_type_check
+def _mean(partial, distance, weight, blocks, BLOCK: tl.constexpr):
+    """Writes the weighted mean distance, and the sum of weights, by the sums of all blocks."""
+    distances, weights = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for begin in range(0, blocks, BLOCK):
+        block = begin + tl.arange(0, BLOCK)
+        distances += tl.load(partial + block, mask=block < blocks, other=0.0)
+        weights += tl.load(partial + blocks + block, mask=block < blocks, other=0.0)
+    divisor = tl.maximum(tl.sum(weights), MIN_WEIGHT)
+    tl.store(weight, divisor)
+    tl.store(distance, tl.sum(distances) / divisor)
+
+
 @triton.jit(do_not_specialize=["count", "roughness"])
 @no_type_check
 def _distances_backward(
     means, quats, scales, normals, offsets, weights, cells, weight_sum, v_distance, v_means, v_quats, v_scales,
-    count, roughness, BLOCK: tl.constexpr,
+    count, roughness, ADD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
+    """Writes all gradients; with ADD adds those of Gaussians of the road."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    valid = i < count
-    cell = tl.load(cells + i, mask=valid, other=-1)
+    written = i < count
+    cell = tl.load(cells + i, mask=written, other=-1)
     inside = cell >= 0
-    normal = _load(normals, cell, inside)
-    height = dot(_load(means, i, inside), normal) - tl.load(offsets + cell, mask=inside, other=0.0)
+    normal = three(normals, cell, inside)
+    height = dot(three(means, i, inside), normal) - tl.load(offsets + cell, mask=inside, other=0.0)
     quat, length, scale, in_own, along = _along(quats, scales, i, inside, normal)
     w, x, y, z = quat
     weight = tl.load(weights + cell, mask=inside, other=0.0) * tl.load(v_distance) / tl.load(weight_sum)
     by_square = weight / tl.sqrt(height * height + dot(along, along) + roughness * roughness)
-    _store(v_means, i, valid, scaled(by_square * height, normal))
-    v_along = scaled(by_square, along)
-    _store(v_scales, i, valid, (v_along[0] * in_own[0], v_along[1] * in_own[1], v_along[2] * in_own[2]))
-    v_own = (v_along[0] * scale[0], v_along[1] * scale[1], v_along[2] * scale[2])
+    by_mean, by_along = scaled(by_square * height, normal), scaled(by_square, along)
+    by_scale, by_own = times(by_along, in_own), times(by_along, scale)
     # in_own is the transposed rotation times the normal
-    v_rows = scaled(normal[0], v_own), scaled(normal[1], v_own), scaled(normal[2], v_own)
-    v_w, v_x, v_y, v_z = rotation_gradient(w, x, y, z, v_rows)
-    radial = v_w * w + v_x * x + v_y * y + v_z * z
-    tl.store(v_quats + 4 * i, (v_w - radial * w) / length, mask=valid)
-    tl.store(v_quats + 4 * i + 1, (v_x - radial * x) / length, mask=valid)
-    tl.store(v_quats + 4 * i + 2, (v_y - radial * y) / length, mask=valid)
-    tl.store(v_quats + 4 * i + 3, (v_z - radial * z) / length, mask=valid)
+    by_rows = scaled(normal[0], by_own), scaled(normal[1], by_own), scaled(normal[2], by_own)
+    by_w, by_x, by_y, by_z = rotation_gradient(w, x, y, z, by_rows)
+    radial = by_w * w + by_x * x + by_y * y + by_z * z
+    by_w, by_x = (by_w - radial * w) / length, (by_x - radial * x) / length
+    by_y, by_z = (by_y - radial * y) / length, (by_z - radial * z) / length
+    if ADD:
+        written = inside
+        by_mean, by_scale = added(by_mean, three(v_means, i, inside)), added(by_scale, three(v_scales, i, inside))
+        others = quaternion(v_quats, i, inside)
+        by_w, by_x, by_y, by_z = by_w + others[0], by_x + others[1], by_y + others[2], by_z + others[3]
+    store_three(v_means, i, by_mean[0], by_mean[1], by_mean[2], written)
+    store_three(v_scales, i, by_scale[0], by_scale[1], by_scale[2], written)
+    store_quaternion(v_quats, i, by_w, by_x, by_y, by_z, written)
 
 
 @triton.jit
@@ -117,30 +171,7 @@ def _distances_backward(
 def _along(quats, scales, i, mask, normal):
     """The unit quaternions of the Gaussians i of a mask, their lengths before normalisation, their scales, the normal
     in their own axes, and its product with the scales."""
-    w, x = tl.load(quats + 4 * i, mask=mask, other=1.0), tl.load(quats + 4 * i + 1, mask=mask, other=0.0)
-    y, z = tl.load(quats + 4 * i + 2, mask=mask, other=0.0), tl.load(quats + 4 * i + 3, mask=mask, other=0.0)
-    length = tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    w, x, y, z = w / length, x / length, y / length, z / length
-    scale = _load(scales, i, mask)
+    w, x, y, z, length = unit(quats, i, mask)
+    scale = three(scales, i, mask)
     in_own = turned_back(rotation_rows(w, x, y, z), normal)
-    along = scale[0] * in_own[0], scale[1] * in_own[1], scale[2] * in_own[2]
-    return (w, x, y, z), length, scale, in_own, along
-
-
-@triton.jit
-@no_type_check
-def _load(vectors, i, mask):
-    """The vectors i of a mask; 0 elsewhere."""
-    return (
-        tl.load(vectors + 3 * i, mask=mask, other=0.0),
-        tl.load(vectors + 3 * i + 1, mask=mask, other=0.0),
-        tl.load(vectors + 3 * i + 2, mask=mask, other=0.0),
-    )
-
-
-@triton.jit
-@no_type_check
-def _store(vectors, i, mask, values):
-    """Writes the vectors i of a mask."""
-    for axis in tl.static_range(3):
-        tl.store(vectors + 3 * i + axis, values[axis], mask=mask)
+    return (w, x, y, z), length, scale, in_own, times(scale, in_own)
