@@ -16,6 +16,7 @@ from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
+from drivesplat.training.losses import Means, weighted
 from drivesplat.training.road import road_of
 
 
@@ -56,14 +57,14 @@ def geometry_terms(
         return {}
     parts = [(part, own) for part, own in zip(model.parts, sets, strict=True) if not part.moves]
     static = concatenate([own for _, own in parts])
-    terms = {}
+    terms: Means = {}
     if settings.flatness_weight:
-        thickness = mean_thickness(static.scales)
-        terms["flatness"] = settings.flatness_weight * thickness / active_fraction([part for part, _ in parts])
+        thickness = mean_thickness(static.scales) / active_fraction([part for part, _ in parts])
+        terms["flatness"] = settings.flatness_weight, thickness
     if priors.road is not None:
         distance = road_loss(static, priors.road) if from_road is None else from_road
-        terms["road"] = settings.road_weight * distance
-    return terms
+        terms["road"] = settings.road_weight, distance
+    return weighted(terms)
 
 
 def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:

@@ -1,5 +1,7 @@
 """The terms of the training loss, by name, for logs and error messages."""
 
+from functools import cache
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
@@ -16,6 +18,8 @@ from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.views import LidarDepth, TrainingView
 
+Means = dict[str, tuple[float, Float[Tensor, ""]]]
+"""Weights and means of the terms of a loss, by name."""
 MIN_DEPTH = 1.0
 """Metres: nearer depths count as this where their inverse is compared."""
 MAX_CURVATURE, EDGE_DECAY, OPAQUE = 0.1, 10.0, 0.8
@@ -31,59 +35,70 @@ def loss_terms(
     alpha = picture.alpha if view.ego_mask is None else picture.alpha.masked_fill(view.ego_mask, 1.0)
     moving = view.moving if settings.dynamic_weight > 0 else None
     difference = color_difference(picture.image, view.pixels, view.ego_mask, moving)
-    terms = {
-        "l1": (1.0 - settings.ssim_weight) * difference.l1,
-        "ssim": settings.ssim_weight * (1.0 - difference.ssim),
+    terms: Means = {
+        "l1": (1.0 - settings.ssim_weight, difference.l1),
+        "ssim": (settings.ssim_weight, 1.0 - difference.ssim),
     }
     if difference.moving_l1 is not None:
-        terms["dynamic"] = settings.dynamic_weight * difference.moving_l1
+        terms["dynamic"] = settings.dynamic_weight, difference.moving_l1
     terms |= regularization(picture, model, settings)
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
-        terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
+        terms["sky_alpha"] = settings.sky_alpha_weight, sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
-        terms["sky_bce"] = settings.sky_bce_weight * mean_cross_entropy(alpha, view.sky)
+        terms["sky_bce"] = settings.sky_bce_weight, mean_cross_entropy(alpha, view.sky)
     if view.not_sky is not None and settings.horizon_weight:
         certain = alpha.masked_fill(~view.not_sky, 1.0)
-        terms["horizon"] = settings.horizon_weight * mean_cross_entropy(certain, torch.zeros_like(view.not_sky))
+        terms["horizon"] = settings.horizon_weight, mean_cross_entropy(certain, torch.zeros_like(view.not_sky))
     if view.lidar is not None and picture.depth is not None:
-        terms["depth"] = settings.depth_weight * depth_loss(picture.depth, view.lidar)
+        terms["depth"] = settings.depth_weight, depth_loss(picture.depth, view.lidar)
     if picture.depth is not None and settings.smoothness_weight:
         opaque = picture.alpha if view.ego_mask is None else picture.alpha.masked_fill(view.ego_mask, 0.0)
-        terms["smoothness"] = settings.smoothness_weight * depth_roughness(picture.depth, opaque, view.target())
+        terms["smoothness"] = settings.smoothness_weight, depth_roughness(picture.depth, opaque, view.target())
     logits = model.class_logits(picture, view.view) if view.classes is not None else None
     if logits is not None:
-        terms["semantic"] = settings.semantic_weight * class_cross_entropy(logits, view.classes)
+        terms["semantic"] = settings.semantic_weight, class_cross_entropy(logits, view.classes)
     for name, learned in (("exposure", model.exposure), ("camera_poses", model.camera_poses)):
         penalty = learned.penalty(view.view.camera) if learned is not None else None
         if penalty is not None:
-            terms[name] = penalty
-    return {**terms, **_dynamic_terms(picture, view, model, settings)}
+            terms[name] = 1.0, penalty
+    return weighted({**terms, **_dynamic_terms(picture, view, model, settings)})
 
 
-def regularization(
-    picture: Picture | ScanPicture, model: SplatModel, settings: TrainSettings
-) -> dict[str, Float[Tensor, ""]]:
-    """The weighted mean opacity and scale (metres) of a model's Gaussians in a picture."""
+def weighted(terms: Means) -> dict[str, Float[Tensor, ""]]:
+    """The products of weights and means, by one operation for all of them."""
+    if not terms:
+        return {}
+    weights, means = zip(*terms.values(), strict=True)
+    products = torch.stack(means) * _on_device(weights, means[0].device)
+    return dict(zip(terms, products.unbind(), strict=True))
+
+
+@cache
+def _on_device(weights: tuple[float, ...], device: torch.device) -> Float[Tensor, " n"]:
+    """Weights as a tensor, copied once: a CUDA graph cannot copy it from the host."""
+    return torch.tensor(weights, device=device)
+
+
+def regularization(picture: Picture | ScanPicture, model: SplatModel, settings: TrainSettings) -> Means:
+    """The mean opacity and scale (metres) of a model's Gaussians in a picture, with their weights."""
     weights = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
     if not any(weights.values()):
         return {}
     means, active = picture.mean_opacity_and_scale(), active_fraction(model.parts)
-    return {name: (w / active) * mean for (name, w), mean in zip(weights.items(), means, strict=True) if w}
+    return {name: (w, mean / active) for (name, w), mean in zip(weights.items(), means, strict=True) if w}
 
 
-def _dynamic_terms(
-    picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
-) -> dict[str, Float[Tensor, ""]]:
+def _dynamic_terms(picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings) -> Means:
     """The terms of dynamic parts, colours excepted; none for a model without such parts. Penalties of one
     name are added over the parts."""
-    terms: dict[str, Float[Tensor, ""]] = {}
+    terms: Means = {}
     for part in model.parts:
         for name, penalty in (part.penalties() | part.penalties_at(view.view.time)).items():
-            terms[name] = terms[name] + penalty if name in terms else penalty
+            terms[name] = 1.0, terms[name][1] + penalty if name in terms else penalty
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
         seen = alpha if view.ego_mask is None else alpha.masked_fill(view.ego_mask, 1.0)
-        terms["entropy"] = settings.entropy_weight * mean_entropy(seen)
+        terms["entropy"] = settings.entropy_weight, mean_entropy(seen)
     return terms
 
 

@@ -20,7 +20,7 @@ from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
-from drivesplat.training.losses import regularization
+from drivesplat.training.losses import Means, regularization, weighted
 from drivesplat.training.views import view_index
 
 SCANS_SEED = 7919
@@ -112,16 +112,16 @@ def scan_terms(
     count = returned.sum().clamp(min=1.0)
     certain, measured = picture.returned.clamp(CERTAIN, 1.0 - CERTAIN), scan.measured.float()
     likelihood = torch.where(scan.returned, certain, 1.0 - certain)
-    terms = {
-        "scan_range": weights.range_weight * range_loss(picture.range, picture.alpha, scan),
-        "scan_drop": -weights.drop_weight * (likelihood.log() * measured).sum() / measured.sum().clamp(min=1.0),
+    terms: Means = {
+        "scan_range": (weights.range_weight, range_loss(picture.range, picture.alpha, scan)),
+        "scan_drop": (-weights.drop_weight, (likelihood.log() * measured).sum() / measured.sum().clamp(min=1.0)),
     }
     if scan.intensity is not None:
         errors = (picture.intensity - scan.intensity).square()
-        terms["scan_intensity"] = weights.intensity_weight * (errors * returned).sum() / count
+        terms["scan_intensity"] = weights.intensity_weight, (errors * returned).sum() / count
     if picture.alpha_before is not None:
-        terms["scan_sight"] = weights.sight_weight * (picture.alpha_before * returned).sum() / count
-    return {**terms, **regularization(picture, model, settings)}
+        terms["scan_sight"] = weights.sight_weight, (picture.alpha_before * returned).sum() / count
+    return weighted({**terms, **regularization(picture, model, settings)})
 
 
 def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan: TrainingScan) -> Float[Tensor, ""]:
