@@ -1,7 +1,5 @@
 """The terms of the training loss, by name, for logs and error messages."""
 
-from functools import cache
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
@@ -9,6 +7,7 @@ from torch import Tensor
 
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
+from drivesplat.kernels.constants import constant
 from drivesplat.kernels.depth_error import mean_depth_error
 from drivesplat.model.part import active_fraction
 from drivesplat.model.picture import Picture
@@ -69,14 +68,8 @@ def weighted(terms: Means) -> dict[str, Float[Tensor, ""]]:
     if not terms:
         return {}
     weights, means = zip(*terms.values(), strict=True)
-    products = torch.stack(means) * _on_device(weights, means[0].device)
+    products = torch.stack(means) * constant(weights, means[0].device)
     return dict(zip(terms, products.unbind(), strict=True))
-
-
-@cache
-def _on_device(weights: tuple[float, ...], device: torch.device) -> Float[Tensor, " n"]:
-    """Weights as a tensor, copied once: a CUDA graph cannot copy it from the host."""
-    return torch.tensor(weights, device=device)
 
 
 def regularization(picture: Picture | ScanPicture, model: SplatModel, settings: TrainSettings) -> Means:
