@@ -180,13 +180,13 @@ class SplatModel(nn.Module):
 
         `gaussians`, a set or several, replace `sets_in(view)`. Of a picture with other sets than one of each part,
         neither `objects_alpha` nor the terms of static parts can be computed. `with_objects` computes the former, too,
-        where this needs no second rendering, and with a `road` the distance of static Gaussians from it, where a kernel
-        does so in passing.
+        where this needs no second rendering. With a `road`, the picture has the distance of static Gaussians from it
+        where the kernel of the projection computes it.
         """
         sets = _sets(self.sets_in(view) if gaussians is None else gaussians)
         seen_from = self.seen_from(view)
         plain = not (with_surface_depth or self.antialiased or self.max_scale)
-        on_road = self._on_road(road)
+        on_road = self._on_road(road, sets)
         projected = projected_sets(sets, seen_from, sh_degree, with_depth, on_road) if plain else None
         options = {"absgrad": absgrad, "objects": self._rows_of_objects() if with_objects else None}
         if projected is not None:
@@ -255,10 +255,12 @@ class SplatModel(nn.Module):
         alone = concatenate(objects)
         return self.composited(alone, alone.means.new_ones(len(alone), 1), view).alpha.squeeze((0, 3))
 
-    def _on_road(self, road: Road | None) -> SetOnRoad | None:
-        """The set of the static part, with a road; None without a road, and where several parts are static."""
+    def _on_road(self, road: Road | None, sets: GaussianSets) -> SetOnRoad | None:
+        """The set of the static part, with a road. None without a road, where several parts are static, and where
+        `sets` are not one of each part."""
         static = [index for index, part in enumerate(self.parts) if not part.moves]
-        return SetOnRoad(static[0], road) if road is not None and len(static) == 1 else None
+        known = road is not None and len(static) == 1 and len(sets) == len(self.parts)
+        return SetOnRoad(static[0], road) if known else None
 
     def _rows_of_objects(self) -> slice | None:
         """The rows of the parts with objects; None without any, or where rows of other parts lie between them."""

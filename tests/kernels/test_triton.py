@@ -346,9 +346,10 @@ def test_values_of_echoes_and_their_gradients_agree_with_torch(count):
 
 
 @pytest.mark.parametrize("listed", [1, 37, 64])
-def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed):
+def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed, monkeypatch):
     """Triton, and without it numba on the CPU. A road of one cell, with gaps, and of all cells; Gaussians out of reach,
-    outside and of opacity 0 among them."""
+    outside and of opacity 0 among them; more blocks than the sum of all reads at a time."""
+    monkeypatch.setattr("drivesplat.kernels.triton.road_distance.SUMS", 4)
     torch.manual_seed(listed)
     keys = torch.randperm(64)[:listed].sort().values
     normals = F.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.1 * torch.randn(listed, 3), dim=1)
