@@ -80,14 +80,14 @@ def project_with_colors(
     from drivesplat.kernels.triton.colored_projection import ColoredProjection
 
     pose, size = (camera.viewmat, camera.K, camera.camera_to_world), (camera.width, camera.height)
-    options = size, tuple(degrees), with_depth, _known(on_road, sets)
+    options = size, tuple(degrees), with_depth, _road_options(on_road, sets)
     *projected, values, opacity, scale, distance = ColoredProjection.apply(
         *pose, *options, *(tensor for own in sets for tensor in own)
     )
     return ProjectedWithColors(ProjectedGaussians(*projected), values, opacity, scale, distance)
 
 
-def _known(on_road: SetOnRoad | None, sets: Sequence[ColoredGaussians]) -> tuple[int, Road, float] | None:
+def _road_options(on_road: SetOnRoad | None, sets: Sequence[ColoredGaussians]) -> tuple[int, Road, float] | None:
     """The index of a set on a road, the road and its roughness; None where the road has no cell or the set is empty."""
     if on_road is None or not len(on_road.road.weights) or not len(sets[on_road.index].means):
         return None
