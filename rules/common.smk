@@ -30,7 +30,7 @@ try:
     prefix = "" if main else take_prefix(workflow)
     if not main:
         config = module_config(config, os.path.join(here, "config.yaml"), prefix)
-    plan = Plan(config, here, prefix)
+    plan = Plan(config, here, prefix, workflow.is_main_process)
     if not main:
         stop_at_absent_data(plan)
     plan.targets = run_targets(wanted, workflow.is_main_process) if main else None
