@@ -8,6 +8,7 @@ import os
 import sys
 
 from snakemake.cli import get_argument_parser
+from snakemake.logging import logger as snakemake_logger
 from snakemake.utils import validate
 
 sys.path.insert(0, here)
@@ -18,8 +19,10 @@ from drivesplat.io.this_copy import in_this_copy
 from drivesplat.workflow.module_use import module_config, stop_at_absent_data, take_prefix
 from drivesplat.workflow.named_tracks import run_targets
 from drivesplat.workflow.plan import Plan, let_scripts_import
+from drivesplat.workflow.snakemake_reasons import name_changes
 
 let_scripts_import(here)
+snakemake_logger.addFilter(name_changes)
 asked = get_argument_parser().parse_known_args(None if main else [])[0]
 wanted = [target for target in asked.targets if target != ESTIMATE]
 
@@ -30,7 +33,7 @@ try:
     prefix = "" if main else take_prefix(workflow)
     if not main:
         config = module_config(config, os.path.join(here, "config.yaml"), prefix)
-    plan = Plan(config, here, prefix)
+    plan = Plan(config, here, prefix, workflow.is_main_process)
     if not main:
         stop_at_absent_data(plan)
     plan.targets = run_targets(wanted, workflow.is_main_process) if main else None

@@ -25,15 +25,27 @@ def code_digest(script: str | Path) -> str:
     package (the viewer's) are part of it, byte by byte.
     """
     path = Path(script)
-    modules, waiting = {}, set(_imports(path, package=""))
+    content = [_content(path), *(f"{name}\n{_content(file)}" for name, file in sorted(_modules(path).items()))]
+    return hashlib.sha256("\n\n".join(content).encode()).hexdigest()
+
+
+def code_files(script: str | Path) -> tuple[list[Path], list[Path]]:
+    """The modules of this package that `code_digest` covers, and the pages and scripts beside them."""
+    modules = list(_modules(Path(script)).values())
+    return modules, [page for file in modules for page in _pages(file)]
+
+
+@cache
+def _modules(script: Path) -> dict[str, Path]:
+    """The modules of this package that a script imports, directly or indirectly, by name."""
+    modules: dict[str, Path] = {}
+    waiting = set(_imports(script, package=""))
     while waiting:
         name = waiting.pop()
         if name not in modules:
-            file = _file_of(name)
-            modules[name] = _content(file)
+            modules[name] = file = _file_of(name)
             waiting |= _imports(file, package=name if file.name == "__init__.py" else name.rpartition(".")[0])
-    content = [_content(path), *(f"{name}\n{modules[name]}" for name in sorted(modules))]
-    return hashlib.sha256("\n\n".join(content).encode()).hexdigest()
+    return modules
 
 
 _syntax = cache(cached_digest)
@@ -42,11 +54,15 @@ _syntax = cache(cached_digest)
 @cache
 def _content(path: Path) -> str:
     """The digest of a module; for a package also those of its pages and scripts."""
-    digest = _syntax(path).digest
+    pages = (f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in _pages(path))
+    return "\n".join([_syntax(path).digest, *pages])
+
+
+def _pages(path: Path) -> list[Path]:
+    """The pages and scripts beside the modules of a package, given its `__init__.py`."""
     if path.name != "__init__.py":
-        return digest
-    others = sorted(file for kind in PAGE_FILES for file in path.parent.glob(f"[!.]*{kind}"))
-    return "\n".join([digest, *(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in others)])
+        return []
+    return sorted(file for kind in PAGE_FILES for file in path.parent.glob(f"[!.]*{kind}"))
 
 
 @cache

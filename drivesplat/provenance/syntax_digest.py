@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import cache_from_source
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,8 @@ def cached_digest(file: Path) -> SyntaxDigest:
         known, digest, names = json.loads(cache.read_text(encoding="utf-8"))
         if known == key:
             return SyntaxDigest(digest, tuple(names))
+        # Python takes bytecode for that of any content of the same size and second.
+        Path(cache_from_source(str(file))).unlink(missing_ok=True)
     found = syntax_digest(content)
     with suppress(OSError):
         cache.parent.mkdir(exist_ok=True)

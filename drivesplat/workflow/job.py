@@ -29,6 +29,7 @@ from drivesplat.settings.track_references import TrackReferences
 from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow import IN_SCRIPT
 from drivesplat.workflow.gpus import hold_gpu
+from drivesplat.workflow.running_code import running_code
 
 S = TypeVar("S", bound=Settings)
 
@@ -146,9 +147,14 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
     log = logging.getLogger(__name__)
     log.info("%s begins", current.name)
     try:
+        code = running_code(snakemake)
+        if code:
+            code.check()
         if check_inputs:
             current.check_inputs(dataset)
         yield current
+        if code:
+            code.check_late_imports()
         current.record_outputs()
         log.info("%s ends", current.name)
     except DriveSplatError as error:
@@ -157,6 +163,8 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
     except Exception as error:
         if isinstance(error, OSError) and error.errno in REFUSED_BY_DISK:
             log.error("%s: %s", current.name, unwritable(error.filename or "a file", error))
+        elif isinstance(error, FileNotFoundError) and str(error.filename) in {*current.input, *current.output}:
+            log.error("%s: %s was removed while the job ran; start again", current.name, error.filename)
         else:
             log.info("%s ends with this:", current.name, exc_info=True)
             message = "%s: %s: %s (a bug; the traceback is in %s)"

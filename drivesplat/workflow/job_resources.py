@@ -17,8 +17,8 @@ MAX_MASK_THREADS = 8
 class JobResources(Outputs):
     """The devices and threads of a validated config's jobs; arguments as in `Outputs`."""
 
-    def __init__(self, config: Config, scripts: Path, prefix: str = ""):
-        super().__init__(config, scripts, prefix)
+    def __init__(self, config: Config, scripts: Path, prefix: str = "", is_main: bool = True):
+        super().__init__(config, scripts, prefix, is_main)
         self._devices: dict[str, tuple[str, int]] = {}
 
     def device(self, wildcards: Any) -> str:

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from drivesplat.errors import ConfigError
+from drivesplat.io.storage import canonical_json, sha256_text
 from drivesplat.provenance.code_digest import code_digest
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
@@ -12,6 +14,7 @@ from drivesplat.settings.tracks import TRACK_FOLDERS
 from drivesplat.workflow.film_names import EDITS, TRAJECTORIES
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.named_tracks import fitting_edits
+from drivesplat.workflow.running_code import planned_digest
 from drivesplat.workflow.stages import (
     OF_ONE_SCENE,
     SCAN_BASELINES,
@@ -47,18 +50,26 @@ COMPARE_FILM = "compare.mp4"
 
 
 class Outputs(Inputs):
-    """The results of a validated config; `scripts` is the folder of the rules' scripts, `prefix` as in `Inputs`."""
+    """The results of a validated config; `scripts` is the folder of the rules' scripts, `prefix` as in `Inputs`, and
+    `is_main` tells whether this process plans the run, not a job of it.
 
-    def __init__(self, config: Config, scripts: Path, prefix: str = ""):
+    Raises ConfigError where a job's process reads other settings than the run was planned with.
+    """
+
+    def __init__(self, config: Config, scripts: Path, prefix: str = "", is_main: bool = True):
         super().__init__(config, prefix)
-        self._scripts = scripts
+        self._scripts, self._is_main = scripts, is_main
+        settings = sha256_text(canonical_json(config.model_dump(mode="json")))
+        if planned_digest(f"{scripts} {prefix}", lambda: settings, is_main) != settings:
+            raise ConfigError("the settings changed since the run was planned; start again")
         self._codes: dict[str, str] = {}
         self._settings: dict[tuple[str | None, ...], str] = {}
 
     def code(self, stage: str) -> str:
-        """The digest of all code a stage runs."""
+        """The digest of all code a stage runs, as the run was planned."""
         if stage not in self._codes:
-            self._codes[stage] = code_digest(self._scripts / f"{stage}.py")
+            script = self._scripts / f"{stage}.py"
+            self._codes[stage] = planned_digest(str(script), lambda: code_digest(script), self._is_main)
         return self._codes[stage]
 
     def stage_settings(self, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:

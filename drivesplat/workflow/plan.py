@@ -42,11 +42,11 @@ def let_scripts_import(folder: str) -> None:
 
 
 class Plan(JobResources):
-    """The interface of the rules to the validated config; `basedir` is the Snakefile's folder, and `prefix` is that of
-    a module of another workflow."""
+    """The interface of the rules to the validated config; `basedir` is the Snakefile's folder, `prefix` is that of a
+    module of another workflow, and `is_main` tells whether this process plans the run."""
 
-    def __init__(self, values: Mapping[str, Any], basedir: str, prefix: str = ""):
-        super().__init__(load(values), Path(basedir) / SCRIPTS, prefix)
+    def __init__(self, values: Mapping[str, Any], basedir: str, prefix: str = "", is_main: bool = True):
+        super().__init__(load(values), Path(basedir) / SCRIPTS, prefix, is_main)
         self.targets: list[str] | None = None
         """The targets of the run; None where they are not known."""
         self._held_lock: Any = None

@@ -128,12 +128,16 @@ class WorkflowCopy:
             timeout=timeout,
         )
 
-    def planned(self, *targets: str) -> dict[str, int]:
-        """How many jobs of each rule `snakemake -n` plans; raises where planning fails."""
+    def dry_run(self, *targets: str) -> str:
+        """What `snakemake -n` prints; raises where planning fails."""
         done = self.run(*targets, flags=("-n",))
         if done.returncode:
             raise AssertionError(done.stdout)
-        table = done.stdout.rpartition("Job stats:")[2].partition("total")[0]
+        return done.stdout
+
+    def planned(self, *targets: str) -> dict[str, int]:
+        """How many jobs of each rule `snakemake -n` plans; raises where planning fails."""
+        table = self.dry_run(*targets).rpartition("Job stats:")[2].partition("total")[0]
         return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", table, re.M) if name != "all"}
 
     def read(self, path: str) -> Any:

@@ -98,7 +98,7 @@ def toy(tmp_path, monkeypatch) -> Path:
 
 def forget() -> None:
     """As a new process would: it reads every file anew."""
-    for cached in (module._syntax, module._content, module._imports, module._file_of):
+    for cached in (module._syntax, module._content, module._imports, module._file_of, module._modules):
         cached.cache_clear()
 
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.workflow.job import Job
+from drivesplat.workflow.job import Job, job
 
 AS_A_SCRIPT = """
 snakemake = None
@@ -80,3 +80,28 @@ def test_only_results_of_the_scene_are_expected_to_have_a_digest(tmp_path, caplo
     told.input, told.output = [str(own), str(result)], [str(output)]
     Job(told).check_inputs()
     assert [record.args[0] for record in caplog.records] == ([result] if wildcards else [])
+
+
+@pytest.mark.parametrize("when", ["as its script starts", "while it reads", "before its digest is recorded"])
+def test_a_file_that_is_removed_while_a_job_runs_is_named_in_one_sentence(when, tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("drivesplat.workflow.job._log_into", lambda path: None)
+    read, made = tmp_path / "seed.ply", tmp_path / "parser.pkl"
+    told = SimpleNamespace(wildcards=SimpleNamespace(), threads=1, rule="parser", params={}, resources={})
+    told.input, told.output, told.log = [str(read)], [str(made)], [str(tmp_path / "it.log")]
+    if when != "as its script starts":
+        read.write_text("points")
+    with pytest.raises(SystemExit), job(told):
+        if when == "while it reads":
+            read.unlink()
+            read.read_text()
+    gone = made if when == "before its digest is recorded" else read
+    assert caplog.messages[-1] == f"parser: {gone} was removed while the job ran; start again"
+
+
+def test_a_missing_file_that_no_rule_makes_stays_a_bug(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("drivesplat.workflow.job._log_into", lambda path: None)
+    told = SimpleNamespace(wildcards=SimpleNamespace(), threads=1, rule="parser", params={}, resources={})
+    told.input, told.output, told.log = [], [], [str(tmp_path / "it.log")]
+    with pytest.raises(SystemExit), job(told):
+        (tmp_path / "nowhere").read_text()
+    assert "FileNotFoundError" in caplog.messages[-1] and "(a bug; " in caplog.messages[-1]

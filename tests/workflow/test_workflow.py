@@ -339,6 +339,14 @@ def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, set
     assert WorkflowWithConfig(finished, changed).planned() == {rule: n for rule, n in expected.items() if n}
 
 
+def test_the_reason_of_a_rerun_is_the_changed_setting(finished):
+    changed = {**finished.config, "train": {**finished.config["train"], "iterations": 61}}
+    printed = WorkflowWithConfig(finished, changed).dry_run("metrics")
+    trained = [line.strip() for line in printed.splitlines() if "iterations" in line]
+    assert sorted(trained) == [f"reason: train {method}: train.iterations 60 -> 61" for method in ("street", "vanilla")]
+    assert max(map(len, printed.splitlines())) < 2000
+
+
 def test_the_page_has_the_edits_of_a_method_with_actors_the_images_and_the_other_method(finished):
     for method, edits in (("street", ["gone", "stop"]), ("vanilla", [])):
         page = (finished.folder / f"results/0001/{method}/viewer.html").read_text(encoding="utf-8")
@@ -564,9 +572,9 @@ class WorkflowWithConfig(WorkflowCopy):
         super().__init__(other.folder, config)
         self._other = other
 
-    def planned(self, *targets: str) -> dict[str, int]:
+    def dry_run(self, *targets: str) -> str:
         self.write_config()
         try:
-            return super().planned(*targets)
+            return super().dry_run(*targets)
         finally:
             self._other.write_config()
