@@ -13,9 +13,9 @@ from typing import Any
 from snakemake.path_modifier import PathModifier
 
 from drivesplat.errors import ConfigError, DriveSplatError
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings.config import load
 from drivesplat.settings.method import merged
-from drivesplat.settings.yaml_file import read_yaml
 from drivesplat.workflow.plan import Plan
 
 
