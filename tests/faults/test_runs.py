@@ -72,7 +72,7 @@ def test_an_unknown_scene_stops_before_any_job_and_lists_those_there_are(copy):
 def test_an_unquoted_scene_number_is_refused_with_advice_to_quote_it(copy):
     copy.write_config("datasets: {nuscenes: {dataroot: data, scenes: [0061]}}\n")
     line = only_complaint(copy.run())
-    assert "quotes" in line and '"0061"' in line
+    assert "a number to YAML (which reads 0061 as octal 49): write it in quotes" in line
     assert not (copy.folder / "results").exists()
 
 
