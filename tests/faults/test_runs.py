@@ -141,7 +141,7 @@ GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
         (GONE.format("0009"), None, "edits/gone.mp4",
          ["edit 'gone', step 1 (remove): no track has an id starting with '0009'"], False),
         (GONE.format("0001 instance 1"), None, "edits/gone.mp4",
-         ["edit 'gone'", "no editable track", "editable tracks: 0001"], True),
+         ["edit 'gone'", "no editable track", "editable tracks: 0001", "people need presets/people.yaml"], True),
         (EDITS, "0001", "removal.png", ["subjects.0001", "no track '0001'", "that move: 0001 instance 0"], False),
     ],
     ids=["an edit of no track", "an edit of a parked car", "a subject"],
