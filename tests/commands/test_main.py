@@ -88,12 +88,12 @@ def ended(command: list[str], **streams) -> tuple[int, str]:
     environment |= {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
         [sys.executable, *command],
-        cwd=folder,
+        cwd=REPOSITORY,
         env=environment,
         stderr=subprocess.PIPE,
         text=True,
         check=False,
-        **options,
+        **streams,
     )
     return done.returncode, done.stderr
 
