@@ -38,7 +38,7 @@ def take_prefix(workflow: Any) -> str:
 
 
 def module_config(config: Any, defaults: str | Path, prefix: str) -> dict[str, Any]:
-    """The settings of a module: its `config`, whatever the module statement gives, laid over the workflow's own config.yaml, `defaults`, with the `prefix`
+    """The settings of a module: its `config` laid over the workflow's own config.yaml, `defaults`, with the `prefix`
     before the relative paths of what the workflow makes. Raises ConfigError where a setting is invalid."""
     if not isinstance(config, Mapping):
         raise ConfigError(f"the config of the module statement is {quoted(config)}; it must be a mapping of settings")
