@@ -8,11 +8,11 @@ from typing import Any, TypeVar
 from pydantic import Field, field_validator
 
 from drivesplat.errors import ConfigError
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings import Settings, validated
 from drivesplat.settings.config import DATASET_OVERRIDES, require_known
 from drivesplat.settings.method import Seeds
 from drivesplat.settings.names import require_text
-from drivesplat.settings.yaml_file import read_yaml
 
 SHARED_SETTINGS = (*DATASET_OVERRIDES, "datasets", "methods", "subjects", "lpips", "random_seed")
 """The sections of config.yaml that `config` of a benchmark file may set."""

@@ -16,9 +16,9 @@ from snakemake.cli import get_argument_parser
 from benchmarks.files import BenchmarkFile, error_prefix
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import atomic_write
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings.config import DATASET_OVERRIDES, load
 from drivesplat.settings.method import MethodSettings, merged, with_seed, with_seeds
-from drivesplat.settings.yaml_file import read_yaml
 from drivesplat.workflow.plan import Plan
 
 CONFIG_FILE = "config.yaml"

@@ -143,7 +143,19 @@ if [ "${1:-}" = --check ]; then
   exit "$problems"
 fi
 
-if [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(stamp_for "$build")" ]; then
+is_made() { [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(stamp_for "$build")" ]; }
+
+# The kernel frees the lock when this process and pip end, however they end. Goes without one where there is no flock.
+hold_lock() {
+  local status=0
+  command -v flock >/dev/null 2>&1 || return 0
+  exec 9< scripts/setup.sh
+  flock --nonblock --conflict-exit-code 75 9 2>/dev/null || status=$?
+  [ "$status" != 75 ] || fail "another make setup is at work in $(pwd); wait until it ends"
+}
+
+is_made || hold_lock
+if is_made; then
   quiet=--if-needed
 else
   quiet=

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from drivesplat import WORKFLOW
 from drivesplat.errors import DriveSplatError
+from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import in_this_copy
 
 RUN = "run"
@@ -22,15 +23,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command of the command line. Returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
+        _require_folder()
         if given[:1] == [RUN]:  # all the rest is Snakemake's
             from drivesplat.commands.snakemake_run import run_workflow
 
             return run_workflow(given[1:])
         parsed = _parser().parse_args(given)
-        return parsed.command(parsed)
+        with standard_output():
+            return parsed.command(parsed)
+        return 0  # nobody reads the rest
     except DriveSplatError as error:
         print(f"drivesplat: {in_this_copy(str(error))}", file=sys.stderr)
         return 1
+
+
+def _require_folder() -> None:
+    """Raises DriveSplatError where the current folder has been removed."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise DriveSplatError("the current folder has been removed; change to another one") from None
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.this_copy import default_config
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings.config import load
-from drivesplat.settings.yaml_file import read_yaml
 
 PAGE, OF_MOVING_OBJECTS = "viewer.html", "parts.mp4"
 

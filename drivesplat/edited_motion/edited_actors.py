@@ -11,6 +11,7 @@ from drivesplat.edited_motion.recolouring import color_matrix
 from drivesplat.edited_motion.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
+from drivesplat.scene.track_references import why_fixed
 from drivesplat.scene.tracks import short_ids
 from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 
@@ -86,27 +87,30 @@ class _StepError(Exception):
 
 @dataclass(frozen=True)
 class _EditState:
-    """The actors after some steps by id; per removed id the number of the step that removed it; ids of other tracks;
-    the ego poses (n, 4, 4)."""
+    """The actors after some steps by id; the removed ones by id, with the number of the step that removed them; ids of
+    other tracks; the ego poses (n, 4, 4)."""
 
     actors: dict[str, EditedActor]
-    removed: dict[str, int]
+    removed: dict[str, tuple[int, EditedActor]]
     other_ids: frozenset[str]
     ego_to_world: np.ndarray
 
-    def find(self, name: str) -> EditedActor:
-        """The actor with that id, or the only one whose id starts with it."""
+    def find(self, name: str, also_removed: bool = False) -> EditedActor:
+        """The actor with that id, or the only one whose id starts with it; perhaps `also_removed` ones."""
         known = [*self.actors, *self.removed]
         found = [name] if name in known else [other for other in known if other.startswith(name)]
         short = short_ids(known)
         remaining = ", ".join(short[other] for other in self.actors) or "none"
         if not found:
-            raise _StepError(f"no editable track has an id starting with {name!r}; editable tracks: {remaining}")
+            fixed = why_fixed(name, self.other_ids)
+            raise _StepError(f"no editable track has an id starting with {name!r}; editable tracks: {remaining}{fixed}")
         if len(found) > 1:
             matches = ", ".join(short[other] for other in found)
             raise _StepError(f"{len(found)} tracks have ids starting with {name!r}: {matches}; give more characters")
         if found[0] in self.removed:
-            number = self.removed[found[0]]
+            number, actor = self.removed[found[0]]
+            if also_removed:
+                return actor
             raise _StepError(f"track {short[found[0]]} was removed by step {number}; remaining tracks: {remaining}")
         return self.actors[found[0]]
 
@@ -117,14 +121,14 @@ class _EditState:
     def without(self, actor: EditedActor, number: int) -> "_EditState":
         """The state after step `number` has removed an actor."""
         remaining = {name: other for name, other in self.actors.items() if name != actor.id}
-        return replace(self, actors=remaining, removed=self.removed | {actor.id: number})
+        return replace(self, actors=remaining, removed=self.removed | {actor.id: (number, actor)})
 
 
 def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
     change = step.change
     if step.kind == "ego":
         return state
-    actor = state.find(change.track)
+    actor = state.find(change.track, also_removed=step.kind == "place")
     match change:
         case Swap():
             return _swapped(state, actor, change)

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from drivesplat.io.point_cloud import read_ply_data
 from drivesplat.io.storage import atomic_write, canonical_json, unreadable
 from drivesplat.model.gaussians import Gaussians
 
@@ -57,7 +58,7 @@ def read_splat_ply(path: str | Path) -> Gaussians:
     Raises ResultError naming the file if it is truncated, lacks a property, or contains NaN or Inf.
     """
     try:
-        vertices = PlyData.read(str(path))["vertex"]
+        vertices = read_ply_data(path)["vertex"]
         coefficients = _coefficients([p.name for p in vertices.properties])
         names = _property_names(coefficients)
         columns = {name: np.asarray(vertices[name], dtype=np.float32) for name in names if name[0] != "n"}

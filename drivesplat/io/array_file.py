@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
+from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import atomic_write, unreadable
 from drivesplat.io.typed_record import field_values, typed_record
 
@@ -74,7 +75,7 @@ def read_arrays(
     content is covered by a checksum, and no array is larger than the file.
     """
     try:
-        with open(path, "rb") as file:
+        with open(regular_file(path), "rb") as file:
             arrays = _members(file)
         content = _unpacked(json.loads(arrays.pop(CONTENT).tobytes()), arrays, from_array)
         if arrays:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import atomic_write, unreadable
 
 MAX_DEPTH = 64
@@ -50,9 +51,9 @@ def write_plain_pickle(path: str | Path, value: Any) -> None:
 def read_plain_pickle(path: str | Path, rule: str) -> Any:
     """Reads what `write_plain_pickle` wrote, by numpy 1 or 2. Raises ResultError naming `path` and `rule`."""
     try:
-        return loads(Path(path).read_bytes())
+        return loads(regular_file(path).read_bytes())
     except OSError as error:
-        raise unreadable(path, rule, f"cannot be read ({error.strerror})") from error
+        raise unreadable(path, rule, f"cannot be read ({error.strerror or error})") from error
     except Exception as error:  # a forged program fails in many ways: every one means "not our file"
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise unreadable(path, rule, f"not a pickle of plain data and arrays ({reason})") from error

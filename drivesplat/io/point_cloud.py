@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import atomic_write, canonical_json, unreadable
 
 _NOTE = "drivesplat "
+MAX_HEADER_BYTES = 1_000_000
+"""plyfile reads a header byte by byte: a comment of 100 MB would take minutes."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ def write_vertices(path: str | Path, columns: Mapping[str, np.ndarray], note: Ma
 def read_ply(path: str | Path, rule: str) -> PointCloud:
     """Reads a file of `write_ply`. Raises ResultError naming the file and its `rule` where it is missing or invalid."""
     try:
-        data = PlyData.read(str(path))
+        data = read_ply_data(path)
         note = next(json.loads(c.removeprefix(_NOTE)) for c in data.comments if c.startswith(_NOTE))
         vertices = data["vertex"]
         return PointCloud(
@@ -50,12 +53,25 @@ def read_ply(path: str | Path, rule: str) -> PointCloud:
         raise unreadable(path, rule, f"not a seed of this workflow ({error or type(error).__name__})") from error
 
 
+def read_ply_data(path: str | Path) -> PlyData:
+    """The content of any PLY file. Raises OSError, PlyParseError or ValueError where the file is not one."""
+    with open(regular_file(path), "rb") as file:
+        header = file.read(MAX_HEADER_BYTES)
+    newline = b"\r\n" if header[3:5] == b"\r\n" else header[3:4]
+    if header.startswith(b"ply") and newline + b"end_header" + newline not in header:
+        raise ValueError(f"its header has no end_header within {MAX_HEADER_BYTES / 1e6:g} MB")
+    try:
+        return PlyData.read(str(path))
+    except (MemoryError, OverflowError) as error:
+        raise ValueError(f"its header announces more than can be read: {error}") from error
+
+
 def read_positions(path: str | Path) -> np.ndarray:
     """The vertex positions (n, 3) float64 of any PLY file.
 
     Raises OSError, PlyParseError, KeyError or ValueError where the file is not one.
     """
-    return _columns(PlyData.read(str(path))["vertex"], ("x", "y", "z"), "f8")
+    return _columns(read_ply_data(path)["vertex"], ("x", "y", "z"), "f8")
 
 
 def _columns(vertices: PlyElement, names: tuple[str, ...], dtype: str) -> np.ndarray:

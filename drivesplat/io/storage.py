@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from drivesplat.errors import ResultError
+from drivesplat.io.regular_file import regular_file
 
 ABANDONED_SECONDS = 3600.0
 
@@ -127,7 +128,7 @@ def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[s
 def read_json(path: str | Path, rule: str) -> Any:
     """The content of a JSON result. Raises ResultError naming `path` and `rule` where it is missing or invalid."""
     try:
-        with open(path, encoding="utf-8") as file:
+        with open(regular_file(path), encoding="utf-8") as file:
             return json.load(file)
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise unreadable(path, rule, f"not a readable JSON file ({error})") from error

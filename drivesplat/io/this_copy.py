@@ -1,6 +1,7 @@
 """What differs between a checkout and a copy that pip has installed: where the workflow's files are (config.yaml,
 presets, edits, profiles), and which commands there are."""
 
+import os
 import re
 from pathlib import Path
 
@@ -10,8 +11,8 @@ CONFIG = "config.yaml"
 
 
 def default_config(workdir: Path, basedir: Path = WORKFLOW) -> Path:
-    """The config file under all others: that of the working directory, or else the workflow's own."""
-    return workdir / CONFIG if (workdir / CONFIG).is_file() else basedir / CONFIG
+    """The config file under all others: that of the working directory, whatever it is, or else the workflow's own."""
+    return workdir / CONFIG if os.path.lexists(workdir / CONFIG) else basedir / CONFIG
 
 
 def of_the_workflow(path: str | Path) -> Path:

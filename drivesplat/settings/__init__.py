@@ -4,7 +4,8 @@ Fields are documented by attribute docstrings, so that a reworded comment does n
 `drivesplat.provenance.code_digest`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from datetime import date
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
@@ -12,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from drivesplat.errors import ConfigError
 
 S = TypeVar("S", bound="Settings")
+OVERRIDING = ("datasets", "methods", "ablation")
+"""Sections with entries that have `overrides`."""
 MAX_QUOTED = 80
 """Maximum number of characters of a value in a message."""
 
@@ -46,7 +49,7 @@ def validated(
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        sentences = (_sentence(item, document, ", ".join(keys)) for item in error.errors())
+        sentences = (_sentence(item, document, ", ".join(keys), model.model_fields) for item in error.errors())
         raise ConfigError(where + "; ".join(sentences)) from None
 
 
@@ -56,14 +59,38 @@ def quoted(value: Any) -> str:
     return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}…"
 
 
-def _sentence(item: Mapping[str, Any], document: str, keys: str) -> str:
-    """One error of pydantic as a sentence."""
+_YAML_KINDS = {bool: "true or false", int: "a number", float: "a number", date: "a date", type(None): "nothing"}
+"""What YAML makes of on and no, 0061 and 12:30:45, 1_0.5, 2024-05-01, and ~."""
+
+
+def not_text(value: Any, what: str, note: str = "") -> str:
+    """The message where YAML made another `value` of `what` should be text."""
+    kind = next((kind for known, kind in _YAML_KINDS.items() if isinstance(value, known)), None)
+    if kind is None:
+        return f"{what} must be text, not {quoted(value)}"
+    return f"{what} is {kind} to YAML{note}: write it in quotes, as it stands in the file"
+
+
+def _sentence(item: Mapping[str, Any], document: str, keys: str, sections: Collection[str]) -> str:
+    """One error of pydantic as a sentence; `sections` are the keys of the top level."""
     key, value = ".".join(map(str, item["loc"])), quoted(item["input"])
     message = item["msg"].removeprefix("Value error, ")
     if not key:
         return message
+    if item["type"] == "invalid_key" or item["loc"][-1] == "[key]":
+        above = ".".join(map(str, item["loc"][: -1 if item["type"] == "invalid_key" else -2]))
+        where = f"'{above}'" if above else "the top level"
+        return f"{where} has the key {value}: {not_text(item['input'], 'this key')}"
+    if item["type"] == "string_type":
+        return f"'{key}' is {value}: {not_text(item['input'], 'this text')}"
+    if item["type"] in ("list_type", "tuple_type"):
+        return f"'{key}' is {value}: it must be a list" + (f": [{value}]" if isinstance(item["input"], str) else "")
     if item["type"] == "extra_forbidden" and keys:
         return f"unknown key '{key}'; there are: {keys}"
+    if item["type"] == "extra_forbidden" and item["loc"][-1] in sections:
+        above = ".".join(map(str, item["loc"][:-1]))
+        alone = f", or under '{above}.overrides' for '{above}' alone" if item["loc"][0] in OVERRIDING else ""
+        return f"'{key}' does not belong there: '{item['loc'][-1]}' stands at the top level{alone}"
     if item["type"] == "extra_forbidden":
         return f"unknown key '{key}' (value {value}): check its spelling against {document}"
     if item["type"] == "missing":

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any
 
-from drivesplat.settings import quoted
+from drivesplat.settings import not_text, quoted
 from drivesplat.settings.tracks import OTHER_TRACKS
 
 NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]*"
@@ -18,12 +18,10 @@ RESULT_SUFFIXES = (".csv", ".html", ".json", ".mp4", ".npz", ".pkl", ".ply", ".p
 
 
 def require_text(scene: Any) -> None:
-    """Raises ValueError, with the correct spelling, for a scene number without quotes."""
+    """Raises ValueError for a scene's name that is no text, such as a number without quotes."""
     if not isinstance(scene, str):
-        octal = f'"{scene:04o}" or ' if isinstance(scene, int) else ""
-        raise ValueError(
-            f'scene numbers are strings: put {octal}"{scene:0>4}" in quotes, since bare YAML reads 0061 as octal 49'
-        )
+        octal = " (which reads 0061 as octal 49)" if type(scene) is int else ""
+        raise ValueError(not_text(scene, "the name of a scene", octal))
 
 
 def require_name(name: str, kind: str) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.this_copy import default_config
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings import quoted
-from drivesplat.settings.yaml_file import read_yaml
 
 SUFFIXES = (".yaml", ".yml", ".json")
 
@@ -29,7 +29,7 @@ def stop_at_bad_config_files(files: Iterable[str | Path] | None, workdir: str | 
 def check_config_files(files: Sequence[str]) -> None:
     """Raises ConfigError, with file and line, for the first of the `files` after `--configfile` that is none."""
     for number, file in enumerate(files):
-        if number and not (file.endswith(SUFFIXES) and Path(file).is_file()):
+        if number and not (file.endswith(SUFFIXES) and Path(file).is_file()) and not Path(file).is_fifo():
             before = " ".join(files[:number])
             raise ConfigError(
                 f"{file!r} is taken for a config file, since it follows --configfile: put -- before the targets, as in "

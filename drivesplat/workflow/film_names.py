@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from drivesplat.io.this_copy import of_the_workflow
 from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
-from drivesplat.settings.edits_file import read_edits
+from drivesplat.workflow.edits_file import read_edits
 
 EDITS, TRAJECTORIES = "edits", "trajectories"
 """Kinds of folders of drives and of scans, and the folders of a method in which they lie."""

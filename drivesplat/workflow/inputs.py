@@ -7,6 +7,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, Literal, get_args
 
 from drivesplat.errors import ConfigError, DriveSplatError
+from drivesplat.io.regular_file import regular_file
 from drivesplat.provenance.file_digests import record_output
 from drivesplat.readers.datasets import index, layout
 from drivesplat.readers.truth import TRUTH_FILE
@@ -217,10 +218,15 @@ class Inputs:
         return [str(Path(path).expanduser())] if path else []
 
     def refuse_special_points_file(self, scene: str) -> None:
-        """Raises ConfigError if the user's seed points are a folder, or a pipe that a job would wait for."""
+        """Raises ConfigError if the user's seed points are a folder, a circle of links, or a pipe that a job would wait
+        for. Snakemake names them where they are absent."""
         for path in self.points_file(SimpleNamespace(scene=scene)):
-            if Path(path).exists() and not Path(path).is_file():
-                raise ConfigError(f"lidar_seed.points_file {path} is no regular file; name a PLY file of points")
+            try:
+                regular_file(path)
+            except FileNotFoundError:
+                pass
+            except OSError as error:
+                raise ConfigError(f"lidar_seed.points_file {path}: {error}; name a PLY file of points") from None
 
     def of_images(self, name: str) -> Callable[[Any], list[str]]:
         """The function of wildcards that gives a scene's result `name`, which is made from images and depends on no

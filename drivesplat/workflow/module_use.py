@@ -13,9 +13,10 @@ from typing import Any
 from snakemake.path_modifier import PathModifier
 
 from drivesplat.errors import ConfigError, DriveSplatError
+from drivesplat.io.yaml_file import read_yaml
+from drivesplat.settings import quoted
 from drivesplat.settings.config import load
 from drivesplat.settings.method import merged
-from drivesplat.settings.yaml_file import read_yaml
 from drivesplat.workflow.plan import Plan
 
 
@@ -36,9 +37,11 @@ def take_prefix(workflow: Any) -> str:
     return str(Path(*prefixes)) if any(prefixes) else ""
 
 
-def module_config(config: Mapping[str, Any], defaults: str | Path, prefix: str) -> dict[str, Any]:
+def module_config(config: Any, defaults: str | Path, prefix: str) -> dict[str, Any]:
     """The settings of a module: its `config` laid over the workflow's own config.yaml, `defaults`, with the `prefix`
     before the relative paths of what the workflow makes. Raises ConfigError where a setting is invalid."""
+    if not isinstance(config, Mapping):
+        raise ConfigError(f"the config of the module statement is {quoted(config)}; it must be a mapping of settings")
     values = deepcopy(merged(read_yaml(defaults, "config file"), config))
     load(values)
     values["results_dir"] = str(Path(prefix, Path(values["results_dir"]).expanduser()))

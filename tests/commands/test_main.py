@@ -1,6 +1,8 @@
 """The console script: each command does what its help says, and faults are sentences."""
 
 import os
+import subprocess
+import sys
 import webbrowser
 from pathlib import Path
 
@@ -78,6 +80,56 @@ def test_demo_runs_everything_and_prints_the_figures(called, folder, monkeypatch
 def test_config_prints_the_defaults(capsys):
     assert main(["config"]) == 0
     assert yaml.safe_load(capsys.readouterr().out) == yaml.safe_load((REPOSITORY / "config.yaml").read_text())
+
+
+def ended(command: list[str], **streams) -> tuple[int, str]:
+    """The exit status of a command of Python in a process of its own, and what it says to standard error."""
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    environment |= {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=REPOSITORY,
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        **streams,
+    )
+    return done.returncode, done.stderr
+
+
+CONFIG = ["-c", "import sys; from drivesplat.commands.main import main; sys.exit(main(['config']))"]
+SCHEMA = ["-m", "drivesplat.readers.drive", "schema"]
+
+
+@pytest.mark.parametrize("command", [CONFIG, SCHEMA])
+def test_a_full_disk_behind_standard_output_is_named_and_a_closed_pipe_ends_quietly(command):
+    with open("/dev/full", "w") as full:
+        status, said = ended(command, stdout=full)
+    assert (status, said.count("\n")) == (1, 1)
+    assert said.startswith("drivesplat: standard output: cannot be written (No space left on device)")
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as pipe:
+        assert ended(command, stdout=pipe) == (0, "")
+
+
+def test_config_escapes_what_the_encoding_lacks(folder):
+    with open("mine.yaml", "wb") as file:
+        assert ended(CONFIG, stdout=file) == (0, "")
+    text = Path("mine.yaml").read_text(encoding="ascii")
+    assert "\\u2265" in text, "the sign of 'at least'"
+    assert yaml.safe_load(text) == yaml.safe_load((REPOSITORY / "config.yaml").read_text())
+
+
+def test_a_command_in_a_removed_folder_says_so(folder, monkeypatch, capsys):
+    (folder / "gone").mkdir()
+    monkeypatch.chdir(folder / "gone")
+    (folder / "gone").rmdir()
+    for command in ("open", "run", "demo"):
+        assert main([command]) == 1
+        said = capsys.readouterr().err
+        assert said == "drivesplat: the current folder has been removed; change to another one\n"
 
 
 @pytest.mark.parametrize("arguments", [["--version"], ["--help"]])

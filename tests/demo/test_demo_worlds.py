@@ -14,7 +14,7 @@ from drivesplat.demo.placed import require_free_places
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.world import make_world
 from drivesplat.readers.truth import read_truth
-from drivesplat.settings.edits_file import read_edits
+from drivesplat.workflow.edits_file import read_edits
 
 pytestmark = pytest.mark.slow
 

@@ -114,6 +114,16 @@ def test_invalid_steps_are_refused_with_their_number(steps, expected):
     assert refusal(*steps) == expected
 
 
+def test_a_person_that_the_method_does_not_have_is_answered_with_the_preset_that_has_people():
+    edit = Edit.model_validate({"steps": [{"remove": {"track": "walk"}}]})
+    with pytest.raises(ConfigError) as refused:
+        edited_actors([recorded(name) for name in IDS], edit, "here", {"parked", "walker"})
+    assert str(refused.value) == (
+        f"here, step 1 (remove): no editable track has an id starting with 'walk'; editable tracks: {EDITABLE}; "
+        "the method has no Gaussians of this track alone (people need presets/people.yaml)"
+    )
+
+
 def test_a_duplicate_cannot_have_the_id_of_a_track_that_is_no_actor():
     """Its labels would be ambiguous."""
     edit = Edit.model_validate({"steps": [{"duplicate": {"track": "91", "as": "parked"}}]})

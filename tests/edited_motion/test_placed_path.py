@@ -115,6 +115,20 @@ def test_a_placed_copy_is_present_from_its_first_point_to_its_last():
     assert standing.present(np.array([1.0, 5.0, 300.0])).all() and not standing.present(np.array([0.5])).any()
 
 
+def test_a_removed_track_can_be_placed_elsewhere_as_it_was_before():
+    """The order of "replace the car": remove, then place."""
+    bigger, removed = {"rescale": {"track": "6e", "factor": 2.0}}, {"remove": {"track": "6e"}}
+    replaced, as_before = edited(bigger, removed, PLACED), edited(bigger, PLACED, removed)
+    assert [(one.id, one.source, one.scale) for one in replaced] == [
+        ("7a11", "7a11", 1.0),
+        ("new", "6e5c", 2.0),
+    ]
+    times = np.array([1.0, 3.0])
+    np.testing.assert_array_equal(replaced[1].poses(times), as_before[1].poses(times))
+    with pytest.raises(ConfigError, match=r"step 3 \(shift\): track 6e5c was removed by step 1"):
+        edited(removed, PLACED, {"shift": {"track": "6e5c", "lateral": 1.0}})
+
+
 def test_later_steps_change_a_placed_copy():
     shifted = edited(PLACED, {"shift": {"track": "new", "lateral": 1.0}}, {"rescale": {"track": "new", "factor": 2.0}})
     np.testing.assert_allclose(shifted[2].poses(np.array([3.0]))[0, :3, 3], [120.0, 54.5, 2.0 + 1.5], atol=0.02)

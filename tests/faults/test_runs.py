@@ -72,7 +72,7 @@ def test_an_unknown_scene_stops_before_any_job_and_lists_those_there_are(copy):
 def test_an_unquoted_scene_number_is_refused_with_advice_to_quote_it(copy):
     copy.write_config("datasets: {nuscenes: {dataroot: data, scenes: [0061]}}\n")
     line = only_complaint(copy.run())
-    assert "quotes" in line and '"0061"' in line
+    assert "a number to YAML (which reads 0061 as octal 49): write it in quotes" in line
     assert not (copy.folder / "results").exists()
 
 
@@ -141,7 +141,7 @@ GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
         (GONE.format("0009"), None, "edits/gone.mp4",
          ["edit 'gone', step 1 (remove): no track has an id starting with '0009'"], False),
         (GONE.format("0001 instance 1"), None, "edits/gone.mp4",
-         ["edit 'gone'", "no editable track", "editable tracks: 0001"], True),
+         ["edit 'gone'", "no editable track", "editable tracks: 0001", "people need presets/people.yaml"], True),
         (EDITS, "0001", "removal.png", ["subjects.0001", "no track '0001'", "that move: 0001 instance 0"], False),
     ],
     ids=["an edit of no track", "an edit of a parked car", "a subject"],

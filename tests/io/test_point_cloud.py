@@ -5,7 +5,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import ResultError
+from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.point_cloud import PointCloud, read_ply, read_positions, write_ply
+from drivesplat.readers.drive.sweep_file import file_fault
 
 
 def some_points(count: int = 5) -> PointCloud:
@@ -80,3 +82,44 @@ def test_a_foreign_point_cloud_is_not_a_seed_but_its_positions_can_be_read(tmp_p
     with pytest.raises(ResultError, match=r"foreign\.ply.*'lidar_seed'"):
         read_ply(tmp_path / "foreign.ply", rule="lidar_seed")
     np.testing.assert_array_equal(read_positions(tmp_path / "foreign.ply"), positions)
+
+
+VERTEX = b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+BAD_HEADERS = {
+    "endless": (b"ply\nformat ascii 1.0\ncomment " + b"x" * 3_000_000 + b"\n" + VERTEX, "no end_header within 1 MB"),
+    "its end in a comment": (
+        b"ply\nformat ascii 1.0\ncomment end_header\ncomment " + b"x" * 3_000_000 + b"\n" + VERTEX,
+        "no end_header within 1 MB",
+    ),
+    "too many vertices": (
+        b"ply\nformat ascii 1.0\n" + VERTEX.replace(b"1", b"9" * 15), "announces more than can be read",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_HEADERS)
+def test_a_header_without_bounds_is_refused_by_every_reader(tmp_path, monkeypatch, name):
+    """plyfile would read it byte by byte, or allocate what it announces."""
+    content, message = BAD_HEADERS[name]
+    path = tmp_path / "odd.ply"
+    path.write_bytes(content)
+    if "MB" in message:
+        monkeypatch.setattr(PlyData, "read", lambda _: pytest.fail("plyfile reads it"))
+    with pytest.raises(ValueError, match=message):
+        read_positions(path)
+    with pytest.raises(ResultError, match=message):
+        read_ply(path, rule="lidar_seed")
+    with pytest.raises(ResultError, match=message):
+        read_splat_ply(path)
+    assert message in str(file_fault(path))
+
+
+def test_a_long_comment_within_the_bound_is_read(tmp_path):
+    (tmp_path / "long.ply").write_bytes(
+        b"ply\r\nformat ascii 1.0\r\ncomment "
+        + b"x" * 200_000
+        + b"\r\n"
+        + VERTEX.replace(b"\n", b"\r\n")
+        + b"1 2 3\r\n"
+    )
+    np.testing.assert_array_equal(read_positions(tmp_path / "long.ply"), [[1, 2, 3]])

@@ -12,7 +12,7 @@ from helpers import REPOSITORY
 
 from drivesplat.machine.doctor.facts import REQUIREMENTS
 
-TOOLS = ("bash", "cat", "cut", "sha256sum", "rm", "grep", "awk", "dirname", "du", "df", "mkdir", "cp", "env")
+TOOLS = ("bash", "cat", "cut", "sha256sum", "rm", "grep", "awk", "dirname", "du", "df", "mkdir", "cp", "env", "flock")
 
 PYTHON = """#!/usr/bin/env bash
 case "$*" in
@@ -157,6 +157,23 @@ def test_the_stamp_goes_first_where_a_venv_is_remade(machine):
     (machine.checkout / "requirements.txt").write_text("torch\n")
     assert machine.run().returncode != 0
     assert (machine.checkout / ".venv/bin/python").exists() and not machine.stamp.exists()
+
+
+def test_a_second_setup_in_the_same_checkout_is_refused_and_leaves_the_first_one_alone(machine):
+    """pip of the first one runs the second one, and a third when the second has ended."""
+    again = 'for run in 2 3; do "$FAKE_BIN/bash" scripts/setup.sh; echo "$run: $?" >&2; done'
+    inner = f'  "-m pip install"*) {again} ;;\n'
+    case = '  "-m pip check") ;;\n'
+    machine.program("python3.11", PYTHON.replace(case, inner + case))
+    done = machine.run()
+    refused = f"setup: another make setup is at work in {machine.checkout}; wait until it ends"
+    said = [line for line in done.stderr.splitlines() if "another" in line or line[1:] == ": 1"]
+    assert said == [refused, "2: 1", refused, "3: 1"] * 2, done.stderr
+    assert done.returncode == 0 and machine.stamp.exists()
+    machine.program("python3.11", PYTHON)
+    (machine.bin / "flock").unlink()
+    (machine.checkout / "requirements.txt").write_text("torch\n")
+    assert machine.run().returncode == 0, "without flock there is no lock"
 
 
 def test_pip_that_fails_points_to_proxies(machine):

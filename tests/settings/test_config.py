@@ -165,14 +165,50 @@ def test_several_faults_are_all_named():
 
 
 @pytest.mark.parametrize(
-    ("text", "suggestion"),
-    [("[0061]", '"0061"'), ("[103]", '"0103"'), ("[0103]", '"0103"'), ('["0061", 1100]', '"1100"')],
-)
-def test_scene_numbers_without_quotes_are_refused_with_advice_to_quote_them(text, suggestion):
-    """Bare YAML reads 0061 as octal, 49."""
-    message = refusal({"datasets": {"nuscenes": {"scenes": yaml.safe_load(text)}}})
-    assert "datasets.nuscenes.scenes" in message and "quotes" in message
-    assert suggestion in message and "\n" not in message
+    ("text", "kind"),
+    [
+        ("0061", "a number to YAML (which reads 0061 as octal 49)"), ("103", "a number"), ("2011_09_26", "a number"),
+        ("12:30:45", "a number"), ("1_0.5", "a number"), ("2024-05-01", "a date"), ("2024-05-01 10:00:00", "a date"),
+        ("on", "true or false"), ("~", "nothing"),
+    ],
+)  # fmt: skip
+def test_scene_numbers_without_quotes_are_refused_with_advice_to_quote_them(text, kind):
+    """Also what else YAML reads as something else than text; no name is guessed."""
+    read = yaml.safe_load(f"['0103', {text}]")
+    message = refusal({"datasets": {"nuscenes": {"scenes": read}}})
+    advice = f"the name of a scene is {kind}", ": write it in quotes, as it stands in the file"
+    assert message.startswith("'datasets.nuscenes.scenes' is ['0103', ") and all(words in message for words in advice)
+    keys = refusal({"datasets": yaml.safe_load(f"{{{text}: {{}}}}")})
+    kind = kind.partition(" to YAML")[0]
+    assert keys == f"'datasets' has the key {read[1]!r}: this key is {kind} to YAML{advice[1]}"
+
+
+IN_QUOTES = "write it in quotes, as it stands in the file"
+
+
+@pytest.mark.parametrize("scene", [{"a": 1}, ["0061"]])
+def test_a_scene_that_is_no_name_is_refused(scene):
+    message = refusal({"datasets": {"mine": {"scenes": [scene]}}})
+    assert message == f"'datasets.mine.scenes' is [{scene!r}]: the name of a scene must be text, not {scene!r}"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cameras: front", "'cameras' is 'front': it must be a list: ['front']"),
+        ("cameras: ~", "'cameras' is None: it must be a list"),
+        ("cameras: [12]", f"'cameras.0' is 12: this text is a number to YAML: {IN_QUOTES}"),
+        ("train: {1: 2}", f"'train' has the key 1: this key is a number to YAML: {IN_QUOTES}"),
+        (
+            "methods: {street: {train: {ssim_weight: 0.3}}}",
+            "'methods.street.train' does not belong there: 'train' stands at the top level, or under "
+            "'methods.street.overrides' for 'methods.street' alone",
+        ),
+        ("train: {images: {width: 400}}", "'train.images' does not belong there: 'images' stands at the top level"),
+    ],
+)  # fmt: skip
+def test_yaml_that_means_something_else_is_answered_with_what_was_meant(text, message):
+    assert refusal(yaml.safe_load(text)) == message
 
 
 def test_an_unknown_scene_is_refused_with_those_there_are():

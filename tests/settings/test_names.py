@@ -6,7 +6,7 @@ import pytest
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, load
-from drivesplat.settings.edits_file import read_edits
+from drivesplat.workflow.edits_file import read_edits
 
 
 def refusal(**values) -> str:

@@ -41,7 +41,7 @@ def test_groups_and_regions_are_those_of_metrics_json():
             r"'published\.0\.url' is 'VAD-GS': it must be the address of a page, as https://",
         ),
         ([{**ENTRY, "url": "javascript:alert(1)"}], "must be the address of a page"),
-        ([{**ENTRY, "scene": 61}], r"'published\.0\.scene' is 61: scene numbers are strings"),
+        ([{**ENTRY, "scene": 61}], r"'published\.0\.scene' is 61: the name of a scene is a number to YAML"),
         ([{**ENTRY, "psnr": "22,77"}], r"'published\.0\.psnr' is '22,77': input should be a number"),
         ([{**ENTRY, "ssim": 65}], r"'published\.0\.ssim' is 65: input should be less than or equal to 1"),
         ([{**ENTRY, "train_minutes": 0}], r"'published\.0\.train_minutes' is 0: input should be greater than 0"),

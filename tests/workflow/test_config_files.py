@@ -1,6 +1,7 @@
 """Config files are checked before Snakemake reads them: broken ones are named with the line, targets are not taken for
 config files."""
 
+import os
 import re
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from drivesplat.errors import ConfigError
 from drivesplat.workflow.config_files import check_config_files, default_config, read_config
+from drivesplat.workflow.edits_file import read_edits
 
 
 @pytest.mark.parametrize(
@@ -60,3 +62,42 @@ def test_the_working_directory_has_its_own_config_or_takes_the_workflows(tmp_pat
     assert default_config(elsewhere, workflow) == workflow / "config.yaml"
     (elsewhere / "config.yaml").touch()
     assert default_config(elsewhere, workflow) == elsewhere / "config.yaml"
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_config_file_that_is_a_pipe_is_refused_before_it_is_read(tmp_path, place):
+    """As of `--configfile <(cat mine.yaml)`: Snakemake would wait for ever for what the first reader has taken."""
+    files = [str(tmp_path / "a.yaml"), str(tmp_path / "b.yaml")]
+    Path(files[1 - place]).write_text("sky: none\n")
+    Path(files[place]).unlink(missing_ok=True)
+    os.mkfifo(files[place])
+    message = rf"{files[place]}: the config file cannot be read \(it is a pipe, not a regular file\)"
+    with pytest.raises(ConfigError, match=message):
+        check_config_files(files)
+    with pytest.raises(ConfigError, match=r"edits file cannot be read \(it is a pipe"):
+        read_edits(files[place])
+
+
+def test_an_endless_or_huge_config_file_is_refused_before_it_is_read(tmp_path):
+    (tmp_path / "config.yaml").symlink_to("/dev/zero")
+    with pytest.raises(ConfigError, match="it is a device, not a regular file"):
+        read_config(default_config(tmp_path))
+    (tmp_path / "huge.yaml").touch()
+    os.truncate(tmp_path / "huge.yaml", 10**12)
+    with pytest.raises(ConfigError, match="it has 1000000 MB, more than 2 MB"):
+        read_config(tmp_path / "huge.yaml")
+
+
+@pytest.mark.parametrize("value", ["2024-13-45", "0x_", "!!timestamp x", "!!bool x", "!!float x", "9" * 5000])
+def test_a_value_that_yaml_cannot_read_is_named_with_its_line(tmp_path, value):
+    (tmp_path / "mine.yaml").write_text(f"sky: none\nresults_dir: {value}\n")
+    with pytest.raises(
+        ConfigError, match=r"mine\.yaml, line 2: not YAML: .* cannot be read as \w+ \(.*\); quote text$"
+    ):
+        read_config(tmp_path / "mine.yaml")
+
+
+def test_a_config_file_that_is_nested_too_deeply_is_refused(tmp_path):
+    (tmp_path / "mine.yaml").write_text("a: " + "[" * 20_000 + "]" * 20_000)
+    with pytest.raises(ConfigError, match=r"mine\.yaml: the config file is nested too deeply"):
+        read_config(tmp_path / "mine.yaml")

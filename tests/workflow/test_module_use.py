@@ -87,6 +87,13 @@ def test_a_wrong_config_of_a_module_is_refused(given):
         module_config(given, DEFAULTS, "made")
 
 
+@pytest.mark.parametrize("given", [[1], "mine.yaml", 3, None])
+def test_a_config_of_a_module_that_is_no_mapping_is_refused(given):
+    with pytest.raises(ConfigError) as refused:
+        module_config(given, DEFAULTS, "made")
+    assert str(refused.value) == f"the config of the module statement is {given!r}; it must be a mapping of settings"
+
+
 def test_absent_data_ends_the_process_with_one_line():
     def absent(_: Any) -> str:
         raise DatasetError("there is no folder nowhere")

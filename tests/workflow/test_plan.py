@@ -473,14 +473,20 @@ def test_a_camera_that_a_dataset_lacks_is_refused_with_those_there_are(tiny_root
         made.refuse_absent_data(["results/w/metrics.json"])
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
-def test_a_points_file_that_is_a_pipe_or_a_folder_is_refused(tiny_root, tmp_path, make):
-    """A job would wait for the pipe's other end."""
+@pytest.mark.parametrize(
+    ("make", "what"),
+    [
+        (os.mkfifo, "it is a pipe, not a regular file"), (os.mkdir, "it is a folder, not a regular file"),
+        (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
+    ],
+)  # fmt: skip
+def test_a_points_file_that_is_a_pipe_or_a_folder_is_refused(tiny_root, tmp_path, make, what):
+    """A job would wait for the pipe's other end, and Snakemake takes a circle of links for a file."""
     make(tmp_path / "points.ply")
     data = {"tiny": {"dataroot": str(tiny_root), "scenes": ["0001"]}}
     seed = {"points_file": str(tmp_path / "points.ply")}
     made = Plan({"datasets": data, "results_dir": str(tmp_path / "out"), "lidar_seed": seed}, str(REPOSITORY))
-    with pytest.raises(ConfigError, match=r"points_file .*/points\.ply is no regular file"):
+    with pytest.raises(ConfigError, match=rf"points_file .*/points\.ply: {what}; name a PLY file of points"):
         made.refuse_absent_data([f"{tmp_path}/out/0001/metrics.json"])
 
 

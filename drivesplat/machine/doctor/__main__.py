@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drivesplat import IS_CHECKOUT, WORKFLOW
+from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import in_this_copy
 
 
@@ -42,4 +43,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    status = 0
+    with standard_output():
+        status = main(sys.argv[1:])
+    sys.exit(status)

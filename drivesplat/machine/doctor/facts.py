@@ -13,6 +13,7 @@ from typing import Any
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.free_disk import free_bytes
 from drivesplat.io.storage import sha256_file
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.kernels import triton_support
 from drivesplat.machine.compute_capability import Capability
 from drivesplat.machine.doctor.torch_builds import Gpu, read_gpus
@@ -23,7 +24,6 @@ from drivesplat.provenance.record import package_version
 from drivesplat.readers.datasets import layout
 from drivesplat.settings.config import Config, load, merged
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
-from drivesplat.settings.yaml_file import read_yaml
 
 STAMP = ".venv/.made-from"
 REQUIREMENTS = ("requirements.txt", "requirements-dev.txt", "constraints.txt")

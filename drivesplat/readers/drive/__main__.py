@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
+from drivesplat.io.standard_output import standard_output
 from drivesplat.readers.drive.check import check, summary, whole_scene
 from drivesplat.readers.drive.format import Drive, grouped, read_drive
 from drivesplat.readers.drive.nerfstudio import add_command
@@ -33,7 +34,9 @@ def main(arguments: list[str] | None = None) -> int:
     add_command(commands)
     asked = parser.parse_args(arguments)
     try:
-        return asked.run(asked)
+        with standard_output():
+            return asked.run(asked)
+        return 0  # nobody reads the rest
     except DriveSplatError as error:
         print(f"drivesplat: {error}", file=sys.stderr)
         return 1

@@ -13,11 +13,14 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivesplat.errors import DatasetError
+from drivesplat.io.regular_file import regular_file
 from drivesplat.scene.object_class import ObjectClass
 
 FILE = "drive.json"
 MAX_ALIKE = 3
 """Maximum number of faults that are reported one by one if they differ in numbers only."""
+MICROSECONDS_FROM = 1e12
+"""A timestamp from here on is in microseconds: as seconds it would be 30,000 years after 1970."""
 
 Timestamp = Annotated[int, Field(ge=0, lt=2**62, strict=True)]
 Vector = tuple[float, float, float]
@@ -205,7 +208,7 @@ def grouped(faults: Iterable[str]) -> list[str]:
 def structure_of(path: Path) -> tuple[list[str], Drive | None]:
     """The faults of a drive.json's structure, a sentence each, and its content where there are none."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(regular_file(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         return [f"{path} is missing; docs/own_data.md says what a drive folder holds"], None
     except (OSError, UnicodeDecodeError) as error:
@@ -228,6 +231,8 @@ def _sentence(item: Any) -> str:
     value = repr(item["input"])
     shown = value if len(value) <= 80 else f"{value[:80]}…"
     if item["loc"][-1:] == ("timestamp",):
+        if isinstance(item["input"], float) and abs(item["input"]) >= MICROSECONDS_FROM:
+            return f"{key} is {shown}: timestamps are whole microseconds; write it without the point"
         return f"{key} is {shown}: timestamps are whole microseconds; from seconds: round(t * 1e6)"
     message = item["msg"].removeprefix("Value error, ")
     return f"{key or 'the file'} is {shown}: {message[:1].lower()}{message[1:]}"

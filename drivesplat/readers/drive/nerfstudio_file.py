@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from drivesplat.errors import DatasetError
+from drivesplat.io.regular_file import regular_file
 from drivesplat.readers.checks import MAX_TIMESTAMP, checked_path, checked_size, checked_transform, is_number
 from drivesplat.readers.record_names import is_printable, shown
 from drivesplat.scene.images import DECODING_ERRORS
@@ -61,7 +62,7 @@ class Shot:
 def content_of(path: Path) -> dict[str, Any]:
     """The content of a transforms.json with at least one frame. Raises DatasetError for anything else."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(regular_file(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is missing") from error
     except (OSError, ValueError, RecursionError) as error:

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
+from plyfile import PlyElementParseError, PlyHeaderParseError
 
+from drivesplat.io.point_cloud import read_ply_data
+from drivesplat.io.regular_file import regular_file
 from drivesplat.scene.sensors import LidarReturns
 
 AXES = ("x", "y", "z")
@@ -51,10 +53,10 @@ def file_fault(path: Path) -> str | None:
 def _columns(path: Path) -> Mapping[str, np.ndarray]:
     """The known columns of a file as flat arrays. Raises KeyError for one that lacks a coordinate."""
     if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as arrays:
+        with np.load(regular_file(path), allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in (*AXES, *OPTIONAL) if name in arrays.files}
     elif path.suffix == ".ply":
-        vertices = PlyData.read(str(path))["vertex"].data
+        vertices = read_ply_data(path)["vertex"].data
         found = {name: np.asarray(vertices[name]) for name in (*AXES, *OPTIONAL) if name in vertices.dtype.names}
     else:
         raise ValueError(f"{path.suffix or 'no suffix'}: sweeps are .npz or .ply")

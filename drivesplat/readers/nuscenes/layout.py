@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
+from drivesplat.io.regular_file import regular_file
 
 TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
@@ -56,7 +57,7 @@ def camera_names(root: Path, version: str) -> list[str]:
     """The names of the cameras that recorded a dataset. Raises DatasetError if the table of sensors is damaged."""
     table = root / version / "sensor.json"
     try:
-        rows = json.loads(table.read_text(encoding="utf-8"))
+        rows = json.loads(regular_file(table).read_text(encoding="utf-8"))
         return [str(row["channel"]) for row in rows if row["modality"] == "camera"]
     except (KeyError, OSError, RecursionError, TypeError, ValueError) as error:
         raise DatasetError(f"{table} cannot be read ({type(error).__name__}: {error}); unpack it again") from error

@@ -17,8 +17,8 @@ from drivesplat.io.storage import canonical_json
 from drivesplat.scene.motion import Motion
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit, Step
-from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.world import WorldSettings
+from drivesplat.workflow.edits_file import read_edits
 
 DEMO = REPOSITORY / "presets" / "edits" / "demo.yaml"
 EVERY_STEP = """
@@ -84,7 +84,7 @@ def test_an_edit_survives_its_travel_as_a_rules_parameter(tmp_path):
 
 
 def test_reading_edits_imports_nothing_heavy():
-    code = "import sys, drivesplat.settings.edits_file as _; print(' '.join(sys.modules))"
+    code = "import sys, drivesplat.workflow.edits_file as _; print(' '.join(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert not {"torch", "scipy", "matplotlib", "nuscenes"} & set(done.stdout.split())
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ConfigError
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings import quoted, validated
 from drivesplat.settings.edit import Edit, Step
 from drivesplat.settings.names import MAX_LENGTH, NAME
-from drivesplat.settings.yaml_file import read_yaml
 
 RESERVED = ("ego",)
 """Names that a duplicate cannot have: `ego` is the ego vehicle."""
