@@ -18,6 +18,8 @@ from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
 from drivesplat.scene.lens import lens_fault
 
+MAX_ELEVATION = 1.6
+"""Maximum elevation of a beam in radians; degrees are mostly beyond it."""
 UNITS = {"seconds": 1e6, "milliseconds": 1e3, "nanoseconds": 1e-3}
 """Units that are taken for microseconds by mistake, and the microseconds in one."""
 COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
@@ -79,6 +81,12 @@ def _camera_faults(drive: Drive) -> Iterator[str]:
 def _lidar_faults(drive: Drive) -> Iterator[str]:
     yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()), MAX_MOUNT)
     for name, lidar in drive.lidars.items():
+        steepest = max(map(abs, lidar.beam_elevations or ()), default=0.0)
+        if steepest > MAX_ELEVATION:
+            yield (
+                f"lidars.{name}: its beam_elevations reach {steepest:g}; they are radians above the sensor's "
+                "horizontal plane, at most 1.57"
+            )
         if not lidar.motion_compensated and not drive.ego_poses:
             yield f"lidars.{name}: motion_compensated is false, but there are no ego_poses for motion compensation"
 
