@@ -25,9 +25,9 @@ STEPS = 6
 """Iterations to find the time and azimuth at which a spinning sensor met a return."""
 MAX_RESIDUAL = 1e-4
 """Fraction of a revolution by which a return's time may differ from that of its azimuth."""
-MIN_COMPARED = 200
+MIN_COMPARED = 1000
 """Minimum number of returns that are compared with known beams."""
-MAX_BEYOND, MAX_MEDIAN_DEVIATION = 0.2, 0.4
+MAX_BEYOND, MAX_MEDIAN_DEVIATION = 0.2, 0.46
 """Of returns without rings: the maximum share that is more than half the spacing of beams from the nearest beam, and
 the maximum median of these distances in that unit. The median is 0.5 where returns lie anywhere."""
 MIN_SPACING = 1e-5
