@@ -119,7 +119,7 @@ class DriveFrame(DriveRecord):
 
 
 class DriveSweep(DriveRecord):
-    """A LiDAR sweep: .npz or .ply (docs/own_data.md)."""
+    """A LiDAR sweep: .npz, .ply or .pcd (docs/own_data.md)."""
 
     lidar: str
     timestamp: Timestamp
