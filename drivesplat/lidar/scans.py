@@ -25,6 +25,13 @@ STEPS = 6
 """Iterations to find the time and azimuth at which a spinning sensor met a return."""
 MAX_RESIDUAL = 1e-4
 """Fraction of a revolution by which a return's time may differ from that of its azimuth."""
+MIN_COMPARED = 1000
+"""Minimum number of returns that are compared with known beams."""
+MAX_BEYOND, MAX_MEDIAN_DEVIATION = 0.2, 0.46
+"""Of returns without rings: the maximum share that is more than half the spacing of beams from the nearest beam, and
+the maximum median of these distances in that unit. The median is 0.5 where returns lie anywhere."""
+MIN_SPACING = 1e-5
+"""Half of the spacing of beams in radians below which two are one."""
 NEAR_ENDS = 0.1
 """Fraction of a revolution before its end and after its beginning in which a return may belong to either."""
 
@@ -180,26 +187,62 @@ def _seen_in_turn(
 
 
 def _beams(returns: LidarReturns, lidar: Lidar, elevations: np.ndarray) -> tuple[Int[np.ndarray, " n"], np.ndarray]:
-    """The ring of each return, and the elevation (b,) of each ring."""
+    """The ring of each return, and the elevation (b,) of each ring: measured where the known ones are those of another
+    sensor."""
     known, rings = lidar.beam_elevations, returns.rings
     if rings is None:
         if known is None:
             raise DatasetError(
-                f"LiDAR {lidar.name}: its returns have no rings and its beam_elevations are unknown; give one of them"
+                f"LiDAR {lidar.name}: its returns have no rings and its beam_elevations are unknown, and methods that "
+                "render LiDAR need its rows and columns; give one of them. A LiDAR without beams, as many solid-state "
+                "ones, has neither: leave these methods and discovered tracks out (docs/lidar.md); all else works"
             )
-        order = np.argsort(known)
-        return order[np.searchsorted(0.5 * (known[order][1:] + known[order][:-1]), elevations)], known
+        nearest, deviations = _nearest(elevations, known)
+        if len(elevations) >= MIN_COMPARED:
+            beyond, median = float((deviations > 1.0).mean()), float(np.median(deviations))
+            if beyond > MAX_BEYOND or median > MAX_MEDIAN_DEVIATION:
+                raise DatasetError(
+                    f"LiDAR {lidar.name}: its returns do not lie on its beam_elevations: {100 * beyond:.0f} % are more "
+                    f"than half a beam away, and the median is {100 * median:.0f} % of half a beam (50 % where returns "
+                    "lie anywhere). Give the rings of returns or their true elevations; a LiDAR without beams has "
+                    "neither (docs/lidar.md)"
+                )
+        return nearest, known
     if known is not None and (not len(rings) or rings.max() < len(known)):
-        return rings, known
+        return rings, known if _are_of_rings(known, elevations, rings) else _medians(elevations, rings, len(known))
     if not len(rings):
         raise DatasetError(f"LiDAR {lidar.name}: a sweep without returns needs beam_elevations to tell its rays")
     return rings, _medians(elevations, rings)
 
 
-def _medians(elevations: np.ndarray, rings: np.ndarray) -> Float[np.ndarray, " b"]:
-    """The median elevation of each ring's returns; rings without returns lie between their neighbours."""
+def _nearest(elevations: np.ndarray, known: np.ndarray) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The nearest of the `known` beams (b,) to elevations (n,), and the distances (n,) in halves of the spacing of
+    beams on that side, which at the ends continues."""
+    order = np.argsort(known)
+    beams = known[order]
+    found = np.searchsorted(0.5 * (beams[1:] + beams[:-1]), elevations)
+    if len(beams) == 1:
+        return order[found], np.zeros(len(elevations))
+    gaps = np.diff(beams)
+    above = elevations > beams[found]
+    half = 0.5 * np.where(above, np.append(gaps, gaps[-1])[found], np.insert(gaps, 0, gaps[0])[found])
+    return order[found], np.abs(elevations - beams[found]) / np.maximum(half, MIN_SPACING)
+
+
+def _are_of_rings(known: np.ndarray, elevations: np.ndarray, rings: np.ndarray) -> bool:
+    """Whether most rings lie nearest to the elevations that are known for them; otherwise these are of another sensor,
+    or in another order."""
     present = np.unique(rings)
-    return np.interp(np.arange(present.max() + 1), present, [np.median(elevations[rings == ring]) for ring in present])
+    measured = _medians(elevations, rings)[present] if len(present) else np.zeros(0)
+    return not len(present) or float(np.mean(_nearest(measured, known)[0] == present)) >= 0.5
+
+
+def _medians(elevations: np.ndarray, rings: np.ndarray, count: int = 0) -> Float[np.ndarray, " b"]:
+    """The median elevation of each ring's returns, of at least `count` rings; those without returns lie between their
+    neighbours."""
+    present = np.unique(rings)
+    numbers = np.arange(max(count, present.max() + 1))
+    return np.interp(numbers, present, [np.median(elevations[rings == ring]) for ring in present])
 
 
 def _steps(lidar: Lidar, azimuths: np.ndarray, rings: np.ndarray) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from plyfile import PlyParseError
 from scipy.spatial import cKDTree
 
@@ -40,6 +40,10 @@ COVERAGE_CELL = 8
 """Edge length in pixels of the image cell that a seed point covers."""
 RAISED = 1.0
 """Minimum height in metres, above the ground under the ego vehicle, of a seed point that counts as upright."""
+MIN_SEEN = 0.05
+"""Minimum share of the points of a file that training images see, below which a warning names its likely causes."""
+MAX_AWAY = 1000.0
+"""Maximum median distance in metres of the points of a file from the nearest camera, above which the same is said."""
 NEAR_CELLS, NEAREST, SPREAD = 12, 4, 0.05
 """Of far points at depths of what is near in the image: the maximum distance in cells; the number of nearest covered
 cells of which the farthest point counts, since points in front of a surface veil it; and the relative standard
@@ -73,6 +77,9 @@ def seed_points(
     source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
     views = KeptViews(lambda i: color_view(scene, frames[i], job.images, ego_mask))
     colors, seen = color_by_visibility(positions, times, prefetch(views.__getitem__, range(len(frames))))
+    if job.lidar_seed.points_file:
+        of_file = source == list(sources).index("points_file")
+        _warn_of_misplaced(scene, frames, Path(job.lidar_seed.points_file).name, positions[of_file], seen[of_file] > 0)
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
@@ -134,6 +141,26 @@ def extra_points(scene: Scene, path: str | None) -> np.ndarray:
         return read_positions(Path(path).expanduser()) - scene.origin
     except (OSError, PlyParseError, KeyError, ValueError) as error:
         raise DatasetError(f"lidar_seed.points_file {path} is not a readable PLY file of points ({error})") from error
+
+
+def _warn_of_misplaced(
+    scene: Scene, frames: list[Frame], name: str, points: Float[np.ndarray, "n 3"], seen: Bool[np.ndarray, " n"]
+) -> None:
+    """Warns where training images see hardly any of the world points of a file, or these are far away, as in another
+    frame of reference or unit."""
+    if not len(points):
+        log.warning("lidar_seed.points_file: %s holds no points", name)
+        return
+    places = np.stack([frame.camera_to_world[:3, 3] for frame in frames])
+    away = float(np.median(cKDTree(places).query(np.nan_to_num(points))[0]))
+    if seen.mean() >= MIN_SEEN and away <= MAX_AWAY:
+        return
+    log.warning(
+        "lidar_seed.points_file: %s of %d points of %s %s seen by a training image, and they are %.0f m from the "
+        "nearest one (median); they must be in the global frame, in which this scene begins at (%.1f, %.1f, %.1f), "
+        "and in metres",
+        int(seen.sum()) or "none", len(seen), name, "is" if seen.sum() < 2 else "are", away, *scene.origin,
+    )  # fmt: skip
 
 
 def triangulated_points(scene: Scene, job: SeedJob, record: TriangulatedPoints) -> tuple[np.ndarray, np.ndarray]:

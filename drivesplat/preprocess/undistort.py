@@ -1,11 +1,11 @@
 """Distorted images, resampled as a pinhole camera would have recorded them: later stages know of no distortion.
 
-The new camera has the centre and the size of the old one, and its focal length, or the smallest longer one with which
-every pixel has a source. No pixel is therefore empty, and no mask is needed; what lies outside the new image is lost.
+The new camera has the centre and the size of the old one, and its focal length at the centre of the image, or the
+smallest longer one with which every pixel has a source. No pixel is therefore empty, and no mask is needed; what lies
+outside the new image is lost.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from drivesplat.errors import DatasetError
 from drivesplat.scene.images import read_image, read_mask, write_png
+from drivesplat.scene.lens import central_intrinsics, pixels_of
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.sensors import Camera
 
@@ -71,22 +72,28 @@ def _readout(camera: Camera, x: np.ndarray, y: np.ndarray) -> float | None:
 
 def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The new intrinsics (3, 3), and for each pixel of the new image (h, w) the x and the y of its source."""
-    assert camera.distortion is not None
-    factor, size = 1.0, (camera.width, camera.height)
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    every = np.stack([columns, rows], axis=-1).astype(np.float64)
+    border = np.concatenate([every[[0, -1]].reshape(-1, 2), every[:, [0, -1]].reshape(-1, 2)])
+    factor = 1.0
     while factor <= LONGEST:
-        k = camera.intrinsics * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]
-        x, y = _sources(camera, k, size)
-        if x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= size[0] - 0.5 and y.max() <= size[1] - 0.5:
-            return k, x, y
+        k = central_intrinsics(camera) * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]
+        if _inside(camera, _sources(camera, k, border)):  # far fewer than all pixels, and mostly the farthest
+            sources = _sources(camera, k, every.reshape(-1, 2))
+            if _inside(camera, sources):
+                x, y = sources.T.reshape(2, camera.height, camera.width).astype(np.float32)
+                return k, x, y
         factor *= LONGER
     raise DatasetError(
         f"camera {camera.name}: its distortion leaves no image without empty pixels; check its coefficients"
     )
 
 
-def _sources(camera: Camera, k: np.ndarray, size: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    if camera.distortion_model == "fisheye":
-        return cv2.fisheye.initUndistortRectifyMap(
-            camera.intrinsics, camera.distortion.reshape(4, 1), np.eye(3), k, size, cv2.CV_32FC1
-        )
-    return cv2.initUndistortRectifyMap(camera.intrinsics, camera.distortion, None, k, size, cv2.CV_32FC1)
+def _sources(camera: Camera, k: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """The pixels (n, 2) of the recorded image that show what `pixels` (n, 2) of a pinhole image with `k` show."""
+    return pixels_of(camera, np.column_stack([(pixels - k[:2, 2]) / k.diagonal()[:2], np.ones(len(pixels))]))
+
+
+def _inside(camera: Camera, pixels: np.ndarray) -> bool:
+    """Whether all pixels (n, 2) are within the image."""
+    return bool(((pixels >= -0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5])).all())

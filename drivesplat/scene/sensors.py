@@ -6,12 +6,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float64
 
+DistortionModel = Literal["none", "opencv", "fisheye", "angle_to_radius", "radius_to_angle", "mei"]
+
 
 @dataclass(frozen=True)
 class Camera:
     """A camera. `width`, `height` in pixels; `intrinsics`, OpenCV (integer coordinates at pixel centres);
-    `distortion`: OpenCV's coefficients by `distortion_model`, all 0 for rectified images; `readout_s`: time in seconds
-    from the first line of pixels to the last, read in `readout_direction`. None if unknown."""
+    `distortion`: coefficients of `distortion_model` (`scene/lens.py`), all 0 for rectified images; `readout_s`: time in
+    seconds from the first line of pixels to the last, read in `readout_direction`. None if unknown."""
 
     name: str
     width: int
@@ -20,7 +22,7 @@ class Camera:
     distortion: Float64[np.ndarray, " k"] | None = None
     readout_s: float | None = None
     readout_direction: Literal["down", "up", "left", "right"] | None = None
-    distortion_model: Literal["none", "opencv", "fisheye"] = "none"
+    distortion_model: DistortionModel = "none"
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,43 @@ def test_more_rings_than_beam_elevations_are_measured():
     np.testing.assert_allclose(scan.rays.elevations, np.tile(BEAMS[:, None], 90), atol=1e-5)
 
 
+def rosette(count: int = 3000) -> LidarReturns:
+    """The returns of a LiDAR without beams, anywhere between -30 and 10 degrees."""
+    random = np.random.default_rng(3)
+    azimuths, elevations = random.uniform(-np.pi, np.pi, count), random.uniform(*np.radians([-30.0, 10.0]), count)
+    flat = np.cos(elevations)
+    directions = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), np.sin(elevations)], axis=1)
+    return LidarReturns(20.0 * directions)
+
+
+MANY = np.radians(np.linspace(-30.67, 10.67, 32))
+ALL = np.ones((32, 90), dtype=bool)
+
+
+def test_beams_on_which_returns_do_not_lie_are_refused():
+    for returns in (rosette(), replace(pattern_returns(MANY + 0.011, 90, np.zeros(32), ALL), rings=None)):
+        with pytest.raises(DatasetError, match="LiDAR top: its returns do not lie on its beam_elevations: "):
+            scan_of(returns, Lidar("top", MANY, 90), standing)
+
+
+def test_beams_between_which_returns_scatter_a_little_are_not():
+    returns = replace(pattern_returns(MANY, 90, np.zeros(32), ALL), rings=None)
+    tilt = np.random.default_rng(1).normal(0.0, 0.003, (len(returns.points), 1))  # a quarter of half a beam
+    scan = scan_of(
+        replace(returns, points=Rotation.from_euler("y", tilt).apply(returns.points)), Lidar("top", MANY, 90), standing
+    )
+    assert scan.returned.sum() > 0.95 * ALL.sum()
+
+
+@pytest.mark.parametrize("known", [MANY[::-1], MANY - 0.1, np.radians(np.linspace(-25.0, 15.0, 40))])
+def test_beams_of_another_sensor_than_the_rings_are_measured(known):
+    scan = scan_of(
+        pattern_returns(MANY, 90, np.zeros(32), ALL & (np.arange(90) % 9 > 0)), Lidar("top", known, 90), standing
+    )
+    np.testing.assert_allclose(scan.rays.beam_elevations[:32], MANY, atol=1e-5)
+    assert scan.rays.shape == (len(known), 90)
+
+
 def test_times_of_returns_are_kept_and_holes_have_those_of_their_firing():
     returns = pattern_returns(BEAMS, 90, np.zeros(5), KEEP)
     columns = np.nonzero(KEEP)[1]

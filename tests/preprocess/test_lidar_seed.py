@@ -1,6 +1,7 @@
 """Seed points: static LiDAR points and far points, coloured by training images only."""
 
 import dataclasses
+import re
 import shutil
 import time
 from pathlib import Path
@@ -510,6 +511,28 @@ def test_points_of_a_file_are_transformed_from_the_global_frame_and_coloured(tin
     red, _, blue = seed.colors[-6:].astype(int).T
     assert (blue > red + 30).all(), "the truck is the only blue thing below the sky"
     assert seed_points(tiny_scene, job(far_points=0)).note["points_file"] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda points, origin: points, None),
+        (lambda points, origin: points - origin, r"none of 500 points of extra.ply is seen .* \(400.0, 1100.0, 0.0\)"),
+        (lambda points, origin: origin + 1000.0 * (points - origin), r"they are [0-9]{4,5} m from the nearest one"),
+        (lambda points, origin: np.full_like(points, np.nan), "none of 500 points of extra.ply is seen"),
+        (
+            lambda points, origin: np.where(np.arange(500)[:, None] % 50 > 0, points - origin, points),
+            "1?[0-9] of 500 points of extra.ply (is|are) seen by a training image",
+        ),
+        (lambda points, origin: points[:0], "extra.ply holds no points"),
+    ],
+)
+def test_points_of_a_file_that_no_image_sees_are_a_warning(tiny_scene, tmp_path, caplog, change, words):
+    seen = seed_points(tiny_scene, job(far_points=0)).positions.astype(np.float64) + tiny_scene.origin
+    write_cloud(tmp_path / "extra.ply", change(seen[:: len(seen) // 500][:500], tiny_scene.origin))
+    seed_points(tiny_scene, job(points_file=str(tmp_path / "extra.ply"), far_points=0))
+    said = [record.getMessage() for record in caplog.records if "points_file:" in record.getMessage()]
+    assert len(said) == (words is not None) and all(re.search(words, line) for line in said)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no PLY", b"ply\nformat ascii 1.0\nelement vertex 1\n"])

@@ -19,7 +19,11 @@ LENSES = {
     "barrel": ("opencv", [-0.25, 0.06, 0.001, -0.0005]),
     "pincushion": ("opencv", [0.2, 0.01, 0.0, 0.0, 0.0]),
     "rational": ("opencv", [0.3, 0.05, 0.0005, 0.0, 0.001, 0.6, 0.1, 0.002]),
+    "thin prism": ("opencv", [-0.2, 0.04, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.004, -0.001, -0.003, 0.001]),
     "fisheye": ("fisheye", [0.05, -0.01, 0.002, -0.0004]),
+    "polynomial of the angle": ("angle_to_radius", [210.0, -4.0, 12.0, -9.0, 1.5]),
+    "polynomial of the radius": ("radius_to_angle", [1.0 / 210.0, 3e-7, -2e-9]),
+    "unified": ("mei", [0.9, -0.1, 0.02, 0.0004, -0.0003]),
 }
 
 
@@ -35,8 +39,27 @@ def pixels() -> np.ndarray:
 
 
 def recorded(model: str, coefficients: np.ndarray) -> np.ndarray:
-    """The image of a camera with distortion: the direction of each of its pixels by OpenCV's own inverse."""
-    if model == "fisheye":
+    """The image of a camera with distortion: the direction of each of its pixels, by OpenCV's own inverse or by the
+    model's definition, solved for the angle."""
+    if model in ("angle_to_radius", "radius_to_angle"):
+        x, y = ((pixels()[:, 0] - K[:2, 2]) * [1.0, K[0, 0] / K[1, 1]]).T
+        radius = np.hypot(x, y)
+        angles = sum(c * radius ** (i + 1) for i, c in enumerate(coefficients))
+        if model == "angle_to_radius":
+            angles = radius / coefficients[0]
+            for _ in range(50):
+                angles = (
+                    angles
+                    - (sum(c * angles ** (i + 1) for i, c in enumerate(coefficients)) - radius) / (coefficients[0])
+                )
+        rays = np.stack([x, y], axis=1) * (np.tan(angles) / np.maximum(radius, 1e-9))[:, None]
+    elif model == "mei":
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+        x, y = cv2.undistortPointsIter(pixels(), K, coefficients[1:], None, None, criteria)[:, 0].T
+        xi, squared = coefficients[0], x**2 + y**2
+        z = (xi + np.sqrt(1.0 + (1.0 - xi**2) * squared)) / (1.0 + squared)  # on the unit sphere
+        rays = np.stack([z * x, z * y], axis=1) / (z - xi)[:, None]
+    elif model == "fisheye":
         rays = cv2.fisheye.undistortPoints(pixels(), K, coefficients.reshape(4, 1))
     else:
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -65,7 +88,8 @@ def test_resampled_images_are_those_of_a_pinhole_camera(scene, tmp_path):
     (camera,) = straight.cameras
     assert camera.distortion_model == "none" and not camera.distortion.any()
     k = camera.intrinsics
-    assert 1.0 <= k[0, 0] / K[0, 0] < 1.6 and (k[:2, 2] == K[:2, 2]).all()
+    central = K[0, 0] / (1.9 if scene.cameras[0].distortion_model == "mei" else 1.0)
+    assert 0.999999 < k[0, 0] / central < 1.6 and (k[:2, 2] == K[:2, 2]).all()
     ideal = seen((pixels().reshape(SIZE[1], SIZE[0], 2) - k[:2, 2]) / k.diagonal()[:2])
     for frame in straight.frames:
         assert (frame.width, frame.height) == SIZE and (frame.intrinsics == k).all()

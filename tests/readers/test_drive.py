@@ -250,6 +250,20 @@ FAULTS = {
         lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "fisheye", "coefficients": [0.1]}),
         "distortion fisheye has 1 coefficients; it takes 4",
     ),
+    "degrees": (
+        lambda d: d["lidars"]["LIDAR_TOP"].update(beam_elevations=[-30.7, -10.0, 10.7]),
+        "lidars.LIDAR_TOP: its beam_elevations reach 30.7; they are radians",
+    ),
+    "a lens that folds": (
+        lambda d: d["cameras"]["CAM_FRONT"].update(
+            distortion={"model": "angle_to_radius", "coefficients": [d["cameras"]["CAM_FRONT"]["K"][0][0], 0.0, -200.0]}
+        ),
+        "cameras.CAM_FRONT: its distortion folds",
+    ),
+    "a polynomial of another lens": (
+        lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "radius_to_angle", "coefficients": [0.3]}),
+        "cameras.CAM_FRONT: K states a focal length of",
+    ),
     "a pose far away": (
         lambda d: d["frames"][0]["ego_to_world"].update(translation=[1e12, 0, 0]),
         "frames[0]: its translation is",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
-from drivesplat.readers.drive.check import check, summary, whole_scene
+from drivesplat.readers.drive.check import check, column_sentences, summary, whole_scene
 from drivesplat.readers.drive.format import Drive, grouped, read_drive
 from drivesplat.readers.drive.nerfstudio import add_command
 from drivesplat.readers.drive.write import write_drive
@@ -55,6 +55,8 @@ def _check(asked: argparse.Namespace) -> int:
     scene = whole_scene(read_drive(asked.folder), asked.folder)
     for sentence in (*jumps(scene), *pose_warnings(scene), *lidar_warnings(scene)):
         print(f"warning: {sentence}")
+    for sentence in column_sentences(scene):
+        print(sentence)
     print(summary(scene))
     return 0
 

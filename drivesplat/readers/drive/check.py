@@ -10,6 +10,7 @@ from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, Drive, structure_of
 from drivesplat.readers.drive.from_above import seen_from_above
 from drivesplat.readers.drive.reader import scene_of
+from drivesplat.readers.drive.sweep_file import columns_sentence
 from drivesplat.readers.image_file import image_fault
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.images import continuous_intrinsics, project, read_image
@@ -71,6 +72,12 @@ def summary(scene: Scene) -> str:
         f"{len(scene.tracks)} tracks" if scene.tracks else "no boxes: all is treated as static",
     ]
     return ", ".join(parts)
+
+
+def column_sentences(scene: Scene) -> list[str]:
+    """What is read from the first sweep of each LiDAR, which has no fault."""
+    firsts = [next(sweep for sweep in scene.sweeps if sweep.lidar == lidar.name) for lidar in scene.lidars]
+    return [f"LiDAR {sweep.lidar}: {Path(sweep.path).name} {columns_sentence(Path(sweep.path))}" for sweep in firsts]
 
 
 def _image_faults(scene: Scene) -> Iterator[str]:

@@ -13,13 +13,16 @@ from drivesplat.readers.checks import (
     order_faults,
     path_faults,
 )
-from drivesplat.readers.drive.format import Distortion, Drive, DriveCamera, Pose, TimedPose
+from drivesplat.readers.drive.format import Distortion, Drive, Pose, TimedPose
 from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
+from drivesplat.scene.lens import lens_fault
 
+MAX_ELEVATION = 1.6
+"""Maximum elevation of a beam in radians; degrees are mostly beyond it."""
 UNITS = {"seconds": 1e6, "milliseconds": 1e3, "nanoseconds": 1e-3}
 """Units that are taken for microseconds by mistake, and the microseconds in one."""
-COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
+COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 
 
 def faults_of(drive: Drive) -> list[str]:
@@ -65,51 +68,35 @@ def _camera_faults(drive: Drive) -> Iterator[str]:
     for name, camera in drive.cameras.items():
         where = f"cameras.{name}"
         try:
-            k = checked_intrinsics(camera.K, where, (camera.width, camera.height))
+            checked_intrinsics(camera.K, where, (camera.width, camera.height))
         except DatasetError as error:
             yield str(error)
             continue
         wrong = list(_distortion_faults(camera.distortion))
         if not wrong and camera.distortion.model != "none":
-            wrong = list(_fold_faults(k, camera))
+            wrong = list(filter(None, [lens_fault(camera.sensor(name))]))
         yield from (f"{where}: {fault}" for fault in wrong)
 
 
 def _lidar_faults(drive: Drive) -> Iterator[str]:
     yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()), MAX_MOUNT)
     for name, lidar in drive.lidars.items():
+        steepest = max(map(abs, lidar.beam_elevations or ()), default=0.0)
+        if steepest > MAX_ELEVATION:
+            yield (
+                f"lidars.{name}: its beam_elevations reach {steepest:g}; they are radians above the sensor's "
+                "horizontal plane, at most 1.57"
+            )
         if not lidar.motion_compensated and not drive.ego_poses:
             yield f"lidars.{name}: motion_compensated is false, but there are no ego_poses for motion compensation"
 
 
 def _distortion_faults(distortion: Distortion) -> Iterator[str]:
-    expected, count = COEFFICIENTS[distortion.model], len(distortion.coefficients)
-    if count not in expected:
+    expected, count = COEFFICIENTS.get(distortion.model), len(distortion.coefficients)
+    if expected is None and not count:
+        yield f"distortion {distortion.model} has no coefficients; it takes one for each power, from the first on"
+    elif expected is not None and count not in expected:
         yield f"distortion {distortion.model} has {count} coefficients; it takes {' or '.join(map(str, expected))}"
-
-
-def _fold_faults(k: np.ndarray, camera: DriveCamera) -> Iterator[str]:
-    """The fault of a distortion whose image of a ray moves back towards the centre before the corner of the image."""
-    corner = max(
-        float(np.hypot((x - k[0, 2]) / k[0, 0], (y - k[1, 2]) / k[1, 1]))
-        for x in (0, camera.width - 1)
-        for y in (0, camera.height - 1)
-    )
-    values = camera.distortion.coefficients
-    if camera.distortion.model == "fisheye":
-        angles = np.linspace(0.0, min(corner, np.pi / 2), 400)
-        imaged = angles * (1.0 + sum(c * angles ** (2 * i + 2) for i, c in enumerate(values)))
-    else:
-        radii = np.linspace(0.0, corner, 400)
-        above, below = [values[0], values[1], *values[4:5]], values[5:8]
-        powers = [radii ** (2 * i + 2) for i in range(3)]
-        imaged = radii * (1.0 + sum(c * p for c, p in zip(above, powers, strict=False)))
-        imaged /= 1.0 + sum(c * p for c, p in zip(below, powers, strict=False))
-    if (np.diff(imaged) <= 0).any():
-        yield (
-            f"its distortion folds: two directions within the image have one pixel; check the order of the "
-            f"{camera.distortion.model} coefficients"
-        )
 
 
 def _pose_faults(

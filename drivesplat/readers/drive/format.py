@@ -10,11 +10,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.regular_file import regular_file
 from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.sensors import Camera, DistortionModel
 
 FILE = "drive.json"
 MAX_ALIKE = 3
@@ -54,11 +56,13 @@ class TimedPose(Pose):
 
 
 class Distortion(DriveRecord):
-    """The distortion of a camera's images, as OpenCV defines it."""
+    """The distortion of a camera's images."""
 
-    model: Literal["none", "opencv", "fisheye"] = "none"
-    """'opencv': k1, k2, p1, p2[, k3[, k4, k5, k6]]; 'fisheye': the four of cv2.fisheye."""
-    coefficients: tuple[float, ...] = ()
+    model: DistortionModel = "none"
+    """'opencv': k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4[, tauX, tauY]]]]; 'fisheye': the four of cv2.fisheye;
+    'angle_to_radius': the radius in pixels by powers of the angle in radians, from the first power on;
+    'radius_to_angle': the reverse; 'mei': xi, k1, k2, p1, p2."""
+    coefficients: tuple[float, ...] = Field((), max_length=30)
 
 
 class DriveCamera(DriveRecord):
@@ -77,6 +81,14 @@ class DriveCamera(DriveRecord):
     """Time from the first line of pixels to the last (seconds). null: unknown."""
     readout_direction: Literal["down", "up", "left", "right"] | None = None
     """The direction in which lines are read out. null: unknown."""
+
+    def sensor(self, name: str) -> Camera:
+        """The camera as scenes have it."""
+        distortion = np.array(self.distortion.coefficients or np.zeros(5))
+        return Camera(
+            name, self.width, self.height, np.array(self.K), distortion, self.readout_s, self.readout_direction,
+            self.distortion.model,
+        )  # fmt: skip
 
 
 class DriveLidar(DriveRecord):
@@ -110,7 +122,7 @@ class DriveFrame(DriveRecord):
 
 
 class DriveSweep(DriveRecord):
-    """A LiDAR sweep: .npz or .ply (docs/own_data.md)."""
+    """A LiDAR sweep: .npz, .ply or .pcd (docs/own_data.md)."""
 
     lidar: str
     timestamp: Timestamp

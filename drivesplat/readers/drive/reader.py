@@ -11,9 +11,10 @@ from drivesplat.readers.drive.faults import faults_of, is_unposed
 from drivesplat.readers.drive.format import FILE, Drive, DriveFrame, DriveTrack, read_drive
 from drivesplat.readers.drive.layout import scene_folder
 from drivesplat.readers.drive.poses import EgoPath, matrix_of
+from drivesplat.scene.lens import central_intrinsics
 from drivesplat.scene.rigid import interpolate, inverse, rigid
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track
-from drivesplat.scene.sensors import Camera, Lidar
+from drivesplat.scene.sensors import Lidar
 from drivesplat.settings.extract import SceneSource
 
 READER = "drive"
@@ -75,7 +76,7 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
         poses=UNPOSED if is_unposed(drive) else READER,
         key_frame_hz=nominal_rate(times),
         key_frame_range=list(source.frames) if source.frames else None,
-        cameras=tuple(_camera(drive, name) for name in cameras),
+        cameras=tuple(drive.cameras[name].sensor(name) for name in cameras),
         lidars=tuple(_lidar(drive, name) for name in dict.fromkeys(sweep.lidar for sweep in sweeps)),
     )
 
@@ -222,6 +223,7 @@ class _Reading:
     def frames(self, name: str, between: bool) -> Iterator[Frame]:
         """The images of a camera at key frames and, if asked for, between them."""
         camera, sensor_to_ego = self.drive.cameras[name], matrix_of(self.drive.cameras[name].sensor_to_ego)
+        intrinsics = central_intrinsics(camera.sensor(name))
         records = sorted((f for f in self.drive.frames if f.camera == name), key=lambda frame: frame.timestamp)
         times, marked = [frame.timestamp for frame in records], [frame.key_frame for frame in records]
         for number, index, is_key_frame in chosen_recordings(times, marked, self.key_times, between):
@@ -236,7 +238,7 @@ class _Reading:
                 image_path=str(self.folder / frame.file),
                 width=camera.width,
                 height=camera.height,
-                intrinsics=np.array(camera.K),
+                intrinsics=intrinsics,
                 camera_to_world=camera_to_world,
                 ego_to_world=ego_to_world,
                 is_key_frame=is_key_frame,
@@ -263,15 +265,6 @@ class _Reading:
         shifted = pose.copy()
         shifted[:3, 3] -= self.shift
         return shifted
-
-
-def _camera(drive: Drive, name: str) -> Camera:
-    camera = drive.cameras[name]
-    distortion = np.array(camera.distortion.coefficients or np.zeros(5))
-    return Camera(
-        name, camera.width, camera.height, np.array(camera.K), distortion, camera.readout_s, camera.readout_direction,
-        camera.distortion.model,
-    )  # fmt: skip
 
 
 def _lidar(drive: Drive, name: str) -> Lidar:
