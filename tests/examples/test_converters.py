@@ -436,6 +436,33 @@ def test_returns_of_argoverse2_belong_to_the_lidar_that_recorded_them(argoverse,
         assert set(returns.rings) == set(range(32))
 
 
+def test_a_log_of_argoverse2_without_images_is_a_drive_of_lidar(argoverse, tmp_path, capsys):
+    log, drive = Path(shutil.copytree(argoverse[0], tmp_path / "log")), argoverse[1]
+    shutil.rmtree(log / "sensors/cameras")
+    (log / "calibration/intrinsics.feather").unlink()
+    assert argoverse2.main([str(log), str(tmp_path / "out")]) == 0
+    assert "no images of ring cameras: the drive is one of LiDAR alone" in capsys.readouterr().err
+    assert check(tmp_path / "out", None) == []
+    scene = whole_scene(read_drive(tmp_path / "out"), tmp_path / "out")
+    assert not scene.frames and len(scene.sweeps) == 12 and len(scene.tracks) == 3
+    assert scene.key_frame_timestamps.tolist() == TIMES.tolist()
+    moved = scene.sweeps[3].sensor_to_world[:3, 3] - scene.sweeps[0].sensor_to_world[:3, 3]
+    expected = (drive.ego(TIMES[3]) @ AV2_LIDARS["up_lidar"])[:3, 3] - (drive.ego(TIMES[0]) @ AV2_LIDARS["up_lidar"])[
+        :3, 3
+    ]
+    np.testing.assert_allclose(moved, expected, atol=2e-3)
+
+
+def test_the_recorded_fragment_of_argoverse2_is_converted(tmp_path):
+    logs = list((REPOSITORY / "../shared/data/av2-log-fragment").glob("*/calibration"))
+    if not logs:
+        pytest.skip("the recorded log is not in ../shared/data/av2-log-fragment")
+    assert argoverse2.main([str(logs[0].parent), str(tmp_path / "out")]) == 0
+    assert check(tmp_path / "out", None) == []
+    drive = read_drive(tmp_path / "out")
+    assert (len(drive.key_frames or ()), len(drive.sweeps), len(drive.tracks)) == (2, 4, 114)
+
+
 # Both
 
 
