@@ -125,6 +125,8 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans:
     imu_times, imu_to_world = imu_poses(folder / "oxts")
 
     numbers = cameras or [number for number in COLOUR if (folder / f"image_{number}").is_dir()]
+    if not numbers:
+        warn(f"{folder} has no image_{' and no image_'.join(COLOUR)}: the drive is one of LiDAR alone")
     rectified = date / "calib_cam_to_cam.txt"
     mounted = {f"image_{number}": camera(rectified, number, imu_to_velo, velo_to_cam) for number in numbers}
     frames, images = [], {}

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow
 import pytest
 from helpers import REPOSITORY
+from helpers.shown_drives import assert_shows, origin_of, world_points
 from helpers.table_files import time_limit
 from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
 from PIL import Image
@@ -24,7 +25,6 @@ from drivesplat.lidar.scans import scan_of, sensor_poses
 from drivesplat.readers.drive.check import check, whole_scene
 from drivesplat.readers.drive.format import read_drive
 from drivesplat.readers.sweeps import read_returns
-from drivesplat.scene.images import read_image
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene
 from examples import argoverse2, kitti_raw, kitti_scans
@@ -35,46 +35,6 @@ AZIMUTHS = np.radians(np.arange(179.0, -180.0, -6.0))
 """Of a scan, in the order in which it turns clockwise from behind the vehicle."""
 RINGS = np.radians(np.linspace(-2.0, -24.0, 64))
 """Elevations of KITTI's scanner."""
-
-
-def origin_of(scene: Scene, drive: TurningDrive) -> np.ndarray:
-    """The scene's origin in the drive's world, by the first image."""
-    first = scene.frames[0]
-    return drive.ego(first.timestamp)[:3, 3] - first.ego_to_world[:3, 3]
-
-
-def assert_shows(scene: Scene, drive: TurningDrive, delay: int, lidars: dict[str, np.ndarray], atol: float) -> None:
-    """Poses, calibration, images and boxes of a scene are those of a drive whose images are `delay` microseconds after
-    its key frames, up to the origin, which is near the first ego position."""
-    origin = origin_of(scene, drive)
-    assert np.linalg.norm(scene.frames[0].ego_to_world[:3, 3]) < 0.1
-
-    def here(pose: np.ndarray) -> np.ndarray:
-        return rigid(pose[:3, :3], pose[:3, 3] - origin)
-
-    assert [frame.timestamp for frame in scene.frames] == (TIMES + delay).tolist()
-    for frame in scene.frames:
-        np.testing.assert_allclose(frame.intrinsics, drive.world.intrinsics, atol=1e-9)
-        np.testing.assert_allclose(frame.ego_to_world, here(drive.ego(frame.timestamp)), atol=atol)
-        np.testing.assert_allclose(frame.camera_to_world, here(drive.ego(frame.timestamp) @ CAMERA), atol=atol)
-        expected = drive.image(frame.timestamp)
-        assert np.abs(read_image(frame.image_path).astype(int) - expected).mean() < 3.0
-    for sweep in scene.sweeps:
-        np.testing.assert_allclose(
-            sweep.sensor_to_world, here(drive.ego(sweep.timestamp) @ lidars[sweep.lidar]), atol=atol
-        )
-    assert len(scene.tracks) == len(drive.world.things)
-    for track, thing in zip(scene.tracks, drive.world.things, strict=True):
-        np.testing.assert_allclose(track.size, thing.size, atol=1e-6)
-        assert len(track.timestamps) >= 5
-        for time, box in zip(track.timestamps, track.object_to_world, strict=True):
-            np.testing.assert_allclose(box, here(drive.box(thing, time)), atol=atol)
-
-
-def world_points(scene: Scene, number: int, drive: TurningDrive) -> np.ndarray:
-    """The returns of a sweep in the drive's world."""
-    sweep = scene.sweeps[number]
-    return apply(sweep.sensor_to_world, read_returns(sweep).points) + origin_of(scene, drive)
 
 
 # KITTI raw
@@ -549,7 +509,7 @@ def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, c
     assert "egovehicle_SE3_sensor.feather cannot be read" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["kitti_raw", "argoverse2"])
+@pytest.mark.parametrize("name", ["kitti_raw", "argoverse2", "pandaset"])
 def test_converters_run_as_documented(name, tmp_path):
     done = subprocess.run(
         [sys.executable, str(REPOSITORY / f"examples/{name}.py"), "--help"],
