@@ -1,6 +1,6 @@
 """Converts a log of the Argoverse 2 sensor dataset (https://argoverse.github.io/user-guide/datasets/sensor.html) to a
 drive folder. LOG is the folder of a log, with calibration/, sensors/, city_SE3_egovehicle.feather and, but in the test
-split, annotations.feather.
+split, annotations.feather. A log without images becomes a drive of LiDAR alone.
 
 Argoverse's ego frame has its origin at the centre of the rear axle, 0.33 m above the ground; that of a drive folder is
 on the ground. Images are undistorted: k1, k2 and k3 describe the lens before that, and are not used. Sweeps hold the
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # a checkout that is not installed
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.drive.conversion import pose_at, reading, reported, timed_poses, write_folder
+from drivesplat.readers.drive.conversion import pose_at, reading, reported, timed_poses, warn, write_folder
 from drivesplat.readers.drive.write import pose_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 
@@ -73,13 +73,14 @@ def files_by_time(folder: Path, suffix: str) -> dict[int, Path]:
 
 
 def cameras_of(log: Path, names: list[str] | None, mounts: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The cameras called `names`, or all ring cameras, of which there are images."""
+    """The cameras called `names`, or all ring cameras of which there are images: none in a log of LiDAR alone."""
+    folders = sorted(path.name for path in (log / "sensors/cameras").glob("*") if path.is_dir())
+    wanted = names or [name for name in folders if name.startswith("ring_")]
     path = log / "calibration/intrinsics.feather"
-    columns, found = table(path), {}
+    columns, found = table(path) if wanted else {}, {}
     with reading(path):
-        for i, name in enumerate(columns["sensor_name"]):
-            wanted = name in names if names else name.startswith("ring_")
-            if not wanted or not (log / "sensors/cameras" / name).is_dir():
+        for i, name in enumerate(columns.get("sensor_name", ())):
+            if name not in wanted or name not in folders:
                 continue
             fx, fy, cx, cy = (float(columns[key][i]) for key in ("fx_px", "fy_px", "cx_px", "cy_px"))
             found[name] = {
@@ -88,9 +89,11 @@ def cameras_of(log: Path, names: list[str] | None, mounts: dict[str, np.ndarray]
                 "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
                 "sensor_to_ego": pose_record(TO_GROUND @ mounts[name]),
             }
-    lacking = [name for name in names or [] if name not in found]
-    if lacking or not found:
-        raise DatasetError(f"{log} has no images or no intrinsics of {', '.join(lacking) or 'any ring camera'}")
+    lacking = [name for name in wanted if name not in found]
+    if lacking:
+        raise DatasetError(f"{log} has no images or no intrinsics of {', '.join(lacking)}")
+    if not found:
+        warn(f"{log / 'sensors/cameras'} has no images of ring cameras: the drive is one of LiDAR alone")
     return found
 
 

@@ -4,7 +4,8 @@ drives; DRIVE is a drive's number, such as 0001.
 
 The ego frame is that of the GPS/IMU unit, lowered to the ground. The unit is mounted within decimetres of the rear
 axle's centre. Poses are the unit's, in Mercator's projection with the scale of the first latitude, as in KITTI's
-development kit. Boxes are those of tracklet_labels.xml, if it is there.
+development kit. Boxes are those of tracklet_labels.xml, if it is there. Rings follow from the order of returns in a
+scan's file, times from their azimuths, and the elevation of a beam is the median of its returns.
 
 KITTI's readme: "the velodyne scanner takes depth measurements continuously while rotating [...] you have to 'untwist'
 the points linearly", and cameras are triggered when it looks forward. Scans are therefore untwisted here to the time at
@@ -16,7 +17,7 @@ report scans that are compensated already: compare the edges of poles in check.p
 import argparse
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,15 @@ from scipy.spatial.transform import Rotation
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # a checkout that is not installed
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.drive.conversion import pose_at, reading, reported, timed_poses, write_folder
+from drivesplat.readers.checks import checked_intrinsics, checked_transform
+from drivesplat.readers.drive.conversion import numbers_of, pose_at, reading, reported, timed_poses, warn, write_folder
 from drivesplat.readers.drive.write import pose_record
-from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.scene.rigid import inverse, rigid
+from examples.kitti_files import MISSING, calibration, imu_poses, recordings, timestamps, transform
+from examples.kitti_scans import RINGS, beams_of, laps_of, read_scan, rings_of, scan_times, shares_of, untwisted
 
 LICENCE = "KITTI: CC BY-NC-SA 3.0, Geiger et al., Vision meets Robotics: The KITTI Dataset"
-MISSING = -1
-"""The time of a lost recording."""
 COLOUR = ("02", "03")
-EARTH_RADIUS = 6378137.0
 IMU_TO_EGO = rigid(np.eye(3), np.array([0.0, 0.0, 0.93]))
 """The GPS/IMU unit is 0.93 m above the ground (sensor setup, https://www.cvlibs.net/datasets/kitti/setup.php)."""
 CLASSES = {
@@ -42,106 +43,77 @@ CLASSES = {
     "Person (sitting)": "pedestrian", "Misc": "vehicle",
 }  # fmt: skip
 """'Misc' holds trailers, Segways and the like."""
-VISIBLE_SHARE = {0: 0.9, 1: 0.5, 2: 0.1}
+VISIBLE_SHARE = {"0": 0.9, "1": 0.5, "2": 0.1}
 """Of an object by its occlusion: not, partly, fully. Other values are unset."""
+Odd = dict[str, list[str]]
+"""Names of scans by what is unusual about them."""
+NO_RINGS = "have returns in another order than ring by ring; they get no ring, which methods that render LiDAR need"
+BY_ELEVATION = (
+    f"have another number of rings than {RINGS}; each ring of theirs is taken for that of the nearest elevation"
+)
 
 
-def calibration(path: Path) -> dict[str, np.ndarray]:
-    """The numbers of a calibration file by their names."""
-    with reading(path):
-        lines = (line.partition(":") for line in path.read_text().splitlines() if ":" in line)
-        return {name: np.array(values.split(), dtype=float) for name, _, values in lines if name != "calib_time"}
-
-
-def transform(path: Path) -> np.ndarray:
-    """The transform (4, 4) of a calibration file with R and T."""
-    values = calibration(path)
-    with reading(path):
-        return rigid(values["R"].reshape(3, 3), values["T"].reshape(3))
-
-
-def timestamps(path: Path) -> np.ndarray:
-    """The times (n,) in microseconds of a file with a time per line, such as 2011-09-26 13:02:25.964389445; MISSING for
-    an empty line, which stands for a lost recording."""
-    with reading(path):
-        times = np.array([line.strip() or "NaT" for line in path.read_text().splitlines()], dtype="datetime64[ns]")
-    return np.where(np.isnat(times), MISSING, times.astype(np.int64) // 1000)
-
-
-def recordings(folder: Path, suffix: str) -> list[tuple[int, int, Path]]:
-    """Of each file of a sensor: its index, which is a line of timestamps.txt, its time, and its path. A drive may lack
-    some."""
-    times, files = timestamps(folder / "timestamps.txt"), sorted((folder / "data").glob(f"*{suffix}"))
-    if not files:
-        raise DatasetError(f"{folder / 'data'} holds no {suffix} files")
-    with reading(folder / "timestamps.txt"):
-        return [(int(path.stem), int(times[int(path.stem)]), path) for path in files]
-
-
-def imu_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The times (n,) and the poses (n, 4, 4) of the GPS/IMU unit: x east, y north, z up."""
-    records, rows = recordings(folder, ".txt"), []
-    for _, _, path in records:
-        with reading(path):
-            rows.append([float(value) for value in path.read_text().split()[:6]])
-    latitude, longitude, altitude, roll, pitch, yaw = np.array(rows).T
-    scale = EARTH_RADIUS * np.cos(np.radians(latitude[0]))
-    east = scale * np.radians(longitude)
-    north = scale * np.log(np.tan(np.radians(90.0 + latitude) / 2))
-    rotations = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
-    return np.array([time for _, time, _ in records]), rigid(rotations, np.stack([east, north, altitude], axis=1))
-
-
-def camera(values: dict[str, np.ndarray], number: str, imu_to_velo: np.ndarray, velo_to_cam: np.ndarray) -> dict:
+def camera(path: Path, number: str, imu_to_velo: np.ndarray, velo_to_cam: np.ndarray) -> dict[str, Any]:
     """A rectified colour camera. P_rect = K [I | t]: t shifts camera 0's rectified frame to this camera's."""
-    projection = values[f"P_rect_{number}"].reshape(3, 4)
-    K, rectifying = projection[:, :3], rigid(values["R_rect_00"].reshape(3, 3), np.zeros(3))
+    size, matrix = f"S_rect_{number}", f"P_rect_{number}"
+    values = calibration(path, **{size: 2, matrix: 12, "R_rect_00": 9})
+    projection, rotation = values[matrix].reshape(3, 4), rigid(values["R_rect_00"].reshape(3, 3), np.zeros(3))
+    width, height = (int(value) for value in values[size])
+    K = checked_intrinsics(projection[:, :3], f"{path}: {matrix}", (width, height))
     shift = rigid(np.eye(3), np.linalg.solve(K, projection[:, 3]))
-    imu_to_camera = shift @ rectifying @ velo_to_cam @ imu_to_velo
-    width, height = values[f"S_rect_{number}"].astype(int).tolist()
+    imu_to_camera = shift @ checked_transform(rotation, f"{path}: R_rect_00") @ velo_to_cam @ imu_to_velo
     mount = pose_record(IMU_TO_EGO @ inverse(imu_to_camera))
     return {"width": width, "height": height, "K": K.tolist(), "sensor_to_ego": mount}
 
 
-def untwisted(points: np.ndarray, scans: str, start: np.ndarray, end: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """The points (n, 3) of a scan as seen from the pose `forward`; the scanner turned once from `start` to `end`, from
-    behind the vehicle to behind it. Poses are scanner to world (4, 4)."""
-    if scans == "compensated":
-        return points
-    azimuth = np.arctan2(points[:, 1], points[:, 0]) * (1 if scans == "counter-clockwise" else -1)
-    shares = (azimuth[:, None] + np.pi) / (2 * np.pi)
-    motion = inverse(start) @ end
-    turns = Rotation.from_rotvec(shares * Rotation.from_matrix(motion[:3, :3]).as_rotvec())
-    return apply(inverse(forward) @ start, turns.apply(points) + shares * motion[:3, 3])
-
-
-def sweep_columns(path: Path, scans: str, start: np.ndarray, end: np.ndarray, forward: np.ndarray) -> dict[str, Any]:
-    """The untwisted returns of a scan's file: x, y, z, reflectance."""
-    with reading(path):
-        *points, reflectance = np.frombuffer(path.read_bytes(), dtype=np.float32).reshape(-1, 4).T
-    at_forward = untwisted(np.stack(points, axis=1).astype(float), scans, start, end, forward)
-    return dict(zip("xyz", at_forward.T.astype(np.float32), strict=True)) | {"intensity": reflectance.clip(0.0, 1.0)}
+def sweep_columns(
+    path: Path, scans: str, times: Sequence[int], poses: list[np.ndarray], beams: np.ndarray | None, odd: Odd
+) -> dict[str, Any]:
+    """The columns of a scan's file. `times` in microseconds and scanner poses (4, 4) are those at the start, when the
+    scanner faces forward, and at the end. Adds the scan to `odd` if its returns have an unusual order."""
+    points, reflectance = read_scan(path)
+    start, forward, end = times
+    at_forward = untwisted(points, scans, poses[0], poses[2], poses[1])
+    seconds = (start - forward + shares_of(points, scans) * (end - start)) * 1e-6
+    columns = dict(zip("xyz", at_forward.T.astype(np.float32), strict=True))
+    columns |= {"intensity": reflectance.astype(np.float32), "time": seconds.astype(np.float32)}
+    rings = None if beams is None else rings_of(points, beams)
+    if rings is None:
+        odd.setdefault(NO_RINGS, []).append(path.name)
+        return columns
+    if laps_of(points)[-1] != RINGS - 1:
+        odd.setdefault(BY_ELEVATION, []).append(path.name)
+    return columns | {"ring": rings.astype(np.int16)}
 
 
 def tracks(path: Path, scanner_poses: np.ndarray, times: np.ndarray) -> Iterator[dict[str, Any]]:
     """The tracklets of a drive; `scanner_poses` (n, 4, 4) and `times` (n,) are those of its scans. Tracklets stand on
     the bottom of their boxes."""
     with reading(path):
-        for number, item in enumerate(ElementTree.parse(path).getroot().findall("tracklets/item")):
-            kind, first = item.findtext("objectType", "").strip(), int(item.findtext("first_frame", ""))
-            height, width, length = (float(item.findtext(name, "")) for name in ("h", "w", "l"))
-            poses = []
-            for index, pose in enumerate(item.findall("poses/item"), first):
-                if times[index] == MISSING:
-                    continue
-                x, y, z, *angles = (float(pose.findtext(name, "")) for name in ("tx", "ty", "tz", "rx", "ry", "rz"))
-                box = rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.array([x, y, z + height / 2]))
-                share = VISIBLE_SHARE.get(int(pose.findtext("occlusion", "-1")))
-                seen = {"timestamp": int(times[index]), "visibility": share}
-                poses.append(seen | pose_record(scanner_poses[index] @ box))
+        items = ElementTree.parse(path).getroot().findall("tracklets/item")
+    for number, item in enumerate(items):
+        record = f"{path}: tracklet {number}"
+        kind, first = item.findtext("objectType", "").strip(), item.findtext("first_frame", "").strip()
+        boxes = item.findall("poses/item")
+        if kind not in CLASSES:
+            raise DatasetError(f"{record}: its objectType is {kind[:40]!r}; known are {', '.join(CLASSES)}")
+        if not first.isdecimal() or int(first) + len(boxes) > len(times):
+            raise DatasetError(
+                f"{record}: its first_frame is {first[:40]!r}, with {len(boxes)} poses in {len(times)} scans"
+            )
+        height, width, length = numbers_of(" ".join(item.findtext(name, "") for name in "hwl"), 3, f"{record}: h, w, l")
+        poses = []
+        for index, pose in enumerate(boxes, int(first)):
+            if times[index] == MISSING:
+                continue
+            values = " ".join(pose.findtext(name, "") for name in ("tx", "ty", "tz", "rx", "ry", "rz"))
+            x, y, z, *angles = numbers_of(values, 6, f"{record}: pose {index - int(first)}: tx, ty, tz, rx, ry, rz")
+            box = rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.array([x, y, z + height / 2]))
+            seen = {"timestamp": int(times[index]), "visibility": VISIBLE_SHARE.get(pose.findtext("occlusion", ""))}
+            poses.append(seen | pose_record(scanner_poses[index] @ box))
+        if poses:
             shape = {"class": CLASSES[kind], "category": kind, "size": [length, width, height]}
-            if poses:
-                yield {"id": f"tracklet_{number}", **shape, "poses": poses}
+            yield {"id": f"tracklet_{number}", **shape, "poses": poses}
 
 
 def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans: str) -> Path:
@@ -150,12 +122,13 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans:
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}; name the folder of a day and the number of one of its drives")
     imu_to_velo, velo_to_cam = (transform(date / f"calib_{name}.txt") for name in ("imu_to_velo", "velo_to_cam"))
-    values = calibration(date / "calib_cam_to_cam.txt")
     imu_times, imu_to_world = imu_poses(folder / "oxts")
 
     numbers = cameras or [number for number in COLOUR if (folder / f"image_{number}").is_dir()]
-    with reading(date / "calib_cam_to_cam.txt"):
-        mounted = {f"image_{number}": camera(values, number, imu_to_velo, velo_to_cam) for number in numbers}
+    if not numbers:
+        warn(f"{folder} has no image_{' and no image_'.join(COLOUR)}: the drive is one of LiDAR alone")
+    rectified = date / "calib_cam_to_cam.txt"
+    mounted = {f"image_{number}": camera(rectified, number, imu_to_velo, velo_to_cam) for number in numbers}
     frames, images = [], {}
     for name in mounted:
         for _, time, path in recordings(folder / name, ".png"):
@@ -163,18 +136,18 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans:
             frames.append({"camera": name, "timestamp": time, "file": f"{name}/{path.name}", "ego_to_world": ego})
             images[f"{name}/{path.name}"] = path
 
-    def scanner_at(time: np.integer) -> np.ndarray:
+    def scanner_at(time: int | np.integer) -> np.ndarray:
         return pose_at(imu_times, imu_to_world, time) @ inverse(imu_to_velo)
 
     velodyne = folder / "velodyne_points"
-    starts, forwards, ends = (timestamps(velodyne / f"timestamps{name}.txt") for name in ("_start", "", "_end"))
-    scanner_poses = np.stack([np.eye(4) if time == MISSING else scanner_at(time) for time in forwards])
-    scan_files = recordings(velodyne, ".bin")
-
+    scan_files, forwards = recordings(velodyne, ".bin"), timestamps(velodyne / "timestamps.txt")
+    spans = scan_times(velodyne, scan_files)
+    beams, odd = beams_of(path for *_, path in scan_files), Odd()
     sweeps = (
-        (f"velodyne/{path.stem}.npz", sweep_columns(path, scans, scanner_at(starts[i]), scanner_at(ends[i]), forward))
-        for (i, _, path), forward in zip(scan_files, scanner_poses[[i for i, *_ in scan_files]], strict=True)
+        (f"velodyne/{path.stem}.npz", sweep_columns(path, scans, span, [scanner_at(time) for time in span], beams, odd))
+        for (*_, path), span in zip(scan_files, spans, strict=True)
     )
+    scanner_poses = np.stack([np.eye(4) if time == MISSING else scanner_at(time) for time in forwards])
     labels = folder / "tracklet_labels.xml"
     record = {
         "format": "drivesplat drive",
@@ -182,7 +155,13 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans:
         "description": f"KITTI raw {folder.name}",
         "licence": LICENCE,
         "cameras": mounted,
-        "lidars": {"velodyne": {"sensor_to_ego": pose_record(IMU_TO_EGO @ inverse(imu_to_velo)), "revolution_s": 0.1}},
+        "lidars": {
+            "velodyne": {
+                "sensor_to_ego": pose_record(IMU_TO_EGO @ inverse(imu_to_velo)),
+                "beam_elevations": None if beams is None else beams.tolist(),
+                "revolution_s": 0.1,
+            }
+        },
         "ego_poses": timed_poses(imu_times, imu_to_world @ inverse(IMU_TO_EGO)),
         "frames": frames,
         "sweeps": [
@@ -196,7 +175,10 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans:
         ],
         "tracks": list(tracks(labels, scanner_poses, forwards)) if labels.is_file() else [],
     }
-    return write_folder(out, record, images, sweeps)
+    written = write_folder(out, record, images, sweeps)
+    for how, names in odd.items():
+        warn(f"{len(names)} of {len(scan_files)} scans (first: {names[0]}) {how}")
+    return written
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -15,6 +15,7 @@ import pickle
 import re
 import struct
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,18 +62,25 @@ def read_plain_pickle(path: str | Path, rule: str) -> Any:
 
 def loads(content: bytes) -> Any:
     """The value of a pickle of plain data. Raises an exception of any type where it is none."""
-    unpickler = _PlainUnpickler(io.BytesIO(content))
-    value = unpickler.load()
-    if unpickler.stack or unpickler.read(1):
+    return _Plain(len(content)).of(executed(content, PlainUnpickler))
+
+
+def executed(content: bytes, unpickler: type["PlainUnpickler"]) -> Any:
+    """What an unpickler makes of the whole content, before `loads` copies it. Raises an exception of any type."""
+    program = unpickler(io.BytesIO(content))
+    value = program.load()
+    if program.stack or program.read(1):
         raise pickle.UnpicklingError("something follows its end")
-    return _Plain(len(content)).of(value)
+    return value
 
 
-class _Dtype:
+class Dtype:
     """A dtype under construction: `code` as in 'f8'."""
 
-    def __init__(self, code: str, align: bool, copy: bool):
-        if not _CODE.fullmatch(code) or (align, copy) != (False, True):
+    codes = _CODE
+
+    def __init__(self, code: str, align: int, copy: int):
+        if not self.codes.fullmatch(code) or (align, copy) != (False, True):
             raise pickle.UnpicklingError("an array has another dtype than numbers or text")
         self.code, self.dtype = code, None
 
@@ -84,7 +92,7 @@ class _Dtype:
         self.dtype = dtype
 
 
-class _Array:
+class Array:
     """An array under construction, in place of the result of numpy's `_reconstruct`: `view` of the file's content, and
     `copy` for the caller."""
 
@@ -92,7 +100,7 @@ class _Array:
     copy: np.ndarray | None = None
 
     def __init__(self, kind: type, shape: tuple[int, ...], code: bytes):
-        if (kind, shape, code) != (_Array, (0,), b"b"):
+        if (kind, shape, code) != (type(self), (0,), b"b"):
             raise pickle.UnpicklingError("it calls what no plain data needs")
 
     def __setstate__(self, state: tuple) -> None:
@@ -101,9 +109,9 @@ class _Array:
             raise pickle.UnpicklingError("an array has an unknown version")
         self._look_at(content, dtype, shape, "F" if fortran else "C")
 
-    def _look_at(self, content: bytes, dtype: _Dtype, shape: tuple[int, ...], order: str) -> None:
+    def _look_at(self, content: bytes, dtype: Dtype, shape: tuple[int, ...], order: str) -> None:
         """Makes `content` the elements. Raises UnpicklingError where it does not fit."""
-        kind = dtype.dtype if type(dtype) is _Dtype else None
+        kind = dtype.dtype if isinstance(dtype, Dtype) else None
         if kind is None or not all(type(n) is int and n >= 0 for n in shape) or len(shape) > MAX_DIMENSIONS:
             raise pickle.UnpicklingError("an array has no dtype or no shape")
         if type(content) is not bytes or math.prod(shape) * kind.itemsize != len(content):
@@ -114,10 +122,10 @@ class _Array:
             raise pickle.UnpicklingError("an array has elements that are no truth values or characters")
 
 
-class _Buffer(_Array):
+class Buffer(Array):
     """An array in place of the result of numpy's `_frombuffer`."""
 
-    def __init__(self, content: bytes, dtype: _Dtype, shape: tuple[int, ...], order: str):
+    def __init__(self, content: bytes, dtype: Dtype, shape: tuple[int, ...], order: str):
         self._look_at(content, dtype, shape, order)
 
 
@@ -130,37 +138,41 @@ class _Dict(dict):
         super().__setitem__(key, value)
 
 
-_CLASSES = {("numpy", "dtype"): _Dtype, ("numpy", "ndarray"): _Array} | {
+CLASSES = {("numpy", "dtype"): Dtype, ("numpy", "ndarray"): Array} | {
     (f"numpy.{core}.{module}", name): kind
     for core in ("core", "_core")  # numpy 1 and 2 name the same package differently
-    for module, name, kind in (("multiarray", "_reconstruct", _Array), ("numeric", "_frombuffer", _Buffer))
+    for module, name, kind in (("multiarray", "_reconstruct", Array), ("numeric", "_frombuffer", Buffer))
 }
 
 
 class _Opcodes:
-    """The methods of `_PlainUnpickler` by opcode, at most MAX_OPCODES times."""
+    """The `methods` of an unpickler by opcode, at most MAX_OPCODES times."""
 
-    def __init__(self):
-        self._left = MAX_OPCODES
+    def __init__(self, methods: dict[int, Callable]):
+        self._methods, self._left = methods, MAX_OPCODES
 
     def __getitem__(self, opcode: int) -> Any:
         self._left -= 1
-        if opcode not in _METHODS or self._left < 0:
+        if opcode not in self._methods or self._left < 0:
             raise pickle.UnpicklingError(f"it has the opcode {bytes([opcode])!r}, or more than {MAX_OPCODES} opcodes")
-        return _METHODS[opcode]
+        return self._methods[opcode]
 
 
-class _PlainUnpickler(pickle._Unpickler):
-    """Executes the opcodes of plain data in the protocols 2 to 5."""
+class PlainUnpickler(pickle._Unpickler):
+    """Executes the opcodes of plain data in the protocols 2 to 5. A subclass may add `classes` in place of those that a
+    file names, and `methods` for further opcodes."""
+
+    classes: Mapping[tuple[str, str], Callable] = CLASSES
+    methods: Mapping[int, Callable] = {}
 
     def __init__(self, file: io.BytesIO):
         super().__init__(file)
-        self.dispatch = _Opcodes()
+        self.dispatch = _Opcodes({**_METHODS, **self.methods})
 
-    def find_class(self, module: str, name: str) -> type:
-        if (module, name) not in _CLASSES:
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in self.classes:
             raise pickle.UnpicklingError(f"it refers to {module}.{name}")
-        return _CLASSES[module, name]
+        return self.classes[module, name]
 
     def load_dict(self) -> None:
         self.append(_Dict())
@@ -174,9 +186,9 @@ class _PlainUnpickler(pickle._Unpickler):
 
 
 _METHODS = {getattr(pickle, name)[0]: pickle._Unpickler.dispatch[getattr(pickle, name)[0]] for name in _OPCODES} | {
-    pickle.EMPTY_DICT[0]: _PlainUnpickler.load_dict,
-    pickle.BYTEARRAY8[0]: _PlainUnpickler.load_buffer,
-    pickle.BUILD[0]: _PlainUnpickler.load_state,
+    pickle.EMPTY_DICT[0]: PlainUnpickler.load_dict,
+    pickle.BYTEARRAY8[0]: PlainUnpickler.load_buffer,
+    pickle.BUILD[0]: PlainUnpickler.load_state,
 }
 
 
@@ -198,7 +210,7 @@ class _Plain:
             return {key: self.of(item, depth + 1) for key, item in value.items()}
         if kind in (list, tuple):
             return kind([self.of(item, depth + 1) for item in value])
-        if kind in (_Array, _Buffer) and value.view is not None:
+        if kind in (Array, Buffer) and value.view is not None:
             return self._copied(value)
         if kind is np.ndarray and (_CODE.fullmatch(value.dtype.str[1:]) is None or value.ndim > MAX_DIMENSIONS):
             raise TypeError(f"an array of {value.dtype} with {value.ndim} dimensions is not plain data")
@@ -206,7 +218,7 @@ class _Plain:
             raise TypeError(f"{kind.__name__} is not plain data")
         return value
 
-    def _copied(self, array: _Array) -> np.ndarray:
+    def _copied(self, array: Array) -> np.ndarray:
         """A writable array, one for every reference to it."""
         if array.copy is None:
             self._free -= array.view.nbytes

@@ -1,6 +1,10 @@
 """The worked converters: each test writes a small drive in a dataset's own layout, by the formulas of that dataset's
 documentation, and compares what the converter makes of it with the world that it shows."""
 
+import io
+import lzma
+import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,63 +14,27 @@ import numpy as np
 import pyarrow
 import pytest
 from helpers import REPOSITORY
+from helpers.shown_drives import assert_shows, origin_of, world_points
+from helpers.table_files import time_limit
 from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
 from PIL import Image
 from pyarrow import feather
 from scipy.spatial.transform import Rotation
 
+from drivesplat.lidar.scans import scan_of, sensor_poses
 from drivesplat.readers.drive.check import check, whole_scene
 from drivesplat.readers.drive.format import read_drive
 from drivesplat.readers.sweeps import read_returns
-from drivesplat.scene.images import read_image
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene
-from examples import argoverse2, kitti_raw
+from examples import argoverse2, kitti_raw, kitti_scans
 
 TILT = Rotation.from_euler("ZYX", [0.65, 0.05, -0.03]).as_matrix()
 ELEVATIONS = np.radians(np.linspace(-25.0, 3.0, 8))
 AZIMUTHS = np.radians(np.arange(179.0, -180.0, -6.0))
 """Of a scan, in the order in which it turns clockwise from behind the vehicle."""
-
-
-def origin_of(scene: Scene, drive: TurningDrive) -> np.ndarray:
-    """The scene's origin in the drive's world, by the first image."""
-    first = scene.frames[0]
-    return drive.ego(first.timestamp)[:3, 3] - first.ego_to_world[:3, 3]
-
-
-def assert_shows(scene: Scene, drive: TurningDrive, delay: int, lidars: dict[str, np.ndarray], atol: float) -> None:
-    """Poses, calibration, images and boxes of a scene are those of a drive whose images are `delay` microseconds after
-    its key frames, up to the origin, which is near the first ego position."""
-    origin = origin_of(scene, drive)
-    assert np.linalg.norm(scene.frames[0].ego_to_world[:3, 3]) < 0.1
-
-    def here(pose: np.ndarray) -> np.ndarray:
-        return rigid(pose[:3, :3], pose[:3, 3] - origin)
-
-    assert [frame.timestamp for frame in scene.frames] == (TIMES + delay).tolist()
-    for frame in scene.frames:
-        np.testing.assert_allclose(frame.intrinsics, drive.world.intrinsics, atol=1e-9)
-        np.testing.assert_allclose(frame.ego_to_world, here(drive.ego(frame.timestamp)), atol=atol)
-        np.testing.assert_allclose(frame.camera_to_world, here(drive.ego(frame.timestamp) @ CAMERA), atol=atol)
-        expected = drive.image(frame.timestamp)
-        assert np.abs(read_image(frame.image_path).astype(int) - expected).mean() < 3.0
-    for sweep in scene.sweeps:
-        np.testing.assert_allclose(
-            sweep.sensor_to_world, here(drive.ego(sweep.timestamp) @ lidars[sweep.lidar]), atol=atol
-        )
-    assert len(scene.tracks) == len(drive.world.things)
-    for track, thing in zip(scene.tracks, drive.world.things, strict=True):
-        np.testing.assert_allclose(track.size, thing.size, atol=1e-6)
-        assert len(track.timestamps) >= 5
-        for time, box in zip(track.timestamps, track.object_to_world, strict=True):
-            np.testing.assert_allclose(box, here(drive.box(thing, time)), atol=atol)
-
-
-def world_points(scene: Scene, number: int, drive: TurningDrive) -> np.ndarray:
-    """The returns of a sweep in the drive's world."""
-    sweep = scene.sweeps[number]
-    return apply(sweep.sensor_to_world, read_returns(sweep).points) + origin_of(scene, drive)
+RINGS = np.radians(np.linspace(-2.0, -24.0, 64))
+"""Elevations of KITTI's scanner."""
 
 
 # KITTI raw
@@ -147,15 +115,28 @@ def tracklets_xml(drive: TurningDrive) -> str:
 
 
 def scan(drive: TurningDrive, time: int) -> tuple[np.ndarray, np.ndarray]:
-    """A turn of the scanner that looks forward at `time`, clockwise from behind: what it writes, each point as
-    seen at its own time, and where the points are in the world; (n, 3) each."""
+    """A turn of the scanner that looks forward at `time`, clockwise from behind: what it writes, each point as seen at
+    its own time, and where the points are in the world; (n, 3) each. Points come ring by ring, each by its azimuth from
+    0 to 360 degrees."""
     raw, true = [], []
     for azimuth in AZIMUTHS:
         now = time - SPIN * azimuth / np.pi
-        hits = drive.hits(VELODYNE, rays_at(azimuth, ELEVATIONS), now)
+        hits = drive.hits(VELODYNE, rays_at(azimuth, RINGS), now)
         true.append(hits)
         raw.append(seen_from(drive.ego(now) @ VELODYNE, hits))
-    return np.concatenate(raw), np.concatenate(true)
+    points, hits = np.concatenate(raw), np.concatenate(true)
+    order = np.lexsort([np.mod(azimuths_of(points), 2 * np.pi), rings_of(points)])
+    return points[order], hits[order]
+
+
+def azimuths_of(points: np.ndarray) -> np.ndarray:
+    return np.arctan2(points[:, 1], points[:, 0])
+
+
+def rings_of(points: np.ndarray) -> np.ndarray:
+    """The rings (n,) of a scan's points, which are exact."""
+    elevations = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    return np.abs(elevations[:, None] - RINGS).argmin(axis=1)
 
 
 LOST = 4
@@ -223,6 +204,54 @@ def test_points_fall_on_the_pixels_of_kittis_readme(kitti, kitti_scene):
     in_world = (drive.ego(frame.timestamp) @ VELODYNE @ point)[:3] - origin_of(kitti_scene, drive)
     found = frame.intrinsics @ seen_from(frame.camera_to_world, in_world[None])[0]
     np.testing.assert_allclose(found[:2] / found[2], [x / z, y / z], atol=0.05)
+
+
+def test_scans_of_kitti_raw_have_rings_times_and_elevations(kitti, kitti_scene):
+    _, drive, _ = kitti
+    np.testing.assert_allclose(kitti_scene.lidars[0].beam_elevations, RINGS, atol=1e-6)
+    sweep, (points, _) = kitti_scene.sweeps[2], scan(drive, int(TIMES[2]))
+    returns = read_returns(sweep)
+    np.testing.assert_array_equal(returns.rings, rings_of(points))
+    np.testing.assert_allclose(returns.offsets_s, -SPIN * 1e-6 * azimuths_of(points) / np.pi, atol=1e-7)
+    rays = scan_of(returns, kitti_scene.lidars[0], sensor_poses(sweep, kitti_scene.sweeps))
+    assert rays.ranges.shape == (64, len(AZIMUTHS)) and (rays.ranges > 0).sum() == len(points)
+    np.testing.assert_allclose(np.median(rays.rays.elevations, axis=1), RINGS, atol=2e-3)
+
+
+def test_scans_of_another_order_are_converted_with_a_warning(kitti, tmp_path, capsys):
+    """One scan ends after 40 rings, one has a stray return, one is shuffled."""
+    day, drive, _ = kitti
+    copied = Path(shutil.copytree(day, tmp_path / day.name))
+    files = [copied / f"2011_09_26_drive_0005_sync/velodyne_points/data/{i:010}.bin" for i in (0, 1, 2)]
+    cut, stray, shuffled = (np.fromfile(file, dtype=np.float32).reshape(-1, 4) for file in files)
+    rings = rings_of(scan(drive, int(TIMES[0]))[0])
+    cut[rings < 40].tofile(files[0])
+    np.vstack([stray, stray[:1]]).tofile(files[1])
+    np.random.default_rng(0).permutation(shuffled).tofile(files[2])
+    assert kitti_raw.main([str(copied), "5", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert "2 of 5 scans (first: 0000000000.bin) have another number of rings than 64" in said
+    assert "1 of 5 scans (first: 0000000002.bin) have returns in another order" in said and said.count("\n") == 2
+    first, second, third = (np.load(tmp_path / f"out/velodyne/{i:010}.npz") for i in (0, 1, 2))
+    np.testing.assert_array_equal(first["ring"], rings[rings < 40])
+    assert second["ring"][-1] == 0 and set(second["ring"]) == set(range(64))
+    assert "ring" not in third and "time" in third
+
+
+def test_rings_of_recorded_scans_are_those_of_their_elevations():
+    """KITTI's own scans: each ring has nearly one elevation, and rings go down from +2.9 to -23.6 degrees."""
+    path = REPOSITORY / "../shared/data/kitti-lidar-22-scans/scans.npz.xz"
+    if not path.is_file():
+        pytest.skip(f"the recorded scans are not in {path}")
+    recorded = np.load(io.BytesIO(lzma.decompress(path.read_bytes())))
+    points, rings = recorded["xyz_11"].T * 0.005, recorded["ring_11"]
+    laps = kitti_scans.laps_of(points)
+    assert laps[-1] == 63 and (laps == rings).mean() > 0.999
+    beams = kitti_scans.medians(kitti_scans.elevations_of(points), laps)
+    assert (np.diff(beams) < 0).all() and -0.43 < beams[-1] < -0.40 and 0.03 < beams[0] < 0.06
+    np.testing.assert_array_equal(kitti_scans.rings_of(points, beams), laps)
+    without_one = points[laps != 17]
+    np.testing.assert_array_equal(kitti_scans.rings_of(without_one, beams), laps[laps != 17])
 
 
 def test_scans_that_are_compensated_already_are_left_as_they_are(kitti, tmp_path):
@@ -367,35 +396,104 @@ def test_returns_of_argoverse2_belong_to_the_lidar_that_recorded_them(argoverse,
         assert set(returns.rings) == set(range(32))
 
 
+def test_a_log_of_argoverse2_without_images_is_a_drive_of_lidar(argoverse, tmp_path, capsys):
+    log, drive = Path(shutil.copytree(argoverse[0], tmp_path / "log")), argoverse[1]
+    shutil.rmtree(log / "sensors/cameras")
+    (log / "calibration/intrinsics.feather").unlink()
+    assert argoverse2.main([str(log), str(tmp_path / "out")]) == 0
+    assert "no images of ring cameras: the drive is one of LiDAR alone" in capsys.readouterr().err
+    assert check(tmp_path / "out", None) == []
+    scene = whole_scene(read_drive(tmp_path / "out"), tmp_path / "out")
+    assert not scene.frames and len(scene.sweeps) == 12 and len(scene.tracks) == 3
+    assert scene.key_frame_timestamps.tolist() == TIMES.tolist()
+    moved = scene.sweeps[3].sensor_to_world[:3, 3] - scene.sweeps[0].sensor_to_world[:3, 3]
+    expected = (drive.ego(TIMES[3]) @ AV2_LIDARS["up_lidar"])[:3, 3] - (drive.ego(TIMES[0]) @ AV2_LIDARS["up_lidar"])[
+        :3, 3
+    ]
+    np.testing.assert_allclose(moved, expected, atol=2e-3)
+
+
+def test_the_recorded_fragment_of_argoverse2_is_converted(tmp_path):
+    logs = list((REPOSITORY / "../shared/data/av2-log-fragment").glob("*/calibration"))
+    if not logs:
+        pytest.skip("the recorded log is not in ../shared/data/av2-log-fragment")
+    assert argoverse2.main([str(logs[0].parent), str(tmp_path / "out")]) == 0
+    assert check(tmp_path / "out", None) == []
+    drive = read_drive(tmp_path / "out")
+    assert (len(drive.key_frames or ()), len(drive.sweeps), len(drive.tracks)) == (2, 4, 114)
+
+
 # Both
+
+
+IMAGES, SCANS, OXTS = "{drive}/image_02", "{drive}/velodyne_points", "{drive}/oxts"
+
+
+def replaced(old: str, new: str) -> Callable[[Path], object]:
+    """A change of a text file: the first `old` becomes `new`."""
+    return lambda path: path.write_text(path.read_text().replace(old, new, 1))
+
+
+def without_the_last_line(path: Path) -> None:
+    path.write_text(path.read_text().rstrip("\n").rpartition("\n")[0])
+
+
+def a_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
 
 
 @pytest.mark.parametrize(
     ("path", "change", "words"),
     [
         ("calib_velo_to_cam.txt", Path.unlink, "calib_velo_to_cam.txt is missing"),
+        ("calib_velo_to_cam.txt", replaced("T:", "U:"), "calib_velo_to_cam.txt has no line that begins with T:"),
+        ("calib_velo_to_cam.txt", lambda p: p.write_text("R: 1 0 0\n"), "cannot be read: line 1 has 3 numbers"),
+        ("calib_imu_to_velo.txt", replaced("R: ", "R: 7"), "calib_imu_to_velo.txt: its transform is not rigid"),
         ("calib_cam_to_cam.txt", lambda p: p.write_text("P_rect_02: x\n"), "calib_cam_to_cam.txt cannot be read"),
-        ("{drive}/image_02/timestamps.txt", lambda p: p.write_text("yesterday\n"), "timestamps.txt cannot be read"),
+        (f"{IMAGES}/timestamps.txt", lambda p: p.write_text("yesterday\n"), "timestamps.txt cannot be read: line 1 is"),
         (
-            "{drive}/image_02/timestamps.txt",
+            f"{IMAGES}/timestamps.txt",
             lambda p: p.write_text(p.read_text()[:40]),
-            "timestamps.txt cannot be read",
+            "timestamps.txt cannot be read: line 2",
         ),
+        (f"{IMAGES}/timestamps.txt", a_pipe, "timestamps.txt is not a file"),
+        (f"{SCANS}/timestamps_start.txt", without_the_last_line, "timestamps_start.txt: line 6 has no time, and there"),
+        (f"{SCANS}/timestamps_end.txt", replaced("2018", "2019"), "line 1: the scan begins 0.05 s before"),
+        (f"{OXTS}/timestamps.txt", replaced("2018", "2019"), "timestamps.txt: line 2 is not later than"),
+        (
+            f"{OXTS}/data/0000000003.txt",
+            lambda p: p.write_text("49 8 1"),
+            "0000000003.txt cannot be read: line 1 has 3",
+        ),
+        (f"{OXTS}/data/0000000003.txt", lambda p: p.write_text(""), "line 1 has 0 numbers; it must have 6"),
+        (f"{OXTS}/data/0000000003.txt", replaced("49.", "nan "), "line 1 has a number that is not finite"),
+        (f"{OXTS}/data/0000000003.txt", replaced("49.", "149."), "no latitude and longitude"),
         ("{drive}/tracklet_labels.xml", lambda p: p.write_text("<a>"), "tracklet_labels.xml cannot be read"),
-        ("{drive}/velodyne_points/data/0000000000.bin", lambda p: p.write_bytes(b"123"), "0000000000.bin cannot be"),
+        (
+            "{drive}/tracklet_labels.xml",
+            replaced("<first_frame>0", "<first_frame>-3"),
+            "tracklet 0: its first_frame is",
+        ),
+        ("{drive}/tracklet_labels.xml", replaced("Car", "Cart"), "tracklet 0: its objectType is 'Cart'"),
+        ("{drive}/tracklet_labels.xml", replaced("<tx>", "<tx>m"), "tracklet 0: pose 0: tx, ty, tz, rx, ry, rz: could"),
+        (f"{SCANS}/data/0000000000.bin", lambda p: p.write_bytes(b"123"), "0000000000.bin cannot be"),
+        (f"{SCANS}/data/0000000000.bin", lambda p: p.write_bytes(b""), "0000000000.bin holds no returns"),
+        (f"{SCANS}/data/0000000000.bin", lambda p: p.write_bytes(b"\xff" * 160), "10 of its 10 returns have values"),
+        (f"{SCANS}/data/0000000001.bin", a_pipe, "0000000001.bin is not a file"),
+        (
+            f"{SCANS}/data/0000000001.bin",
+            lambda p: p.rename(p.with_name("x.bin")),
+            "x.bin: the name of a recording must",
+        ),
         ("{drive}", lambda p: p.rename(p.with_name("x")), "there is no folder"),
     ],
 )
 def test_a_damaged_day_of_kitti_ends_with_a_sentence(path, change: Callable, words, kitti, tmp_path, capsys):
-    day = tmp_path / "2011_09_26"
-    name = "2011_09_26_drive_0005_sync"
-    for file in kitti[0].rglob("*"):
-        if file.is_file():
-            target = day / file.relative_to(kitti[0])
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(file.read_bytes())
-    change(day / path.format(drive=name))
-    assert kitti_raw.main([str(day), "0005", str(tmp_path / "out"), "--cameras", "02"]) == 1
+    day = Path(shutil.copytree(kitti[0], tmp_path / "2011_09_26"))
+    change(day / path.format(drive="2011_09_26_drive_0005_sync"))
+    with time_limit(10.0):
+        assert kitti_raw.main([str(day), "0005", str(tmp_path / "out"), "--cameras", "02"]) == 1
     said = capsys.readouterr().err
     assert said.startswith("kitti_raw: ") and said.count("\n") == 1 and words in said
 
@@ -411,7 +509,7 @@ def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, c
     assert "egovehicle_SE3_sensor.feather cannot be read" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["kitti_raw", "argoverse2"])
+@pytest.mark.parametrize("name", ["kitti_raw", "argoverse2", "pandaset"])
 def test_converters_run_as_documented(name, tmp_path):
     done = subprocess.run(
         [sys.executable, str(REPOSITORY / f"examples/{name}.py"), "--help"],

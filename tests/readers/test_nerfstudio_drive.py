@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.hand_made import recording_of
+from helpers.table_files import time_limit
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -124,6 +126,50 @@ def test_units_times_and_folders(folder, values):
             frame.camera_to_world[:3, 3] + scene.origin, (rig(number) @ MOUNTS[camera])[:3, 3], atol=1e-9
         )
     assert scene.frames[0].intrinsics[0, 2] == 40.5 and scene.frames[0].intrinsics[1, 2] == 29.0
+
+
+def test_files_without_times_take_the_rate_of_their_images(folder, values, capsys):
+    """Names count from 9 to 12, and frames stand in another order."""
+    for camera in MOUNTS:
+        for number in range(4):
+            image = folder / f"images/{camera}/{number}.png"
+            image.rename(image.with_name(f"frame_{number + 9}.png"))
+    with_times = json.loads(json.dumps(values))
+    for frame in values["frames"]:
+        path, _, number = frame["file_path"][:-4].rpartition("/")
+        frame["file_path"] = f"{path}/frame_{int(number) + 9}.png"
+        del frame["time"]
+    values["frames"].reverse()
+    without_unit = ["--metres-per-unit", "0.5", "--camera-height", "1.5"]
+    assert converted(values, folder, without_unit) == 1
+    assert "frames[0] has no timestamp" in (said := capsys.readouterr().err) and "state --hz where" in said
+    for hz, words in (("0", "a positive number, not 0: --hz"), ("nan", "not nan: --hz"), ("-3", "not -3: --hz")):
+        assert converted(values, folder, [*without_unit, "--hz", hz]) == 1
+        assert words in capsys.readouterr().err
+    assert converted(with_times, folder, [*without_unit, "--hz", "4"]) == 1
+    assert "its frames have a time; leave out --hz" in capsys.readouterr().err
+    assert converted(values, folder, [*without_unit, "--hz", "4"]) == 0
+    scene = scene_in(folder)
+    assert {frame.camera for frame in scene.frames} == set(MOUNTS)
+    for camera in MOUNTS:
+        of_camera = [frame for frame in scene.frames if frame.camera == camera]
+        assert [frame.timestamp for frame in of_camera] == [0, 250_000, 500_000, 750_000]
+        for number, frame in enumerate(of_camera):
+            place = frame.camera_to_world[:3, 3] + scene.origin
+            np.testing.assert_allclose(place, (rig(number) @ MOUNTS[camera])[:3, 3], atol=1e-9)
+
+
+def test_files_that_are_pipes_are_refused(folder, values, capsys):
+    (folder / "images/left/2.png").unlink()
+    os.mkfifo(folder / "images/left/2.png")
+    with time_limit(10.0):
+        assert converted(values, folder, HALF_METRES) == 1
+    assert "2.png cannot be read (it is not a file)" in capsys.readouterr().err
+    (folder / "transforms.json").unlink()
+    os.mkfifo(folder / "transforms.json")
+    with time_limit(10.0):
+        assert main(["from-nerfstudio", str(folder / "transforms.json"), str(folder / "out"), *HALF_METRES]) == 1
+    assert "transforms.json is not a file" in capsys.readouterr().err
 
 
 def test_the_ego_frame_is_level_below_the_camera_that_looks_ahead(folder, values):

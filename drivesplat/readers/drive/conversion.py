@@ -16,16 +16,45 @@ from drivesplat.readers.drive.write import pose_record, require_empty
 from drivesplat.readers.files import link_or_copy
 from drivesplat.scene.rigid import interpolate
 
+FAILURES = (
+    OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, SyntaxError, RuntimeError, EOFError,
+    MemoryError,
+)  # fmt: skip
+"""What libraries raise for damaged files."""
+
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turns what goes wrong with a file into a DatasetError that names it."""
+    """Turns what goes wrong with a file or folder into a DatasetError that names it. Pipes and devices, whose reading
+    may never end, are refused."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise DatasetError(f"{path} is not a file")
     try:
         yield
     except FileNotFoundError as error:
         raise DatasetError(f"{error.filename or path} is missing") from error
-    except (OSError, ValueError, LookupError, TypeError, SyntaxError) as error:
+    except FAILURES as error:
         raise DatasetError(f"{path} cannot be read ({type(error).__name__}: {str(error)[:200]})") from error
+
+
+def numbers_of(text: str, count: int, record: str) -> np.ndarray:
+    """The first `count` numbers (count,) of a text, separated by spaces. Raises DatasetError naming `record` where
+    there are fewer, or one is not finite."""
+    words = text.split()[:count]
+    try:
+        values = np.array(words, dtype=np.float64)
+    except ValueError as error:
+        raise DatasetError(f"{record}: {error}") from error
+    if len(values) < count:
+        raise DatasetError(f"{record} has {len(values)} numbers; it must have {count}")
+    if not np.isfinite(values).all():
+        raise DatasetError(f"{record} has a number that is not finite")
+    return values
+
+
+def warn(sentence: str) -> None:
+    """Prints a warning of a converter."""
+    print(f"warning: {sentence}", file=sys.stderr)
 
 
 def reported(program: str, convert: Callable[[], Path]) -> int:

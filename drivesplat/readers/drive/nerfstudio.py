@@ -45,6 +45,8 @@ class Scale:
     """Seconds of a unit of `timestamp` or `time`: 1e-6 for microseconds."""
     camera_height: float | None
     """Metres of the ego camera above the ground."""
+    hz: float | None = None
+    """Images a second of each camera, for files without times."""
     ego_camera: str | None = None
     """The camera that looks ahead; None: the first of the file."""
     undo_applied_transform: bool = False
@@ -58,8 +60,8 @@ def convert(path: Path, folder: Path, scale: Scale, licence: str = "") -> tuple[
     Raises DatasetError naming a value that cannot be, or the part of `scale` that is not stated.
     """
     values = content_of(path)
-    metres, seconds, height = _stated(scale, values)
-    shots = _in_metres(shots_of(values, path, seconds), values, path, scale, metres)
+    metres, height = _stated(scale, values)
+    shots = _in_metres(shots_of(values, path, scale.seconds_per_time, scale.hz), values, path, scale, metres)
     cameras = grouped(shots)
     ego_camera = scale.ego_camera or next(iter(cameras))
     if ego_camera not in cameras:
@@ -91,22 +93,27 @@ def convert(path: Path, folder: Path, scale: Scale, licence: str = "") -> tuple[
     return write_folder(folder, record, images), unused(values)
 
 
-def _stated(scale: Scale, values: dict[str, Any]) -> tuple[float, float, float]:
-    """Metres per unit, seconds per unit of time, and metres above the ground."""
+def _stated(scale: Scale, values: dict[str, Any]) -> tuple[float, float]:
+    """Metres per unit, and metres above the ground. Raises DatasetError where one of these two is not stated, or a part
+    of the scale is no positive number."""
     applied = values.get("applied_scale")
     hint = f"; the file says that its source's units were multiplied by {applied!r}" if applied is not None else ""
-    for value, what in (
-        (scale.metres_per_unit, f"--metres-per-unit: the metres of a unit of transform_matrix (1 if metres){hint}"),
-        (scale.seconds_per_time, "--seconds-per-time: the seconds of a unit of timestamp or time (1e-6 if "
-         "microseconds, 1 if seconds, the drive's length if it goes from 0 to 1)"),
-        (scale.camera_height, "--camera-height: the metres of the camera that looks ahead above the ground"),
-    ):  # fmt: skip
-        if value is None:
+    for value, needed, what in (
+        (
+            scale.metres_per_unit,
+            True,
+            "--metres-per-unit: the metres of a unit of transform_matrix (1 if metres)" + hint,
+        ),
+        (scale.seconds_per_time, False, "--seconds-per-time: the seconds of a unit of timestamp or time"),
+        (scale.hz, False, "--hz: the images a second of each camera"),
+        (scale.camera_height, True, "--camera-height: the metres of the camera that looks ahead above the ground"),
+    ):
+        if value is None and needed:
             raise DatasetError(f"a transforms.json does not say it, so state {what}")
-        if not 0 < value < np.inf:
+        if value is not None and not 0 < value < np.inf:
             raise DatasetError(f"it must be a positive number, not {value:g}: {what}")
-    assert scale.metres_per_unit and scale.seconds_per_time and scale.camera_height
-    return scale.metres_per_unit, scale.seconds_per_time, scale.camera_height
+    assert scale.metres_per_unit and scale.camera_height
+    return scale.metres_per_unit, scale.camera_height
 
 
 def _in_metres(shots: Sequence[Shot], values: dict[str, Any], path: Path, scale: Scale, metres: float) -> list[Shot]:
@@ -205,7 +212,7 @@ def add_command(commands: Any) -> None:
     parser = commands.add_parser(
         "from-nerfstudio",
         help="write a transforms.json of nerfstudio as a drive folder",
-        description="Writes a transforms.json of nerfstudio, with the times of its images, as a drive folder.",
+        description="Writes a transforms.json of nerfstudio as a drive folder.",
     )
     parser.add_argument("transforms", type=Path, help="the transforms.json")
     parser.add_argument("folder", type=Path, help="the drive folder, new or empty")
@@ -213,6 +220,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument(
         "--seconds-per-time", type=float, help="seconds of a unit of timestamp or time; 1e-6 if microseconds"
     )
+    parser.add_argument("--hz", type=float, help="images a second of each camera, if the file has no times")
     parser.add_argument("--camera-height", type=float, help="metres of the ego camera above the ground")
     parser.add_argument("--ego-camera", help="the camera that looks ahead; by default the first one")
     parser.add_argument(
@@ -224,7 +232,7 @@ def add_command(commands: Any) -> None:
 
 def _run(asked: argparse.Namespace) -> int:
     scale = Scale(
-        asked.metres_per_unit, asked.seconds_per_time, asked.camera_height, asked.ego_camera,
+        asked.metres_per_unit, asked.seconds_per_time, asked.camera_height, asked.hz, asked.ego_camera,
         asked.undo_applied_transform,
     )  # fmt: skip
     written, left_out = convert(asked.transforms, asked.folder, scale, asked.licence)

@@ -61,6 +61,8 @@ class Shot:
 
 def content_of(path: Path) -> dict[str, Any]:
     """The content of a transforms.json with at least one frame. Raises DatasetError for anything else."""
+    if path.exists() and not path.is_file():
+        raise DatasetError(f"{path} is not a file")
     try:
         values = json.loads(regular_file(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -73,13 +75,12 @@ def content_of(path: Path) -> dict[str, Any]:
     return values
 
 
-def shots_of(values: Mapping[str, Any], path: Path, seconds_per_time: float) -> list[Shot]:
-    """The images of the content of a transforms.json at `path`, with a unit of their times. Raises DatasetError naming
-    a frame whose values cannot be, or whose image is missing."""
-    frames, key = values["frames"], time_key(values, path)
-    folder = path.parent
-    found = []
-    for number, frame in enumerate(frames):
+def shots_of(values: Mapping[str, Any], path: Path, seconds_per_time: float | None, hz: float | None) -> list[Shot]:
+    """The images of the content of a transforms.json at `path`, with a unit of their times, or with the rate of images
+    that have no times. Raises DatasetError naming a frame whose values cannot be, or whose image is missing."""
+    frames, folder, found = values["frames"], path.parent, []
+    times = _times(values, path, seconds_per_time) if hz is None else _even_times(values, path, hz)
+    for number, (frame, time) in enumerate(zip(frames, times, strict=True)):
         record = f"{path}: frames[{number}]"
         image = folder / _file(frame, record)
         found.append(
@@ -87,7 +88,7 @@ def shots_of(values: Mapping[str, Any], path: Path, seconds_per_time: float) -> 
                 record=record,
                 path=image,
                 camera=_camera_name(frame, record),
-                time=_microseconds(frame[key], seconds_per_time, key, record),
+                time=time,
                 camera_to_world=_transform(frame.get("transform_matrix"), record) @ OPENGL_TO_OPENCV,
                 lens=_lens(values, frame, image, record),
             )
@@ -95,16 +96,48 @@ def shots_of(values: Mapping[str, Any], path: Path, seconds_per_time: float) -> 
     return found
 
 
-def time_key(values: Mapping[str, Any], path: Path) -> str:
-    """The key that holds the times of frames. Raises DatasetError where some frames have none."""
-    for key in TIME_KEYS:
-        if all(key in frame for frame in values["frames"]):
-            return key
-    lacking = next(i for i, frame in enumerate(values["frames"]) if TIME_KEYS[0] not in frame)
-    raise DatasetError(
-        f"{path}: frames[{lacking}] has no timestamp and not all frames have a time; a drive needs the time of every "
-        "image"
-    )
+def _times(values: Mapping[str, Any], path: Path, seconds_per_time: float | None) -> list[int]:
+    """The times of frames that have them. Raises DatasetError where some have none."""
+    key = time_key(values)
+    if key is None:
+        lacking = next(i for i, frame in enumerate(values["frames"]) if TIME_KEYS[0] not in frame)
+        raise DatasetError(
+            f"{path}: frames[{lacking}] has no timestamp and not all frames have a time; a drive needs the time of "
+            "every image: add them, or state --hz where images of each camera were taken at a constant rate"
+        )
+    if seconds_per_time is None:
+        raise DatasetError(
+            "a transforms.json does not say it, so state --seconds-per-time: the seconds of a unit of timestamp or "
+            "time (1e-6 if microseconds, 1 if seconds, the drive's length if it goes from 0 to 1)"
+        )
+    return [
+        _microseconds(frame[key], seconds_per_time, key, f"{path}: frames[{number}]")
+        for number, frame in enumerate(values["frames"])
+    ]
+
+
+def _even_times(values: Mapping[str, Any], path: Path, hz: float) -> list[int]:
+    """Times at a constant rate, from 0: the images of each camera, or folder, in the order of the numbers in their
+    names."""
+    key = time_key(values)
+    if key is not None:
+        raise DatasetError(f"{path}: its frames have a {key}; leave out --hz, and state --seconds-per-time")
+    cameras: dict[tuple[str | None, str], list[tuple[list[Any], int]]] = {}
+    for number, frame in enumerate(values["frames"]):
+        record = f"{path}: frames[{number}]"
+        file = _file(frame, record)
+        order = [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
+        cameras.setdefault((_camera_name(frame, record), str(file.parent)), []).append((order, number))
+    times = [0] * len(values["frames"])
+    for of_camera in cameras.values():
+        for position, (_, number) in enumerate(sorted(of_camera)):
+            times[number] = round(position * 1e6 / hz)
+    return times
+
+
+def time_key(values: Mapping[str, Any]) -> str | None:
+    """The key that holds the times of frames; None where some have none."""
+    return next((key for key in TIME_KEYS if all(key in frame for frame in values["frames"])), None)
 
 
 def applied_transform(values: Mapping[str, Any], path: Path) -> np.ndarray:
@@ -162,11 +195,12 @@ def _microseconds(value: Any, seconds_per_time: float, key: str, record: str) ->
 def _lens(values: Mapping[str, Any], frame: Mapping[str, Any], image: Path, record: str) -> Lens:
     """The intrinsics of a frame, whose image must have the size that they are for."""
     fl_x, fl_y, cx, cy = (_number(values, frame, key, record) for key in ("fl_x", "fl_y", "cx", "cy"))
+    if not image.is_file():
+        wrong = "cannot be read (it is not a file)" if image.exists() else "is missing"
+        raise DatasetError(f"{record}: image {image} {wrong}")
     try:
         with Image.open(image) as opened:
             size = opened.size
-    except FileNotFoundError as error:
-        raise DatasetError(f"{record}: image {image} is missing") from error
     except DECODING_ERRORS as error:
         raise DatasetError(f"{record}: image {image} cannot be read ({error})") from error
     stated = [values.get(key, frame.get(key, found)) for key, found in zip(("w", "h"), size, strict=True)]
