@@ -8,7 +8,7 @@ from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.export import DriveJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("sweeps",)) as current:
     scene = read_scene(current.input.scene)
     checkpoint = read_checkpoint(current.input.checkpoint)
     provenance = current.provenance(scene.provenance, checkpoint.provenance)

@@ -1,16 +1,25 @@
 """The actors of a trained model that edits change."""
 
-from collections.abc import Iterable
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError, ResultError
+from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.trajectory import recorded_frames
-from drivesplat.scene.motion import Motion
+from drivesplat.scene.motion import HALF_STEP, Motion
+from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
+
+log = logging.getLogger(__name__)
+
+COLLISION_MARGIN = 0.5
+"""Metres around a box within which a camera sees little but the inside of the object."""
 
 
 def recorded_and_edited(
@@ -62,3 +71,45 @@ def other_objects(scene: Scene, actors: Iterable[EditedActor]) -> list[EditedAct
     ids = {actor.id for actor in actors}
     others = (track for track in scene.tracks if track.id not in ids)
     return [EditedActor.recorded(t.id, t.category, t.size, Motion.of_track(scene, t)) for t in others]
+
+
+def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list[list[ActorPlacement]]:
+    """The actors present at each of `seconds` (n,), with their poses and distances then and HALF_STEP before and
+    after."""
+    result: list[list[ActorPlacement]] = [[] for _ in seconds]
+    for actor in actors:
+        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix, phase=actor.phase)
+        times = [seconds + step for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
+        poses, walked = [actor.poses(at) for at in times], [actor.walked(at) for at in times]
+        for number in np.flatnonzero(actor.present(seconds)):
+            placement = own
+            if times:
+                pose, *around = (of_time[number] for of_time in poses)
+                distance, *beside = (float(of_time[number]) for of_time in walked)
+                placement = replace(
+                    own, object_to_world=pose, around=tuple(around), walked=distance, walked_around=tuple(beside)
+                )
+            result[number].append(placement)
+    return result
+
+
+def warn_of_collisions(
+    actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray, where: str
+) -> np.ndarray:
+    """The `collisions` of a camera, after a warning that begins with `where` if there are any."""
+    colliding = collisions(actors, camera_to_world, seconds)
+    if colliding.any():
+        first, last = seconds[colliding][[0, -1]]
+        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
+    return colliding
+
+
+def collisions(actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """The frames (n,) bool in which the camera is inside a box enlarged by COLLISION_MARGIN, and so shows the inside of
+    an object."""
+    inside = np.zeros(len(seconds), dtype=bool)
+    for actor in actors:
+        to_object = inverse(actor.poses(seconds))
+        camera = (to_object[:, :3, :3] @ camera_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
+        inside |= actor.present(seconds) & (np.abs(camera) < actor.size / 2 + COLLISION_MARGIN).all(axis=1)
+    return inside

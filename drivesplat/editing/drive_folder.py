@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
 from drivesplat.editing.rendered_drive import RenderedDrive, rendered_drive
 from drivesplat.io.prefetch import prefetch_items
@@ -18,7 +19,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.readers.drive.write import write_record
-from drivesplat.readers.nuscenes.write import write_nuscenes
+from drivesplat.readers.nuscenes.write import Labels, write_nuscenes
 from drivesplat.rendering.frames import film_frames
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import last_training_timestamp
@@ -55,15 +56,17 @@ def write_rendered_drive(
             pictures = prefetch_items(_pictures(model, drive, drive.views(device)))
             for frame, pixels in zip(drive.scene.frames, pictures, strict=True):
                 _write_jpeg(Path(frame.image_path), pixels)
-        _write_records(scene, drive, job, path, what, source, provenance)
+            trained_until = last_training_timestamp(scene, job.eval_camera, job.holdout)
+            drive, labels = labelled(scene, drive, trained_until, device, what)
+        _write_records(drive, labels, job, path, what, source, provenance)
     except BaseException:
         _remove(folder)
         raise
 
 
 def _write_records(
-    scene: Scene,
     drive: RenderedDrive,
+    labels: Labels,
     job: DriveJob,
     path: Path,
     what: str,
@@ -75,14 +78,15 @@ def _write_records(
     marked = replace(
         drive.scene,
         name=f"{source['scene']}_{source.get('edit') or source.get('trajectory')}",
-        description=f"Rendered by drivesplat, not recorded ({what}). {scene.description}".strip(),
+        description=f"Rendered by drivesplat, not recorded ({what}). {drive.scene.description}".strip(),
         provenance=provenance,
     )
     steps = None if job.edit is None else job.edit.model_dump(mode="json", exclude_none=True)["steps"]
-    trained_until = last_training_timestamp(scene, job.eval_camera, job.holdout)
-    rendered: dict[str, Any] = {**source, "steps": steps, "trained_until": trained_until}
+    rendered: dict[str, Any] = {
+        **source, "steps": steps, "trained_until": labels.trained_until, "shown_by": labels.shown_by
+    }  # fmt: skip
     log = {"logfile": "rendered-by-drivesplat", "vehicle": "rendered", "date_captured": "", "location": what}
-    write_nuscenes(marked, folder / TABLES, VERSION, log)
+    write_nuscenes(marked, labels, folder / TABLES, VERSION, log)
     write_json(folder / TABLES / "provenance.json", {"rendered": rendered, "provenance": provenance})
     write_record(path, replace(marked, tracks=drive.tracks), {**rendered, "provenance": provenance})
 

@@ -1,16 +1,17 @@
 """The stage `edit`: an edited drive as a film beside the recorded one, and as labels."""
 
-import logging
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivesplat.edited_motion.edited_actors import EditedActor
-from drivesplat.editing.actors import other_objects, recorded_and_edited
+from drivesplat.editing.actors import actor_placements, other_objects, recorded_and_edited, warn_of_collisions
 from drivesplat.editing.ego import edited_camera_path
+from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.editing.unseen_sides import UNSEEN, unseen_sides
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.part import ActorPlacement
@@ -21,18 +22,14 @@ from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.images import write_png
-from drivesplat.scene.motion import HALF_STEP
-from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob, TrajectorySettings
 
-log = logging.getLogger(__name__)
-
 DECIMALS = 6
 """Decimals of a pose in labels: micrometres, and 1e-4 degrees. More would double the size of the file."""
-COLLISION_MARGIN = 0.5
-"""Metres around a box within which a camera sees little but the inside of the object."""
+SHOWN_EVERY_S = 0.5
+"""Seconds between the frames in which labels look for the objects that the background shows."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +69,7 @@ def render_edit(
         changed = written_frames(files.frames, changed)
     write_film(files.film, still.pairs(shown, changed), after, model, panels, drive.notes)
     write_png(files.still, still.picture)
+    apart = max(1, round(SHOWN_EVERY_S * job.fps))
     images = [frame_name(files.frames, number) for number in range(len(after.cameras))] if job.frames else []
     return {
         **after.record(),
@@ -79,7 +77,7 @@ def render_edit(
         "edit": job.edit.model_dump(mode="json"),
         "still_frame": still.number,
         "images": images,
-        "tracks": track_labels(scene, drive, seconds),
+        "tracks": track_labels(drive.objects(scene, model), seconds, islice(after.views(device), 0, None, apart)),
     }
 
 
@@ -98,6 +96,12 @@ class EditedDrive:
         """The note in the caption of each edited frame."""
         return [UNSEEN if unseen else "" for unseen in unseen_sides(self.recorded, self.actors, self.after)]
 
+    def objects(self, scene: Scene, model: SplatModel) -> ShownObjects:
+        """The actors after the edit, and the other annotated movable objects, which stay as recorded."""
+        dynamic = {track.id for track in scene.tracks if track.object_class.is_dynamic}
+        others = [item for item in other_objects(scene, self.recorded) if item.id in dynamic]
+        return ShownObjects.of_scene(scene, model, self.actors, others)
+
 
 def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> EditedDrive:
     """The drive with the edit of `job`. Raises ConfigError, starting with `where` (the scene and the edit), if the edit
@@ -107,48 +111,6 @@ def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> E
     unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     before, after = (Shot(scene, cameras, job, (job.width, job.height)) for cameras in (unedited, path))
     return EditedDrive(recorded, actors, before, after)
-
-
-def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list[list[ActorPlacement]]:
-    """The actors present at each of `seconds` (n,), with their poses and distances then and HALF_STEP before and
-    after."""
-    result: list[list[ActorPlacement]] = [[] for _ in seconds]
-    for actor in actors:
-        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix, phase=actor.phase)
-        times = [seconds + step for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
-        poses, walked = [actor.poses(at) for at in times], [actor.walked(at) for at in times]
-        for number in np.flatnonzero(actor.present(seconds)):
-            placement = own
-            if times:
-                pose, *around = (of_time[number] for of_time in poses)
-                distance, *beside = (float(of_time[number]) for of_time in walked)
-                placement = replace(
-                    own, object_to_world=pose, around=tuple(around), walked=distance, walked_around=tuple(beside)
-                )
-            result[number].append(placement)
-    return result
-
-
-def warn_of_collisions(
-    actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray, where: str
-) -> np.ndarray:
-    """The `collisions` of a camera, after a warning that begins with `where` if there are any."""
-    colliding = collisions(actors, camera_to_world, seconds)
-    if colliding.any():
-        first, last = seconds[colliding][[0, -1]]
-        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
-    return colliding
-
-
-def collisions(actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """The frames (n,) bool in which the camera is inside a box enlarged by COLLISION_MARGIN, and so shows the inside of
-    an object."""
-    inside = np.zeros(len(seconds), dtype=bool)
-    for actor in actors:
-        to_object = inverse(actor.poses(seconds))
-        camera = (to_object[:, :3, :3] @ camera_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
-        inside |= actor.present(seconds) & (np.abs(camera) < actor.size / 2 + COLLISION_MARGIN).all(axis=1)
-    return inside
 
 
 def edited_frames(
@@ -194,29 +156,29 @@ def frame_name(folder: Path, number: int) -> str:
     return f"{folder.name}/{number:06d}.png"
 
 
-def track_labels(scene: Scene, drive: EditedDrive, seconds: np.ndarray) -> list[dict[str, Any]]:
-    """A record for every actor after the edit, then for every other annotated movable object, which stays as recorded;
-    `seconds` (n,) of frames.
+def track_labels(objects: ShownObjects, seconds: np.ndarray, views: Iterable[View]) -> list[dict[str, Any]]:
+    """A record for every object of an edited drive, first the actors; `seconds` (n,) of frames.
 
-    `size` is length, width, height in metres, `scale` included; `color_matrix` (3, 3) maps its RGB colours in [0, 1]
-    (None: unchanged); `object_to_world` (n times (4, 4)) is at the box
-    centre, rounded to 1e-6, None in frames where the object is absent.
+    `source` is the track whose Gaussians it has (None: it has none of its own); `shown_by` says what shows it in any of
+    `views` (see `ShownObjects.shown_by`); `size` is length, width, height in metres, `scale` included; `color_matrix`
+    (3, 3) maps its RGB colours in [0, 1] (None: unchanged); `object_to_world` (n times (4, 4)) is at the box centre,
+    rounded to 1e-6, None in frames where the object is absent.
     """
-    actors, dynamic = drive.actors, {track.id for track in scene.tracks if track.object_class.is_dynamic}
-    recorded = [item for item in other_objects(scene, drive.recorded) if item.id in dynamic]
-    labels = []
-    for i, actor in enumerate((*actors, *recorded)):
-        present, poses = actor.present(seconds), actor.poses(seconds).round(DECIMALS)
+    shown_by, labels = objects.shown_by(objects.seen_in_any(views)), []
+    for i, item in enumerate((*objects.actors, *objects.others)):
+        present, poses = item.present(seconds), item.poses(seconds).round(DECIMALS)
+        own = i < len(objects.actors)
         labels.append(
             {
-                "id": actor.id,
-                "category": actor.category,
-                "size": actor.size.tolist(),
-                "source": actor.source,
-                "scale": actor.scale,
-                "color_matrix": None if actor.color_matrix is None else actor.color_matrix.round(DECIMALS).tolist(),
-                "edited": actor.edited,
-                "editable": i < len(actors),
+                "id": item.id,
+                "category": item.category,
+                "size": item.size.tolist(),
+                "source": item.source if own else None,
+                "shown_by": shown_by[item.id],
+                "scale": item.scale,
+                "color_matrix": None if item.color_matrix is None else item.color_matrix.round(DECIMALS).tolist(),
+                "edited": item.edited,
+                "editable": own,
                 "object_to_world": [pose.tolist() if now else None for now, pose in zip(present, poses, strict=True)],
             }
         )

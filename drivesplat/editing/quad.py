@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import torch
 
-from drivesplat.editing.film import actor_placements, edited_drive, edited_frames
+from drivesplat.editing.actors import actor_placements
+from drivesplat.editing.film import edited_drive, edited_frames
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, write_film

@@ -8,9 +8,15 @@ import numpy as np
 import torch
 
 from drivesplat.edited_motion.edited_actors import EditedActor
-from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
+from drivesplat.editing.actors import (
+    actor_placements,
+    other_objects,
+    recorded_and_edited,
+    trained_actors,
+    warn_of_collisions,
+)
 from drivesplat.editing.ego import EgoEdit
-from drivesplat.editing.film import actor_placements, warn_of_collisions
+from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -32,13 +38,14 @@ RENDERED = "rendered"
 @dataclass(frozen=True)
 class RenderedDrive:
     """A drive to render. `scene` has its images, by their paths to be, which the model shows at `seconds` (n,); its
-    tracks are all annotated objects at key frames, and `tracks` are the same at LABEL_INTERVAL. `actors` are those of
-    an edit; None: all as trained."""
+    tracks are all annotated objects at key frames, and `tracks` are the same at LABEL_INTERVAL. `objects` are what the
+    model shows of them; `edited`: whether it has the actors of an edit."""
 
     scene: Scene
     seconds: np.ndarray
     tracks: tuple[Track, ...]
-    actors: Sequence[EditedActor] | None
+    objects: ShownObjects
+    edited: bool
 
     def views(self, device: torch.device) -> Iterator[View]:
         """The cameras of the images in order, on the device, as films have them: with the colours and the poses of the
@@ -55,7 +62,7 @@ class RenderedDrive:
 
     def placements(self) -> list[list[ActorPlacement]] | None:
         """The actors in each image and where they are; None where all are as trained."""
-        return None if self.actors is None else actor_placements(self.actors, self.seconds)
+        return actor_placements(self.objects.actors, self.seconds) if self.edited else None
 
 
 def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> RenderedDrive:
@@ -82,14 +89,16 @@ def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path,
     seconds = _seconds(scene, frames)
     camera_to_world = np.stack([frame.camera_to_world for frame in frames])
     warn_of_collisions(actors, camera_to_world, seconds, where)
-    objects, key_times = [*actors, *other_objects(scene, trained)], rendered.key_frame_timestamps
+    others, key_times = other_objects(scene, trained), rendered.key_frame_timestamps
+    objects = [*actors, *others]
     times = [*key_times.tolist(), *(frame.timestamp for frame in frames)]
     label_times = np.union1d(key_times, np.arange(min(times), max(times) + 1, LABEL_INTERVAL))
     return RenderedDrive(
         replace(rendered, tracks=_tracks(scene, objects, key_times)),
         seconds,
         _tracks(scene, objects, label_times),
-        None if job.edit is None else actors,
+        ShownObjects.of_scene(scene, model, actors, others),
+        job.edit is not None,
     )
 
 

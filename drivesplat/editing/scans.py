@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float64, Int, Int16
 
 from drivesplat.edited_motion.edited_actors import EditedActor
-from drivesplat.editing.actors import recorded_and_edited, trained_actors
+from drivesplat.editing.actors import actor_placements, collisions, recorded_and_edited, trained_actors
 from drivesplat.editing.ego import EgoEdit
-from drivesplat.editing.film import actor_placements, collisions
+from drivesplat.editing.shown_objects import parts_that_may_show
 from drivesplat.errors import ConfigError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.objects_met import TrackedBoxes
@@ -127,7 +127,8 @@ def scan_drive(
             raise ConfigError(f"{where}: scans of edits need images, and the scene has no camera")
         trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
         sensors = _carried(scene, scans, job.eval_camera, job.edit, where)
-    boxes = TrackedBoxes.of_scene(scene, without={actor.id for actor in trained})
+    unseen = {track.id for track in scene.tracks if not parts_that_may_show(track, model)}
+    boxes = TrackedBoxes.of_scene(scene, without=unseen | {actor.id for actor in trained})
     if sensors:
         poses, seconds = np.stack([s.sensor_to_world for s in sensors]), np.array([s.seconds for s in sensors])
         colliding = collisions(actors, poses, seconds)

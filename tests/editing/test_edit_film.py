@@ -26,9 +26,9 @@ from helpers.hand_made_traffic import placed
 from PIL import Image
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
-from drivesplat.editing.actors import editable_actors
+from drivesplat.editing.actors import actor_placements, collisions, editable_actors
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import EditFiles, Still, actor_placements, collisions, render_edit
+from drivesplat.editing.film import EditFiles, Still, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import read_footage
@@ -190,15 +190,15 @@ def test_labels_hold_the_pose_of_every_object_in_every_frame(scene, busy):
 
 def test_labels_hold_the_attributes_of_every_object(busy):
     known = {
-        track["id"]: [track[key] for key in ("source", "category", "scale", "edited", "editable")]
+        track["id"]: [track[key] for key in ("source", "shown_by", "category", "scale", "edited", "editable")]
         for track in busy.record["tracks"]
     }
     assert known == {
-        AHEAD: [AHEAD, "vehicle.car", 1.0, True, True],
-        "twin": [AHEAD, "vehicle.car", 1.0, True, True],
-        GONE: [GONE, "vehicle.truck", 1.3, True, True],
-        "0001 instance 1": ["0001 instance 1", "vehicle.truck", 1.0, False, False],
-        "0001 instance 2": ["0001 instance 2", "human.pedestrian.adult", 1.0, False, False],
+        AHEAD: [AHEAD, "own", "vehicle.car", 1.0, True, True],
+        "twin": [AHEAD, "own", "vehicle.car", 1.0, True, True],
+        GONE: [GONE, "own", "vehicle.truck", 1.3, True, True],
+        "0001 instance 1": [None, "none", "vehicle.truck", 1.0, False, False],
+        "0001 instance 2": [None, "none", "human.pedestrian.adult", 1.0, False, False],
     }
     np.testing.assert_allclose(busy.track(GONE)["size"], 1.3 * np.array(DRIVERS[GONE].size))
     np.testing.assert_allclose(busy.track("twin")["size"], DRIVERS[AHEAD].size)

@@ -20,9 +20,8 @@ from helpers.hand_made_traffic import placed
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.edited_motion.recolouring import color_matrix
-from drivesplat.editing.actors import editable_actors
+from drivesplat.editing.actors import actor_placements, editable_actors
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import actor_placements
 from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel

@@ -9,7 +9,7 @@ from helpers.hand_made import about_z, actors_of, motion_through, round_gaussian
 from torch import nn
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
-from drivesplat.editing.film import actor_placements
+from drivesplat.editing.actors import actor_placements
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanPicture, ScanView
 from drivesplat.model.splat_model import SplatModel

@@ -165,6 +165,9 @@ class Rendered(DriveRecord):
     """The steps of the edit."""
     trained_until: Timestamp | None = None
     """Time of the last training image of the evaluated camera: later images are extrapolated."""
+    shown_by: dict[str, str] = {}
+    """What shows each object, by its id: 'own', Gaussians of its own; the name of a part, such as 'background'; or
+    'none': it moves and has no Gaussians of its own, or no image of a key frame shows it. It has no boxes then."""
     provenance: dict[str, Any] = {}
     """Settings, code and inputs of all results behind the drive."""
 

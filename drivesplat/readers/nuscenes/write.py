@@ -1,5 +1,7 @@
 """Writes a scene as nuScenes tables, which nuscenes-devkit and the nuScenes reader load."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +19,49 @@ from drivesplat.scene.tracks import Box, box_at
 MOVING_VEHICLE, MOVING_PERSON, WITH_RIDER = "vehicle.moving", "pedestrian.moving", "cycle.with_rider"
 """Attributes that are written. Why an object stands, and whether a cycle has a rider, is not known otherwise."""
 CYCLES = (ObjectClass.BICYCLE, ObjectClass.MOTORCYCLE)
+REPEATED = (
+    "attribute_tokens", "instance_token", "next", "num_lidar_pts", "num_radar_pts", "prev", "visibility_token",
+    "shown_by",
+)  # fmt: skip
+"""The columns of annotations that the boxes in images repeat."""
+RIG_SPREAD = 100_000
+"""Microseconds, at most half a key-frame interval, by which a key frame and its images may be apart."""
+IMAGE_BOXES = "image_annotations"
+"""The table of boxes in images, which nuscenes-devkit's export_2d_annotations_as_json makes of recorded drives."""
 
 
-def write_nuscenes(scene: Scene, root: Path, version: str, log: dict[str, str]) -> None:
-    """Writes the tables of a scene without LiDAR below `root`/`version`, and hard links to its images, or copies, as
+@dataclass(frozen=True)
+class ImageBox:
+    """A box in the image of a key frame: left, top, right, bottom in continuous pixels, and the share of its object,
+    also of what lies outside the image, that is `visible` there."""
+
+    frame: Frame
+    track_id: str
+    corners: tuple[float, float, float, float]
+    visible: float
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the tables of a rendered drive say beyond its scene: what shows each track (`shown_by`), the LiDAR points of
+    each of its annotations, the boxes in images, and the time of the last training image in microseconds (None:
+    unknown)."""
+
+    shown_by: Mapping[str, str]
+    lidar_points: Mapping[str, Sequence[int]]
+    image_boxes: Sequence[ImageBox]
+    trained_until: int | None
+
+
+def write_nuscenes(scene: Scene, labels: Labels, root: Path, version: str, log: dict[str, str]) -> None:
+    """Writes the tables of a rendered scene below `root`/`version`, and hard links to its images, or copies, as
     nuScenes names them. `log` are the columns of its log, which names the vehicle.
 
     Image and ego poses are those of the scene; the mount of each camera is that of its first image. Boxes are those at
-    key frames; a visibility that is not known is an empty token.
+    key frames. Two columns are not nuScenes' own: `shown_by` of annotations, and `beyond_training` of samples and
+    images.
     """
-    tables = _SceneTables(scene, log)
+    tables = _SceneTables(scene, labels, log)
     for index, time in enumerate(scene.key_frame_timestamps.tolist()):
         tables.add_sample(index, time)
     mounts: dict[str, np.ndarray] = {}
@@ -38,15 +73,16 @@ def write_nuscenes(scene: Scene, root: Path, version: str, log: dict[str, str]) 
         link_or_copy(Path(frame.image_path), root / name)
     for track in scene.tracks:
         tables.add_track(track)
+    tables.add_image_boxes()
     tables.write(root, version)
 
 
 class _SceneTables(TableRows):
     """The tables of one scene. Poses of the scene become global ones."""
 
-    def __init__(self, scene: Scene, log: dict[str, str]):
+    def __init__(self, scene: Scene, labels: Labels, log: dict[str, str]):
         super().__init__(token(scene.name, "log"), log, (MOVING_VEHICLE, MOVING_PERSON, WITH_RIDER))
-        self._scene, self._origin = scene, rigid(np.eye(3), scene.origin)
+        self._scene, self._labels, self._origin = scene, labels, rigid(np.eye(3), scene.origin)
         count = len(scene.key_frame_timestamps)
         self.add(
             "scene", token(scene.name), log_token=token(scene.name, "log"), nbr_samples=count,
@@ -56,7 +92,10 @@ class _SceneTables(TableRows):
 
     def add_sample(self, index: int, time: int) -> None:
         """Adds a key frame."""
-        self.add_linked("sample", (), self._sample(index), timestamp=time, scene_token=token(self._scene.name))
+        self.add_linked(
+            "sample", (), self._sample(index), timestamp=time, scene_token=token(self._scene.name),
+            beyond_training=self._beyond_training(time),
+        )  # fmt: skip
 
     def add_camera(self, frame: Frame, mount: np.ndarray) -> None:
         """Adds the camera of an image, with its pose (4, 4) on the vehicle."""
@@ -78,6 +117,7 @@ class _SceneTables(TableRows):
             "sample_data", (camera,), name, sample_token=self._sample(frame.sample_index), ego_pose_token=name,
             calibrated_sensor_token=token(scene, "calibrated", camera), timestamp=time, fileformat=suffix[1:],
             is_key_frame=frame.is_key_frame, width=frame.width, height=frame.height, filename=path,
+            beyond_training=self._beyond_training(time),
         )  # fmt: skip
         return path
 
@@ -86,13 +126,37 @@ class _SceneTables(TableRows):
         name, category = self._scene.name, category_of(track.object_class, track.category)
         for i, index in enumerate(track.sample_indices.tolist()):
             box = box_at(track, int(track.timestamps[i]), self._scene.key_frame_interval)
-            level = int(track.visibility[i])
             self.add_annotation(
                 (name, "annotation", track.id, index), token(name, "instance", track.id), category, track.size,
-                sample_token=self._sample(index), visibility_token=str(level) if level else "",
-                attribute_tokens=_attributes(box), num_lidar_pts=0,
-                **self._global(track.object_to_world[i]),
+                sample_token=self._sample(index), visibility_token=str(int(track.visibility[i])),
+                attribute_tokens=_attributes(box), num_lidar_pts=self._labels.lidar_points[track.id][i],
+                shown_by=self._labels.shown_by[track.id], **self._global(track.object_to_world[i]),
             )  # fmt: skip
+
+    def add_image_boxes(self) -> None:
+        """Adds the boxes in images, with the columns of their annotations as nuscenes-devkit repeats them."""
+        scene, annotations = self._scene, {row["token"]: row for row in self.rows["sample_annotation"]}
+        categories = {row["token"]: row["name"] for row in self.rows["category"]}
+        category_of_instance = {row["token"]: categories[row["category_token"]] for row in self.rows["instance"]}
+        files = {row["token"]: row["filename"] for row in self.rows["sample_data"]}
+        self.rows[IMAGE_BOXES] = []
+        for box in self._labels.image_boxes:
+            image = token(scene.name, box.frame.camera, box.frame.timestamp)
+            name = token(scene.name, "annotation", box.track_id, box.frame.sample_index)
+            if (row := annotations.get(name)) is None:
+                continue  # the object is there at the time of the image, and not at that of the key frame
+            self.rows[IMAGE_BOXES].append(
+                {
+                    **{column: row[column] for column in REPEATED},
+                    "category_name": category_of_instance[row["instance_token"]], "sample_annotation_token": name,
+                    "sample_data_token": image, "filename": files[image], "bbox_corners": list(box.corners),
+                    "visible_share": round(box.visible, 3),
+                }
+            )  # fmt: skip
+
+    def _beyond_training(self, time: int) -> bool:
+        until, slack = self._labels.trained_until, min(RIG_SPREAD, self._scene.key_frame_interval / 2.0)
+        return until is not None and time > until + slack
 
     def _sample(self, index: int) -> str:
         return token(self._scene.name, "sample", index)

@@ -1,0 +1,155 @@
+"""The annotated objects that renderings of a drive show: by Gaussians of their own, or with the background."""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from drivesplat.edited_motion.edited_actors import EditedActor
+from drivesplat.editing.actors import actor_placements
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.regions import fill, hull_of
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.tracks import Box
+
+OWN, NONE = "own", "none"
+"""What shows an object besides the names of parts: Gaussians of its own, or nothing."""
+MIN_TRAVEL, MAX_TRAVEL_SHARE = 0.5, 0.25
+"""A background cannot show an object that travels farther than this, metres and a share of its length: it smears it."""
+MIN_SEEN = 0.05
+"""Share of the pixels of a box from which an image shows its object."""
+MARGIN, FLOOR_SHARE = 0.1, 0.1
+"""Metres by which a box is enlarged at its sides and roof for the Gaussians of the background that show its object, and
+share of its height by which its floor is raised above those of the road."""
+
+
+@dataclass(frozen=True)
+class SeenObject:
+    """An object in an image: the projected box, clipped to the image, as left, top, right, bottom in continuous pixels;
+    and the share of the object, also of what lies outside the image, that is `visible` in it."""
+
+    id: str
+    corners: tuple[float, float, float, float]
+    visible: float
+
+
+@dataclass(frozen=True)
+class ShownObjects:
+    """The objects of a drive: the `actors` of a model as they now are, and `others`, annotated objects of which it has
+    no Gaussians. `parts` are the parts of the model that may show each of the others."""
+
+    model: SplatModel
+    actors: Sequence[EditedActor]
+    others: Sequence[EditedActor]
+    parts: Sequence[frozenset[str]]
+
+    @classmethod
+    def of_scene(
+        cls, scene: Scene, model: SplatModel, actors: Sequence[EditedActor], others: Sequence[EditedActor]
+    ) -> "ShownObjects":
+        """The objects of a scene; `others` are tracks of it."""
+        tracks = {track.id: track for track in scene.tracks}
+        return cls(model, actors, others, [parts_that_may_show(tracks[item.id], model) for item in others])
+
+    def shown_by(self, seen: Collection[str]) -> dict[str, str]:
+        """What shows each object, by its id: OWN, the name of a part, or NONE. `seen` are the ids of those that images
+        show."""
+        names = {actor.id: OWN for actor in self.actors}
+        for item, parts in zip(self.others, self.parts, strict=True):
+            names[item.id] = min(parts) if parts and item.id in seen else NONE
+        return names
+
+    def seen_in_any(self, views: Iterable[View]) -> set[str]:
+        """The ids of the others that any of the views shows."""
+        seen: set[str] = set()
+        for view in views:
+            wanted = [i for i, item in enumerate(self.others) if self.parts[i] and item.id not in seen]
+            rest = replace(self, others=[self.others[i] for i in wanted], parts=[self.parts[i] for i in wanted])
+            seen |= {found.id for found in rest._seen(view, with_actors=False)} if wanted else set()
+        return seen
+
+    def seen_in(self, view: View) -> list[SeenObject]:
+        """The objects that a view shows."""
+        return self._seen(view, with_actors=True)
+
+    @torch.no_grad()
+    def _seen(self, view: View, with_actors: bool) -> list[SeenObject]:
+        now = np.array([view.time])
+        present = [actor for actor in self.actors if actor.present(now)[0]]
+        (placements,) = actor_placements(present, now)
+        gaussians = self.model.gaussians_with_placements(view.time, placements)
+        placed = [part.placement_of_rows(placements) for part in self.model.parts]
+        found = []
+        if with_actors:
+            owner = torch.cat(placed)
+            found += [_seen_object(self, gaussians, owner == i, actor, view) for i, actor in enumerate(present)]
+        part_of_row = torch.cat([torch.full_like(rows, i) for i, rows in enumerate(placed)])
+        for item, parts in zip(self.others, self.parts, strict=True):
+            if parts and item.present(now)[0]:
+                rows = _in_box(gaussians, item.poses(now)[0], item.size) & self._rows_of(parts, part_of_row)
+                found.append(_seen_object(self, gaussians, rows, item, view))
+        return [item for item in found if item is not None]
+
+    def _rows_of(self, parts: frozenset[str], part_of_row: Int[Tensor, " n"]) -> Bool[Tensor, " n"]:
+        wanted = torch.tensor([part.name in parts for part in self.model.parts], device=part_of_row.device)
+        return wanted[part_of_row]
+
+
+def parts_that_may_show(track: Track, model: SplatModel) -> frozenset[str]:
+    """The parts of a model that may show an object of which it has no Gaussians: static ones where it stands, and those
+    that move without objects where it travels."""
+    places = track.object_to_world[:, :2, 3]
+    farthest = float(np.linalg.norm(np.ptp(places, axis=0)))
+    travels = farthest > max(MIN_TRAVEL, MAX_TRAVEL_SHARE * float(track.size[0]))
+    return frozenset(part.name for part in model.parts if not part.has_objects and part.moves == travels)
+
+
+def _seen_object(
+    shown: ShownObjects, gaussians: Gaussians, rows: Bool[Tensor, " n"], item: EditedActor, view: View
+) -> SeenObject | None:
+    """An object in a view that the `rows` of the Gaussians show; None where the image does not show it."""
+    pose = item.poses(np.array([view.time]))[0]
+    box = Box(item.id, ObjectClass.VEHICLE, item.category, item.size, pose, 0.0, 0)
+    polygon = hull_of(box, view.viewmat.cpu().double().numpy(), view.K.cpu().double().numpy())
+    if polygon is None or not bool(rows.any()):
+        return None
+    size = np.array([view.width, view.height])
+    low, high = polygon.min(axis=0), polygon.max(axis=0)
+    corners = np.concatenate([low.clip(0, size), high.clip(0, size)])
+    pixels = int(fill(polygon, (view.width, view.height)).sum())
+    if not pixels:
+        return None
+    inside = _cropped(view, corners[:2], corners[2:])
+    whole = _cropped(view, low.clip(-size, 2 * size), high.clip(-size, 2 * size))
+    share = shown.model.composited(gaussians, rows.to(gaussians.means)[:, None], inside).image.sum()
+    if share < MIN_SEEN * pixels:
+        return None
+    own = gaussians[rows]
+    alone = shown.model.composited(own, own.means.new_ones(len(own), 1), whole).alpha.sum()
+    return SeenObject(item.id, tuple(corners.tolist()), min(1.0, float(share / alone)))
+
+
+def _cropped(view: View, low: np.ndarray, high: np.ndarray) -> View:
+    """The part of a view between two corners, which may lie outside of its image."""
+    left, top = np.floor(low).astype(int).tolist()
+    right, bottom = np.ceil(high).astype(int).tolist()
+    shifted = view.K.clone()
+    shifted[0, 2] -= left
+    shifted[1, 2] -= top
+    return replace(view, K=shifted, width=max(1, right - left), height=max(1, bottom - top))
+
+
+def _in_box(gaussians: Gaussians, pose: np.ndarray, size: Float[np.ndarray, "3"]) -> Bool[Tensor, " n"]:
+    """The Gaussians whose centres lie in a box of the background."""
+    means, half = gaussians.means, size / 2
+    to_object = torch.from_numpy(inverse(pose)).to(means)
+    local = means @ to_object[:3, :3].T + to_object[:3, 3]
+    low, high = -half - [MARGIN, MARGIN, -FLOOR_SHARE * size[2]], half + MARGIN
+    return ((local > torch.from_numpy(low).to(means)) & (local < torch.from_numpy(high).to(means))).all(dim=1)
