@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
+from drivesplat.readers.outline import unknown_beams
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scan import Scan, ScanRays, wrapped
 from drivesplat.scene.scene import Sweep
@@ -184,9 +185,7 @@ def _beams(returns: LidarReturns, lidar: Lidar, elevations: np.ndarray) -> tuple
     known, rings = lidar.beam_elevations, returns.rings
     if rings is None:
         if known is None:
-            raise DatasetError(
-                f"LiDAR {lidar.name}: its returns have no rings and its beam_elevations are unknown; give one of them"
-            )
+            raise DatasetError(unknown_beams(lidar.name))
         order = np.argsort(known)
         return order[np.searchsorted(0.5 * (known[order][1:] + known[order][:-1]), elevations)], known
     if known is not None and (not len(rings) or rings.max() < len(known)):

@@ -22,6 +22,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility, in_image
 from drivesplat.lidar.sweeps import outside_boxes, thin, world_returns
 from drivesplat.poses.triangulated import TriangulatedPoints
+from drivesplat.readers.outline import without_lidar, without_training
 from drivesplat.readers.sweeps import sweep_fault
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
@@ -57,10 +58,7 @@ def seed_points(
     random = np.random.default_rng(job.random_seed)
     frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
     if not frames:
-        raise DatasetError(
-            f"scene {scene.name}: the hold-out leaves none of its {len(scene.key_frame_timestamps)} key frames to "
-            "train on; lower holdout.last_block, or set holdout.every_nth: 0"
-        )
+        raise DatasetError(without_training(scene.name, len(scene.key_frame_timestamps)))
     lidar, times, missing = lidar_points(scene, job)
     middle = float(np.median(scene.key_frame_timestamps))
     extra = extra_points(scene, job.lidar_seed.points_file)
@@ -99,9 +97,7 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
     'stop'."""
     settings = job.lidar_seed
     if not scene.sweeps and settings.on_missing == "stop":
-        raise DatasetError(
-            f"scene {scene.name} has no LiDAR sweeps; set lidar_seed.on_missing: warn to seed from images alone"
-        )
+        raise DatasetError(without_lidar(scene.name))
     positions, times, missing = [np.empty((0, 3))], [np.empty(0)], 0
     moving = moving_tracks(scene)
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
