@@ -21,7 +21,7 @@ class RecordedCamera:
 @dataclass(frozen=True)
 class Outline:
     """The cameras of a recording by name, the times of its key frames (microseconds), the number of its LiDAR sweeps,
-    and the LiDARs whose beams are unknown, so that their rays cannot be told."""
+    and the LiDARs whose beams are unknown, and thereby their rays."""
 
     cameras: Mapping[str, RecordedCamera]
     key_frames: Sequence[int]
@@ -77,7 +77,7 @@ def without_scans(scene: str) -> str:
 
 
 def unknown_beams(lidar: str) -> str:
-    """A sentence about a LiDAR whose rays cannot be told."""
+    """A sentence about a LiDAR whose rays are unknown."""
     return f"LiDAR {lidar}: its returns have no rings and its beam_elevations are unknown; give one of them"
 
 
