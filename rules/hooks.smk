@@ -23,7 +23,7 @@ rule estimate:
 
 
 if workflow.is_main_process:
-    snakemake_logger.addFilter(when_planned(workflow, plan.refuse_jobs))
+    snakemake_logger.addFilter(when_planned(workflow, plan.check_jobs))
 
 
 onstart:

@@ -5,6 +5,7 @@ Everything here must import and run quickly: it runs in the main process and in 
 
 import os
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -77,10 +78,12 @@ class Plan(JobResources):
         references = track_references(self.config, wildcards.scene, self.targets, self.tracks(wildcards))
         return canonical_json(references.model_dump(mode="json"))
 
-    def refuse_jobs(self, jobs: Iterable[Any]) -> None:
-        """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that settings name, or on
-        what a recording lacks."""
+    def check_jobs(self, jobs: Iterable[Any]) -> None:
+        """Prints which of Snakemake's planned `jobs` have images that exceed a GPU. Raises ConfigError where one would
+        fail on a track that settings name, or on what a recording lacks."""
         planned = list(jobs)
+        for sentence in self.recordings.large_images(planned):
+            print(f"drivesplat: {sentence}", file=sys.stderr)
         self.recordings.refuse_unfit(planned)
         refuse_wrong_tracks(self.config, planned, self.shown_scene, self.recordings.has_same_world)
 

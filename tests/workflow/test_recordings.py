@@ -56,7 +56,7 @@ def refusal(made: Plan, *rules: str, scene: str = "one") -> str | None:
     wildcards = SimpleNamespace(scene=scene)
     jobs = [SimpleNamespace(rule=SimpleNamespace(name=rule), wildcards=wildcards, output=[""]) for rule in rules]
     try:
-        made.refuse_jobs(jobs)
+        made.check_jobs(jobs)
     except ConfigError as error:
         return str(error)
     return None
@@ -213,3 +213,52 @@ def test_a_world_that_only_gets_another_edit_keeps_its_tracks(tmp_path):
     assert not Plan({"datasets": {"w": other}, "results_dir": str(results)}, str(REPOSITORY)).recordings.has_same_world(
         "w"
     )
+
+
+def test_images_that_exceed_the_required_gpu_memory_are_named_at_planning(tmp_path, capsys):
+    """1,116 images of 3840x2160 in uint8: 27.8 GB."""
+    frames = [{"camera": "front", "timestamp": 500_000 * i, "file": f"{i}.jpg"} for i in range(1116)]
+    drive = changed(frames=frames, cameras={"front": {"width": 3840, "height": 2160}})
+    everything = {"holdout": {"every_nth": 0, "last_block": 0}}
+    card = {"device": {"kind": "cuda", "min_free_gb": 16}}
+    made = plan(tmp_path, {"one": drive}, **everything, **card)
+    assert made.recordings.image_gb("one") == pytest.approx(1116 * 3840 * 2160 * 3e-9)
+    assert refusal(made, "extract", "train") is None
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("drivesplat: scene one: its training images take 27.8 GB of GPU memory, and ")
+    assert "device.min_free_gb asks for 16 GB alone; set images.width, " in line
+    assert made.recordings.training_mb(SimpleNamespace(scene="one")) == 16_000 + 27_770
+    fitting = [{"images": {"width": 1920}}, {"device": {"kind": "cuda", "min_free_gb": 40}}, {"device": "cpu"}]
+    for values in fitting:
+        smaller = Plan({**made.config.model_dump(mode="json"), **values}, str(REPOSITORY))
+        assert refusal(smaller, "train") is None
+    assert refusal(made, "extract") is None
+    assert not capsys.readouterr().err
+
+
+def test_the_size_of_training_images_counts_cameras_ranges_and_the_hold_out(tmp_path):
+    of_one = 1600 * 900 * 3e-9
+    mine = {"reader": "drive", "dataroot": str(tmp_path), "scenes": ["one"]}
+    made = plan(tmp_path, {"one": DRIVE})
+    assert made.recordings.image_gb("one") == pytest.approx(5 * of_one), "10 without the 5th and the last four"
+    config = {**made.config.model_dump(mode="json"), "holdout": {"every_nth": 0, "last_block": 0}}
+    for values, images in (
+        ({}, 10),
+        ({"cameras": ["front", "back"]}, 20),
+        ({"cameras": ["front", "back"], "holdout": {**config["holdout"], "cameras": ["back"]}}, 10),
+        ({"datasets": {"mine": {**mine, "frames": {"one": (2, 6)}}}}, 4),
+        ({"images": {"width": 800}}, 10 / 4),
+    ):
+        found = Plan({**config, **values}, str(REPOSITORY)).recordings.image_gb("one")
+        assert found == pytest.approx(images * of_one), values
+
+
+def test_the_size_of_other_recordings_is_known_once_they_are_extracted(tmp_path):
+    made = Plan({"datasets": {"n": {"scenes": ["a1"]}}, "results_dir": str(tmp_path)}, str(REPOSITORY))
+    assert made.recordings.image_gb("a1") is None
+    assert made.recordings.training_mb(SimpleNamespace(scene="a1")) == 16_000
+    frames = [{"camera": "CAM_FRONT", "width": 1600, "height": 900}] * 40
+    scene = {"frames": frames, "key_frame_timestamps": [500_000 * i for i in range(40)], "sweeps": []}
+    (tmp_path / "a1").mkdir()
+    (tmp_path / "a1/scene.json").write_text(json.dumps(scene))
+    assert made.recordings.image_gb("a1") == pytest.approx(32 * 1600 * 900 * 3e-9), "without 4, 12, 20, 28 and 36 to 39"
