@@ -19,7 +19,7 @@ from drivesplat.io.this_copy import in_this_copy
 from drivesplat.workflow.module_use import module_config, stop_at_absent_data, take_prefix
 from drivesplat.workflow.named_tracks import run_targets
 from drivesplat.workflow.plan import Plan, let_scripts_import
-from drivesplat.workflow.snakemake_reasons import name_changes
+from drivesplat.workflow.snakemake_log import name_changes, when_planned
 
 let_scripts_import(here)
 snakemake_logger.addFilter(name_changes)

@@ -1,4 +1,5 @@
-# Hooks of a run: the estimate and the lock at its start, costs and partial report at its end.
+# Hooks of a run: the check of its jobs (in a dry run, too), the estimate and the lock at its start, costs and partial
+# report at its end.
 #
 # REQUIRED INPUTS: none.
 # OUTPUTS: <results>/costs.csv and costs.json, of all jobs that have run; where jobs failed, the partial report. No rule
@@ -21,12 +22,15 @@ rule estimate:
         [] if wanted else rules.all.input,
 
 
+if workflow.is_main_process:
+    snakemake_logger.addFilter(when_planned(workflow, plan.check_jobs))
+
+
 onstart:
     if workflow.is_main_process:
         if run_costs.print_estimate():
             sys.exit(0)
         try:
-            plan.refuse_wrong_tracks(workflow.dag.needrun_jobs())
             plan.hold_results()
         except DriveSplatError as error:
             sys.exit(f"drivesplat: {error}")

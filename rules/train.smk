@@ -31,7 +31,7 @@ rule train:
     resources:
         gpu=plan.gpus,
         device=plan.device,
-        mem_mb=16000,
+        mem_mb=plan.recordings.training_mb,
         runtime=240,
     params:
         settings=plan.settings("train"),

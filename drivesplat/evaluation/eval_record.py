@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drivesplat.scene.splits import NEIGHBOURHOOD_HZ
-from drivesplat.settings.images import HoldoutSettings
+from drivesplat.settings.images import NEIGHBOURHOOD_HZ, HoldoutSettings
 
 
 def training_figures(summary: dict[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
+from drivesplat.readers.outline import unknown_beams
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scan import Scan, ScanRays, wrapped
 from drivesplat.scene.scene import Sweep
@@ -192,11 +193,7 @@ def _beams(returns: LidarReturns, lidar: Lidar, elevations: np.ndarray) -> tuple
     known, rings = lidar.beam_elevations, returns.rings
     if rings is None:
         if known is None:
-            raise DatasetError(
-                f"LiDAR {lidar.name}: its returns have no rings and its beam_elevations are unknown, and methods that "
-                "render LiDAR need its rows and columns; give one of them. A LiDAR without beams, as many solid-state "
-                "ones, has neither: leave these methods and discovered tracks out (docs/lidar.md); all else works"
-            )
+            raise DatasetError(unknown_beams(lidar.name))
         nearest, deviations = _nearest(elevations, known)
         if len(elevations) >= MIN_COMPARED:
             beyond, median = float((deviations > 1.0).mean()), float(np.median(deviations))

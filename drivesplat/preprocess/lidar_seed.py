@@ -8,6 +8,7 @@ Held-out images and sweeps contribute neither LiDAR positions nor colours.
 """
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility, in_image
 from drivesplat.lidar.sweeps import outside_boxes, thin, world_returns
 from drivesplat.poses.triangulated import TriangulatedPoints
+from drivesplat.readers.outline import without_lidar, without_training
 from drivesplat.readers.sweeps import sweep_fault
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
@@ -36,6 +38,8 @@ from drivesplat.settings.lidar_seed import SeedJob
 
 log = logging.getLogger(__name__)
 
+THINNED_TOGETHER = 2_000_000
+"""Number of new points at which all are thinned, so that memory grows with occupied voxels and not with sweeps."""
 COVERAGE_CELL = 8
 """Edge length in pixels of the image cell that a seed point covers."""
 RAISED = 1.0
@@ -61,10 +65,7 @@ def seed_points(
     random = np.random.default_rng(job.random_seed)
     frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
     if not frames:
-        raise DatasetError(
-            f"scene {scene.name}: the hold-out leaves none of its {len(scene.key_frame_timestamps)} key frames to "
-            "train on; lower holdout.last_block, or set holdout.every_nth: 0"
-        )
+        raise DatasetError(without_training(scene.name, len(scene.key_frame_timestamps)))
     lidar, times, missing = lidar_points(scene, job)
     middle = float(np.median(scene.key_frame_timestamps))
     extra = extra_points(scene, job.lidar_seed.points_file)
@@ -106,10 +107,8 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
     'stop'."""
     settings = job.lidar_seed
     if not scene.sweeps and settings.on_missing == "stop":
-        raise DatasetError(
-            f"scene {scene.name} has no LiDAR sweeps; set lidar_seed.on_missing: warn to seed from images alone"
-        )
-    positions, times, missing = [np.empty((0, 3))], [np.empty(0)], 0
+        raise DatasetError(without_lidar(scene.name))
+    kept, new, missing = (np.empty((0, 3)), np.empty(0)), [], 0
     moving = moving_tracks(scene)
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
         try:
@@ -124,13 +123,20 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
             continue
         boxes = boxes_of(moving, sweep.timestamp, scene.key_frame_interval)
         points = points[outside_boxes(points, boxes, settings.box_margin)]
-        positions.append(points)
-        times.append(np.full(len(points), sweep.timestamp, dtype=np.float64))
+        new.append((points, np.full(len(points), sweep.timestamp, dtype=np.float64)))
+        if settings.voxel_size and sum(len(points) for points, _ in new) > THINNED_TOGETHER:
+            kept, new = _thinned([kept, *new], settings.voxel_size), []
     if missing:
         log.warning("%d of %d LiDAR sweeps are missing; seeding without them", missing, len(scene.sweeps))
-    merged, merged_times = np.concatenate(positions), np.concatenate(times)
-    kept = thin(merged, settings.voxel_size)
-    return merged[kept], merged_times[kept], missing
+    return *_thinned([kept, *new], settings.voxel_size), missing
+
+
+def _thinned(parts: Sequence[tuple[np.ndarray, np.ndarray]], voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points and times of all parts, with the first point of each voxel alone: those that stay are the same in
+    whatever groups sweeps are thinned."""
+    positions, times = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    kept = thin(positions, voxel)
+    return positions[kept], times[kept]
 
 
 def extra_points(scene: Scene, path: str | None) -> np.ndarray:

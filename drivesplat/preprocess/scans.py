@@ -13,6 +13,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.lidar.objects_met import TrackedBoxes
 from drivesplat.lidar.scans import SensorPoses, mean_velocity, scan_of, sensor_poses
 from drivesplat.lidar.unmeasured import blocked_rays, measured_rays
+from drivesplat.readers.outline import without_scans
 from drivesplat.readers.sweeps import read_returns, read_scan
 from drivesplat.scene.scan import Scan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan, ScanRecords
@@ -57,10 +58,7 @@ def scan_records(scene: Scene, job: ScansJob) -> ScanRecords:
             for item, rays, hidden in zip(found, measured, blocked, strict=True)
         ]
     if not records:
-        raise DatasetError(
-            f"scene {scene.name} has no LiDAR sweep that gives a scan; leave out methods that render LiDAR, and give "
-            "those with tracks: discovered other tracks (annotated or none, docs/without_boxes.md)"
-        )
+        raise DatasetError(without_scans(scene.name))
     rays = sum(record.scan.returned.size for record in records)
     log.info(
         "%d scans with %d rays: %.1f %% return, %.1f %% say nothing, %.1f %% are blocked by the vehicle",

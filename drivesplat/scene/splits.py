@@ -6,21 +6,17 @@ from typing import Literal
 import numpy as np
 
 from drivesplat.scene.scene import Frame, Scene, Sweep
-from drivesplat.settings.images import HoldoutSettings
+from drivesplat.settings.images import NEIGHBOURHOOD_HZ, HoldoutSettings
 
 Group = Literal["train", "interpolation", "extrapolation", "side_camera", "excluded"]
-NEIGHBOURHOOD_HZ = 5.0
-"""Key frames a second from which `holdout.neighbourhood_s` applies."""
 HELD_OUT_GROUPS: tuple[Group, Group] = ("interpolation", "extrapolation")
 SIDE_CAMERA: Group = "side_camera"
 """The group of images of `holdout.cameras` at times at which other cameras have training images."""
 
 
 def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[int]]:
-    """Held-out indices by group, of `count` key frames. A key frame in both groups belongs to the last block."""
-    block = list(range(max(0, count - holdout.last_block), count))
-    nth = range(holdout.offset, count, holdout.every_nth) if holdout.every_nth else range(0)
-    return {"interpolation": [i for i in nth if i not in block], "extrapolation": block}
+    """Held-out indices by group, of `count` key frames."""
+    return holdout.held_out(count)
 
 
 def frame_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:

@@ -4,6 +4,9 @@ from pydantic import Field, model_validator
 
 from drivesplat.settings import Settings
 
+NEIGHBOURHOOD_HZ = 5.0
+"""Key frames a second from which `holdout.neighbourhood_s` applies."""
+
 
 class ImageSettings(Settings):
     width: int | None = Field(None, ge=16, le=10_000)
@@ -33,6 +36,12 @@ class HoldoutSettings(Settings):
                 f"offset must be at most every_nth ({self.every_nth}): it is the first key frame that is held out"
             )
         return self
+
+    def held_out(self, count: int) -> dict[str, list[int]]:
+        """Held-out indices by group, of `count` key frames. A key frame in both groups belongs to the last block."""
+        block = list(range(max(0, count - self.last_block), count))
+        nth = range(self.offset, count, self.every_nth) if self.every_nth else range(0)
+        return {"interpolation": [i for i in nth if i not in block], "extrapolation": block}
 
 
 class ParserJob(Settings):

@@ -127,14 +127,21 @@ def _of_edit(name: str, edit: Edit) -> Iterable[EditReference]:
         copies += [change.name] if hasattr(change, "name") else []
 
 
-def refuse_wrong_tracks(config: Config, jobs: Iterable[Any], scene_file: Callable[[Any], str]) -> None:
+def refuse_wrong_tracks(
+    config: Config,
+    jobs: Iterable[Any],
+    scene_file: Callable[[Any], str],
+    keeps_tracks: Callable[[str], bool] = lambda _: False,
+) -> None:
     """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that the settings name. Records
     that this run makes are left to the stages `extract`, `relabel` and `actors`, which make the same check.
 
-    `scene_file` gives the path of the scene record whose tracks a job shows by its wildcards.
+    `scene_file` gives the path of the scene record whose tracks a job shows by its wildcards; `keeps_tracks` tells of a
+    scene whether a record that is made again has the same tracks as before.
     """
     planned = [job for job in jobs if hasattr(job.wildcards, "scene")]
     extracted = {job.wildcards.scene for job in planned if job.rule.name == "extract"}
+    extracted = {scene for scene in extracted if not keeps_tracks(scene)}
     made = {str(job.output[0]) for job in planned if job.rule.name == "relabel"}
     for job in planned:
         rule, scene = job.rule.name, job.wildcards.scene

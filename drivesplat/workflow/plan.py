@@ -5,6 +5,7 @@ Everything here must import and run quickly: it runs in the main process and in 
 
 import os
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,7 @@ from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
 from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
+from drivesplat.workflow.recordings import Recordings
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
@@ -49,6 +51,7 @@ class Plan(JobResources):
         super().__init__(load(values), Path(basedir) / SCRIPTS, prefix, is_main)
         self.targets: list[str] | None = None
         """The targets of the run; None where they are not known."""
+        self.recordings = Recordings(self)
         self._held_lock: Any = None
 
     def settings(self, stage: str) -> Callable[[Any], str]:
@@ -75,9 +78,14 @@ class Plan(JobResources):
         references = track_references(self.config, wildcards.scene, self.targets, self.tracks(wildcards))
         return canonical_json(references.model_dump(mode="json"))
 
-    def refuse_wrong_tracks(self, jobs: Iterable[Any]) -> None:
-        """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that settings name."""
-        refuse_wrong_tracks(self.config, jobs, self.shown_scene)
+    def check_jobs(self, jobs: Iterable[Any]) -> None:
+        """Prints which of Snakemake's planned `jobs` have images that exceed a GPU. Raises ConfigError where one would
+        fail on a track that settings name, or on what a recording lacks."""
+        planned = list(jobs)
+        for sentence in self.recordings.large_images(planned):
+            print(f"drivesplat: {sentence}", file=sys.stderr)
+        self.recordings.refuse_unfit(planned)
+        refuse_wrong_tracks(self.config, planned, self.shown_scene, self.recordings.has_same_world)
 
     def known(self, names: Any) -> str:
         """A wildcard constraint that matches only these names."""

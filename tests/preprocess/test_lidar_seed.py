@@ -473,6 +473,21 @@ def test_points_are_subsampled_to_the_limit_at_random(tiny_scene, limit):
     assert rows(thinned.positions) < rows(whole.positions)
 
 
+def test_memory_of_lidar_points_grows_with_voxels_and_their_points_are_the_same(tiny_scene, monkeypatch):
+    """However many sweeps there are: here the same ones 20 times."""
+    often = dataclasses.replace(tiny_scene, sweeps=tiny_scene.sweeps * 20)
+    settings = job(NOTHING_HELD_OUT, voxel_size=2.0)
+    every, every_time, _ = lidar_points(often, settings)
+    together = []
+    monkeypatch.setattr(lidar_seed, "thin", lambda points, voxel: together.append(len(points)) or thin(points, voxel))
+    monkeypatch.setattr(lidar_seed, "THINNED_TOGETHER", 1000)
+    points, times, _ = lidar_points(often, settings)
+    np.testing.assert_array_equal(points, every)
+    np.testing.assert_array_equal(times, every_time)
+    largest_sweep = max(len(read_returns(sweep).points) for sweep in tiny_scene.sweeps)
+    assert len(together) > 5 and max(together) <= len(every) + 1000 + largest_sweep
+
+
 def test_the_seed_has_lidar_points_before_far_points_and_its_note_counts_them(tiny_scene):
     seed = seed_points(tiny_scene, job())
     lidar, far = seed.note["lidar"], seed.note["far"]

@@ -76,10 +76,14 @@ def test_scenes_and_methods_share_cores_and_gpus():
 def test_an_estimate_says_how_it_knows_and_what_is_not_measured_yet(tmp_path):
     planned = [PlannedJob(JobId("train", "0103", "vanilla"), 8, True), PlannedJob(JobId("masks", "0103"), 1, False)]
     unknown = estimate(planned, expectations(), Machine(4, 2), tmp_path)
-    assert in_one_line(unknown).startswith("2 jobs, time not measured yet, disk not measured yet (")
+    rough = "time not measured yet, by other machines very roughly 62 s on 4 cores and 2 GPUs, disk not measured yet ("
+    assert rough in in_one_line(unknown), "7,000 iterations of 6 ms on a GPU after masks, 10 s of each job beside them"
     assert in_full(unknown).count("1 x not measured yet") == 2
+    on_cpu = estimate([PlannedJob(planned[0].job, 1, False)], expectations(), Machine(1, 1), tmp_path)
+    assert on_cpu.rough_seconds == 10.0 + 7000 * 0.15
     half = estimate(planned, expectations(training("0061", "vanilla", 600.0)), Machine(1, 1), tmp_path)
-    assert half.seconds == 600.0 and "from 1 measured job; 1 not measured yet)" in in_one_line(half)
+    assert half.seconds == 600.0 and "about 10 min on 1 core (from 1 measured job; 1 not" in in_one_line(half)
+    assert "; 1 not measured yet, by other machines very roughly 10 min in all)" in in_one_line(half)
     measured = [training("0061", "vanilla", 600.0), Cost(JobId("masks", "0061"), 60.0, "")]
     line = in_one_line(estimate(planned, expectations(*measured), Machine(1, 1), tmp_path))
     assert line.startswith("2 jobs, about 11 min on 1 core (from 2 measured jobs), ") and "GB free" in line

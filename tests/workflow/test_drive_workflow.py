@@ -65,6 +65,23 @@ def test_a_changed_drive_json_reruns_its_scene_and_a_fault_stops_it_in_a_line(co
     assert "drive.json: version is 2" in line, line
 
 
+@pytest.mark.parametrize("flags", [("-n",), ("-n", "--quiet", "all"), ()], ids=" ".join)
+def test_a_drive_that_is_unfit_for_the_settings_is_refused_before_any_job(copy, flags, tmp_path):
+    config = copy.config
+    copy.config = {**config, "holdout": {"last_block": 10}, "results_dir": "other"}
+    copy.write_config()
+    try:
+        done, unfit = (copy.run(f"other/monday/{name}", flags=flags) for name in ("own_car.json", "metrics.json"))
+    finally:
+        copy.config = config
+        copy.write_config()
+    assert done.returncode == 0, "these settings do not concern it"
+    assert unfit.returncode == 1
+    (line,) = complaints(unfit.stdout)
+    assert "scene monday: the hold-out leaves none of its 10 key frames to train on" in line
+    assert not (copy.folder / "other/monday/seed.ply").exists() and "Job stats" not in unfit.stdout
+
+
 EDITS = """\
 edits:
   gone:

@@ -418,11 +418,13 @@ def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
     path = finished.folder / "edits.yaml"
     path.write_text(EDITS + "  typo:\n    - remove: {track: abcd}\n")
     try:
-        done = finished.run("results/0001/street/edits/typo.mp4")
+        target = "results/0001/street/edits/typo.mp4"
+        done, planned = (finished.run(target, flags=flags) for flags in ((), ("-n",)))
     finally:
         path.write_text(EDITS)
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
     (line,) = complaints(done.stdout)
+    assert planned.returncode != 0 and complaints(planned.stdout) == {line}
     words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"tracks that move: {CAR[:8]}")
     assert all(word in line for word in words), line
     assert not list((finished.folder / "results/0001/street/edits").glob("*typo*"))

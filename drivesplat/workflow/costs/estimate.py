@@ -11,6 +11,9 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.costs.measured import TRAIN, WORLD, Cost, JobId
 
 NOT_MEASURED = "not measured yet"
+ROUGH_SECONDS, ROUGH_ITERATION = 10.0, {True: 0.006, False: 0.15}
+"""Seconds of a job of any stage, and of a training's iteration with and without a GPU, on other machines. They are used
+for what is not measured yet: a job may take a third or three times as long."""
 MEMBER_FOLDERS = {
     "masks.json": ".", "checkpoint.npz": "tensorboard", "parts.json": ".", "drive.json": ".", "scans.json": ".",
 }  # fmt: skip
@@ -61,6 +64,14 @@ class Expectations:
             if found:
                 return statistics.median(found.values()), set(found)
         return None, set()
+
+    def rough_seconds(self, planned: PlannedJob) -> float:
+        """The seconds of a job by those of other machines."""
+        job = planned.job
+        if job.stage != TRAIN:
+            return ROUGH_SECONDS
+        iterations = for_scene(self._config, job.scene, job.method).train.iterations
+        return ROUGH_SECONDS + iterations * ROUGH_ITERATION[planned.on_gpu]
 
     def disk_bytes(self, planned: PlannedJob, results: Path) -> float | None:
         """Bytes that a job will add to the results folder: none where it replaces files, else the median of what it
@@ -128,12 +139,13 @@ def wall_seconds(planned: Iterable[PlannedJob], machine: Machine) -> float:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The expected wall time (s) of those of a run's `jobs` that are `known` from `measured` jobs; per stage the number
-    of jobs and the mean seconds of the known ones (None: not measured), the dearest first; the bytes that the run adds,
-    without those of `unknown_disk` jobs, and the free bytes."""
+    """The expected wall time (s) of those of a run's `jobs` that are `known` from `measured` jobs, and a rough one of
+    all; per stage the number of jobs and the mean seconds of the known ones (None: not measured), the dearest first;
+    the bytes that the run adds, without those of `unknown_disk` jobs, and the free bytes."""
 
     jobs: int
     seconds: float
+    rough_seconds: float
     known: int
     measured: int
     by_stage: dict[str, tuple[int, float | None]]
@@ -153,9 +165,11 @@ def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine:
     longest_first = sorted(stages, key=lambda stage: -sum(known[stage]))
     disk = [expectations.disk_bytes(one, results) for one in planned]
     jobs = [replace(one, seconds=seconds) for one, (seconds, _) in zip(planned, expected, strict=True)]
+    rough = [one if one.seconds is not None else replace(one, seconds=expectations.rough_seconds(one)) for one in jobs]
     return Estimate(
         jobs=len(planned),
         seconds=wall_seconds(jobs, machine),
+        rough_seconds=wall_seconds(rough, machine),
         known=sum(map(len, known.values())),
         measured=len(set().union(*(measured for _, measured in expected))),
         by_stage={s: (len(stages[s]), statistics.fmean(known[s]) if known[s] else None) for s in longest_first},
@@ -174,12 +188,13 @@ def in_one_line(found: Estimate) -> str:
 
 
 def _time(found: Estimate) -> str:
-    if not found.known:
-        return f"time {NOT_MEASURED}"
     cores, gpus = found.machine.cores, found.machine.gpus
     where = f"{cores} core{'s' * (cores > 1)}" + (f" and {gpus} GPUs" if gpus > 1 else "")
     rest = found.jobs - found.known
-    missing = f"; {rest} {NOT_MEASURED}" if rest else ""
+    rough = f"{NOT_MEASURED}, by other machines very roughly {spelled(found.rough_seconds)}"
+    if not found.known:
+        return f"time {rough} on {where}"
+    missing = f"; {rest} {rough} in all" if rest else ""
     basis = f"from {found.measured} measured job{'s' * (found.measured > 1)}{missing}"
     return f"about {spelled(found.seconds)} on {where} ({basis})"
 

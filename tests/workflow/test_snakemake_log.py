@@ -7,7 +7,7 @@ import pytest
 from snakemake.jobs import Reason
 from snakemake.persistence import ParamsChange
 
-from drivesplat.workflow.snakemake_reasons import MAX_CHANGES, name_changes
+from drivesplat.workflow.snakemake_log import MAX_CHANGES, name_changes
 
 TRAIN = {"parts": ["background"], "train": {"ssim_weight": 0.2, "note": "it's \"so\", now: 'x'", "sky": None}}
 OTHER = {**TRAIN, "train": {**TRAIN["train"], "ssim_weight": 0.3}}

@@ -1,14 +1,17 @@
-"""Snakemake's reasons for jobs: changed settings by name, old and new, instead of both records in full.
+"""What Snakemake logs: reasons of jobs, with changed settings by name, and the moment when all jobs are planned.
 
-The text of a reason is no documented interface: tests/workflow/test_snakemake_reasons.py fails where that changes.
+Neither is a documented interface: tests/workflow/test_snakemake_log.py fails where that changes.
 """
 
 import ast
 import json
 import logging
 import re
+import sys
+from collections.abc import Callable, Iterable
 from typing import Any
 
+from drivesplat.errors import DriveSplatError
 from drivesplat.io.storage import leaves
 
 MAX_CHANGES = 6
@@ -23,6 +26,21 @@ _CHANGED_PARAMS = re.compile(
     f"before: {_PARAMS} now: {_PARAMS} ?"
 )
 _DIGEST = re.compile("[0-9a-f]{64}")
+
+
+def when_planned(workflow: Any, check: Callable[[Iterable[Any]], None]) -> Callable[[logging.LogRecord], bool]:
+    """A filter of Snakemake's logger that drops no record: before Snakemake shows which jobs of a `workflow` are to
+    run, or runs one, `check` gets them, and ends the process where it raises DriveSplatError."""
+
+    def checked(record: logging.LogRecord) -> bool:
+        if hasattr(record, "stats"):
+            try:
+                check(workflow.dag.needrun_jobs())
+            except DriveSplatError as error:
+                sys.exit(f"drivesplat: {error}")
+        return True
+
+    return checked
 
 
 def name_changes(record: logging.LogRecord) -> bool:
