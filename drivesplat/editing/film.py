@@ -17,7 +17,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.film import Shot, recorded_shot, write_film
+from drivesplat.rendering.film import Shot, film_size, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import film_path
@@ -109,7 +109,7 @@ def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> E
     recorded, actors = recorded_and_edited(model, scene, job.camera, job.edit, where)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
-    before, after = (Shot(scene, cameras, job, (job.width, job.height)) for cameras in (unedited, path))
+    before, after = (Shot(scene, cameras, job, film_size(scene, job)) for cameras in (unedited, path))
     return EditedDrive(recorded, actors, before, after)
 
 

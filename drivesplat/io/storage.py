@@ -130,7 +130,7 @@ def read_json(path: str | Path, rule: str) -> Any:
     try:
         with open(regular_file(path), encoding="utf-8") as file:
             return json.load(file)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, RecursionError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise unreadable(path, rule, f"not a readable JSON file ({error})") from error
 
 

@@ -40,7 +40,7 @@ class _EveryKeyOnce(yaml.SafeLoader):
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
-            return super().construct_object(node, deep)
+            return super().construct_object(node, deep=True)  # not deep, it would make circles of aliases
         except (AttributeError, KeyError, ValueError) as error:
             kind = node.tag.rpartition(":")[2]
             problem = f"{str(node.value)[:80]!r} cannot be read as {kind} ({error}); quote text"

@@ -24,12 +24,15 @@ from drivesplat.rendering.captions import Caption, captioned, drive_captions, la
 from drivesplat.rendering.frames import film_frame, film_frames, uint8_image
 from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import CameraPath, film_intrinsics, film_path, recorded_frames
+from drivesplat.scene.images import target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmEncoding, FilmFormat, FilmJob, ShownParts, TrajectorySettings
 
 log = logging.getLogger(__name__)
 
+MAX_WIDTH = 1920
+"""Maximum width of films in pixels where the settings name no size."""
 BACKDROP = 0.35
 """Grey level behind dynamic parts that are rendered alone."""
 PARTS_SHOWN: tuple[ShownParts, ...] = ("all", "static", "moving")
@@ -89,6 +92,15 @@ class Shot:
         }
 
 
+def film_size(scene: Scene, job: FilmFormat) -> tuple[int, int]:
+    """Width and height of a film in pixels, both even: as the settings say, otherwise those of the training images, at
+    most MAX_WIDTH wide, with their aspect ratio. Raises DatasetError where the scene lacks the camera."""
+    own_width, own_height = target_size(recorded_frames(scene, job.camera)[0], job.images)
+    width = job.width or (job.height * own_width / own_height if job.height else min(own_width, MAX_WIDTH))
+    height = job.height or width * own_height / own_width
+    return max(16, 2 * round(width / 2)), max(16, 2 * round(height / 2))
+
+
 def render_film(
     scene: Scene, checkpoint: TrainedCheckpoint, job: FilmJob, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
@@ -98,7 +110,7 @@ def render_film(
     Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or a rendering contains NaN or Inf.
     """
-    shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
+    shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, film_size(scene, job))
     model, device = open_model(checkpoint, device_settings)
     panels = Panels((f"{path.parent.name}: {path.stem}",), shot.size)
     parts = job.trajectory.parts
@@ -114,7 +126,7 @@ def render_parts(
     on plain grey. Returns the record of its cameras as `render_film` does, for one panel, with the `film` of all.
     Raises what `render_film` raises.
     """
-    shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, (job.width, job.height))
+    shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, film_size(scene, job))
     model, device = open_model(checkpoint, device_settings)
     panels = Panels(("everything", "static", "moving"), shot.size)
     model.precompute(shot.seconds)

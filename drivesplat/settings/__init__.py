@@ -73,7 +73,7 @@ def not_text(value: Any, what: str, note: str = "") -> str:
 
 def _sentence(item: Mapping[str, Any], document: str, keys: str, sections: Collection[str]) -> str:
     """One error of pydantic as a sentence; `sections` are the keys of the top level."""
-    key, value = ".".join(map(str, item["loc"])), quoted(item["input"])
+    key, value = ".".join(str(part) for part in item["loc"] if "[" not in str(part)), quoted(item["input"])
     message = item["msg"].removeprefix("Value error, ")
     if not key:
         return message

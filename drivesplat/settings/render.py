@@ -6,7 +6,7 @@ from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit
-from drivesplat.settings.images import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 
 ShownParts = Literal["all", "moving", "static"]
 
@@ -34,10 +34,11 @@ class RenderSettings(Settings):
 
     fps: int = Field(30, ge=1, le=240)
     """Frames per second."""
-    width: int = Field(1920, ge=16, le=7680, multiple_of=2)
-    """Width in pixels. Even, since H.264 requires it."""
-    height: int = Field(1080, ge=16, le=4320, multiple_of=2)
-    """Height in pixels. Even."""
+    width: int | None = Field(None, ge=16, le=7680, multiple_of=2)
+    """Width in pixels. Even, since H.264 requires it. null = that of the training images, at most 1920, or where
+    `height` is set as their aspect ratio gives it."""
+    height: int | None = Field(None, ge=16, le=4320, multiple_of=2)
+    """Height in pixels. Even. null = as the aspect ratio of the training images gives it."""
     horizontal_fov: float | None = Field(None, gt=1, lt=170)
     """Horizontal field of view in degrees. null = that of the evaluated camera."""
     crf: int = Field(18, ge=1, le=51)
@@ -68,9 +69,10 @@ class FilmFormat(FilmEncoding):
     """The format of a film. For the film of a method's parts these are all its settings."""
 
     camera: str
-    width: int
-    height: int
+    width: int | None
+    height: int | None
     horizontal_fov: float | None
+    images: ImageSettings = Field(default_factory=ImageSettings)
     holdout: HoldoutSettings = Field(default_factory=HoldoutSettings)
 
 

@@ -26,11 +26,12 @@ from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.film import Shot, render_film
+from drivesplat.rendering.film import Shot, film_size, render_film
 from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 
@@ -332,6 +333,25 @@ def a_job(**changes: Any) -> FilmJob:
         "horizontal_fov": None, "crf": 5,
     }  # fmt: skip
     return FilmJob(**(values | changes))
+
+
+@pytest.mark.parametrize(
+    ("recorded", "images", "given", "expected"),
+    [
+        ((400, 225), None, {}, (400, 224)),
+        ((1600, 900), None, {}, (1600, 900)), ((1242, 375), None, {}, (1242, 376)),
+        ((3840, 2160), None, {}, (1920, 1080)), ((1080, 1920), None, {}, (1080, 1920)),
+        ((1600, 900), 400, {}, (400, 224)),
+        ((1600, 900), 400, {"width": 1920}, (1920, 1080)), ((1600, 900), None, {"height": 450}, (800, 450)),
+        ((400, 225), None, {"width": 576, "height": 324}, (576, 324)), ((4000, 20), 200, {}, (200, 16)),
+    ],
+)  # fmt: skip
+def test_a_film_is_as_large_as_the_training_images_unless_the_settings_say_otherwise(
+    tiny_scene, recorded, images, given, expected
+):
+    frame = dataclasses.replace(tiny_scene.frames[0], width=recorded[0], height=recorded[1])
+    job = a_job(**{"width": None, "height": None, "images": ImageSettings(width=images)} | given)
+    assert film_size(dataclasses.replace(tiny_scene, frames=(frame,)), job) == expected
 
 
 def filmed(scene: Scene, path: Path, job: FilmJob) -> dict[str, Any]:

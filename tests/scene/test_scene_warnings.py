@@ -94,6 +94,11 @@ def test_each_warning_is_one_sentence_and_ordinary_drives_have_none(tiny_scene, 
     assert not any("\n" in sentence for sentence in found)
 
 
+def test_without_boxes_street_is_said_to_have_the_parts_of_vanilla(tiny_scene):
+    (found,) = scene_warnings(dataclasses.replace(tiny_scene, tracks=()), DAY)
+    assert "; street has the parts of vanilla and differs in its losses alone (methods: {street: null} leaves" in found
+
+
 @pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (200, 100, 50)])
 def test_luminance_is_the_mean_luma_of_the_images(tiny_scene, tmp_path, color):
     Image.new("RGB", (96, 54), color).save(tmp_path / "a.png")

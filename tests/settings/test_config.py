@@ -413,7 +413,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
             "truth_film",
         ),
         (at("sweeps", True), "extract evaluate"),
-        (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate"),
+        (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate film"),
         (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
         (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
         (

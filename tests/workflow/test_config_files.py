@@ -23,6 +23,10 @@ from drivesplat.workflow.edits_file import read_edits
         ("train:\n  iterations: 3\n  iterations: 4\n", "mine.yaml, line 3: .*'iterations' stands twice"),
         ("- sky\n", "mine.yaml, line 1: ['sky'] is no setting"),
         ("sky\n", "mine.yaml, line 1: 'sky' is no setting"),
+        (
+            "sky: none\ntrain: &a {iterations: *a}\n",
+            "mine.yaml, line 2: not YAML: found unconstructable recursive node",
+        ),
     ],
 )
 def test_a_broken_config_file_is_named_with_its_line(tmp_path, text, message):
