@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyarrow import feather
+from pyarrow import ArrowException, feather
 from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # a checkout that is not installed
@@ -50,8 +50,12 @@ CLASS_OF = {category: name for name, categories in CLASSES.items() for category 
 def table(path: Path) -> dict[str, np.ndarray]:
     """The columns of a feather file."""
     with reading(path):
-        content = feather.read_table(path)
-        return {name: content[name].to_numpy() for name in content.column_names}
+        try:
+            content = feather.read_table(path)
+            content.validate(full=True)
+            return {name: content[name].to_numpy() for name in content.column_names}
+        except ArrowException as error:
+            raise ValueError(str(error)) from error
 
 
 def poses_of(columns: dict[str, np.ndarray]) -> np.ndarray:

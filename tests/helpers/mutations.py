@@ -1,7 +1,9 @@
 """Random damage to the files of a dataset: JSON tables, and files of bytes. The generator's seed determines it."""
 
+import gzip
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -158,3 +160,59 @@ def mutate_bytes(random: Random, path: Path) -> str:
     else:
         path.write_bytes(b"")
     return f"{path.name}: {kind}"
+
+
+WORDS = [
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "1e300",
+    "1e30",
+    "99999999999999999999",
+    "x",
+    "",
+    "\0",
+    "ä",
+    "null",
+    "{",
+    "]",
+    "<a>",
+    "'",
+]
+
+
+def mutate_words(random: Random, path: Path) -> str:
+    """Deletes, repeats or exchanges lines of a text, or replaces, negates or scales numbers; returns what was done."""
+    kind, text = random.choice(["delete", "repeat", "exchange", "word", "word", "word", "scale"]), path.read_text()
+    lines, numbers = text.splitlines(keepends=True), list(re.finditer(r"-?\d+(\.\d+)?(e[+-]?\d+)?", text))
+    if kind in ("word", "scale") and numbers:
+        for found in sorted(
+            random.sample(numbers, min(len(numbers), random.choice([1, 1, 3]))), key=lambda it: -it.start()
+        ):
+            scaled = f"{float(found[0]) * random.choice([-1, 1e-3, 1e3, 1e6]):.17g}"
+            word = scaled if kind == "scale" else random.choice(WORDS)
+            text = text[: found.start()] + word + text[found.end() :]
+        path.write_text(text)
+    elif lines:
+        first, second = random.randrange(len(lines)), random.randrange(len(lines))
+        if kind == "delete":
+            lines.pop(first)
+        elif kind == "repeat":
+            lines.insert(first, lines[second])
+        else:
+            lines[first], lines[second] = lines[second], lines[first]
+        path.write_text("".join(lines))
+    return f"{path.name}: {kind}"
+
+
+def mutate_file(random: Random, path: Path) -> str:
+    """Damages a file as what it is: a text, a packed file, or bytes; returns what was done."""
+    if path.suffix in (".txt", ".json", ".xml") and random.random() < 0.7:
+        return mutate_words(random, path)
+    if path.suffix == ".gz" and random.random() < 0.8:
+        path.write_bytes(gzip.decompress(path.read_bytes()))
+        done = mutate_bytes(random, path)
+        path.write_bytes(gzip.compress(path.read_bytes(), 1))
+        return f"unpacked {done}"
+    return mutate_bytes(random, path)

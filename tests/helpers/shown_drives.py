@@ -1,12 +1,22 @@
 """Compares a converted drive with the vehicle that turns in the tiny world."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
+from drivesplat.readers.drive.check import check, whole_scene
+from drivesplat.readers.drive.format import read_drive
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.images import read_image
 from drivesplat.scene.rigid import apply, rigid
 from drivesplat.scene.scene import Scene
+from helpers.table_files import time_limit
 from helpers.turning_drive import CAMERA, TIMES, TurningDrive
+
+SECONDS = 10.0
+"""For one conversion; an undamaged one takes 0.1 s."""
 
 
 def origin_of(scene: Scene, drive: TurningDrive) -> np.ndarray:
@@ -47,3 +57,26 @@ def world_points(scene: Scene, number: int, drive: TurningDrive) -> np.ndarray:
     """The returns of a sweep in the drive's world."""
     sweep = scene.sweeps[number]
     return apply(sweep.sensor_to_world, read_returns(sweep).points) + origin_of(scene, drive)
+
+
+def require_refused_or_sound(convert: Callable[[], int], out: Path, capsys: Any, done: str) -> None:
+    """A damaged recording is refused in one line, or gives a folder whose faults `check` lists, or finite values."""
+    with time_limit(SECONDS):
+        status = convert()
+    said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    if status:
+        assert len(said) == 1 and 10 < len(said[0]) < 1200 and "Traceback" not in said[0], done
+        assert not (out / "drive.json").exists(), done
+        return
+    assert not said, done
+    with time_limit(SECONDS):
+        if check(out, None):
+            return
+        scene = whole_scene(read_drive(out), out)
+        poses = [frame.camera_to_world for frame in scene.frames] + [sweep.sensor_to_world for sweep in scene.sweeps]
+        poses += [pose for track in scene.tracks for pose in track.object_to_world]
+        assert np.isfinite(poses).all() and np.abs(poses).max() < 1e9, done
+        for pose in poses:
+            np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6, err_msg=done)
+        for sweep in scene.sweeps:
+            assert len(read_returns(sweep).points) and np.abs(read_returns(sweep).points).max() < 2000.0, done

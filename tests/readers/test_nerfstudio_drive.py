@@ -4,12 +4,15 @@ import copy
 import json
 import os
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from helpers.hand_made import recording_of
+from helpers.mutations import mutate_bytes, mutate_words
+from helpers.shown_drives import require_refused_or_sound
 from helpers.table_files import time_limit
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -417,3 +420,20 @@ def test_200_mutated_files_end_with_a_drive_or_a_sentence(folder, values, capsys
             scene = whole_scene(read_drive(out), out)
             assert all(np.isfinite(frame.camera_to_world).all() for frame in scene.frames)
     assert 60 < refused < 190
+
+
+@pytest.mark.parametrize("seeds", [range(first, first + 50) for first in range(0, 200, 50)], ids=str)
+def test_damaged_files_are_refused_in_one_line_or_sound(seeds, folder, values, capsys):
+    for seed in seeds:
+        random = Random(seed)
+        given = copy.deepcopy(values)
+        if seed % 2:
+            for frame in given["frames"]:
+                del frame["time"]
+        rate = ["--hz", "10"] if seed % 2 else ["--seconds-per-time", "1"]
+        path = folder / f"{seed}.json"
+        path.write_text(json.dumps(given, indent=random.choice([None, 1])))
+        done = f"seed {seed}: {mutate_words(random, path) if random.random() < 0.6 else mutate_bytes(random, path)}"
+        out = folder / f"out{seed}"
+        command = ["from-nerfstudio", str(path), str(out), "--metres-per-unit", "0.5", "--camera-height", "1.5", *rate]
+        require_refused_or_sound(lambda command=command: main(command), out, capsys, done)

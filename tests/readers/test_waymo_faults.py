@@ -1,7 +1,9 @@
 """Faults of Waymo's files: each is refused in a sentence, or handled."""
 
+import os
 import re
 import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers.table_files import time_limit
 from helpers.tiny_world import World, write_world
 from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
 from helpers.waymo_files import tfrecord, write_v1, write_v2
@@ -71,6 +74,34 @@ def test_a_folder_without_segments_is_refused_with_what_to_do(tmp_path):
         find_root(str(tmp_path / "nowhere"), "")
     with pytest.raises(DatasetError, match=r"looked for \*\.tfrecord and camera_image/\*\.parquet"):
         find_root(str(tmp_path), "")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "loop", "dangling"])
+def test_segments_that_are_no_files_are_refused_in_the_plan(kind, tmp_path):
+    path = tmp_path / V1_FILE
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(path if kind == "loop" else tmp_path / "nowhere")
+    with time_limit(10.0), pytest.raises(DatasetError, match=rf"scene {NAME}: .*{V1_FILE} is not a file"):
+        table_files(find_root(str(tmp_path), ""), "", NAME)
+
+
+def test_a_file_of_another_kind_holds_no_frames(tmp_path):
+    """Waymo's motion dataset: a tf.train.Example, which begins with a map (1) of features (1) by name (1), and a
+    Scenario, which begins with times as doubles (1) and has its name elsewhere (5)."""
+
+    def field(number: int, content: bytes) -> bytes:
+        return bytes([number << 3 | 2, len(content)]) + content
+
+    example = field(1, field(1, field(1, b"traffic_light_state/past/x") + field(2, b"")))
+    scenario = b"\x09" + struct.pack("<d", 0.1) + field(5, b"637f20cafde22ff8")
+    for content in (example, scenario):
+        (tmp_path / V1_FILE).write_bytes(tfrecord(content))
+        said = refusal(tmp_path, tmp_path)
+        assert V1_FILE in said and "holds no frames" in said and "of another kind" in said
 
 
 @pytest.mark.parametrize("version", WRITERS)

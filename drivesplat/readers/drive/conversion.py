@@ -34,7 +34,8 @@ def reading(path: Path) -> Iterator[None]:
     except FileNotFoundError as error:
         raise DatasetError(f"{error.filename or path} is missing") from error
     except FAILURES as error:
-        raise DatasetError(f"{path} cannot be read ({type(error).__name__}: {str(error)[:200]})") from error
+        reason = "".join(letter if letter.isprintable() else " " for letter in str(error)[:200])
+        raise DatasetError(f"{path} cannot be read ({type(error).__name__}: {reason})") from error
 
 
 def numbers_of(text: str, count: int, record: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""nuScenes' class names as `ObjectClass`."""
+"""Class names of nuScenes, and of others' tables in its layout, as `ObjectClass`."""
 
 from drivesplat.scene.object_class import ObjectClass
 
@@ -18,11 +18,24 @@ _CLASSES = {
 (cones, barriers, bicycle racks) OTHER_MOVABLE. Boxes of cycles include riders."""
 
 
+_PLAIN = {
+    **{kind.value: kind for kind in ObjectClass},
+    **dict.fromkeys(
+        ("other_vehicle", "emergency_vehicle", "ambulance", "police_car", "fire_truck"), ObjectClass.VEHICLE
+    ),
+    "motorbike": ObjectClass.MOTORCYCLE,
+    "cyclist": ObjectClass.RIDER,
+    "motorcyclist": ObjectClass.RIDER,
+    "train": ObjectClass.TRAM,
+}
+"""Names without a dot, as in the tables of Lyft and TIER IV."""
+
+
 def object_class(category: str) -> ObjectClass:
     """The class of a category name such as vehicle.bus.rigid."""
     while category not in _CLASSES and "." in category:
         category = category.rpartition(".")[0]
-    return _CLASSES.get(category, ObjectClass.OTHER_MOVABLE)
+    return _CLASSES.get(category) or _PLAIN.get(category.lower(), ObjectClass.OTHER_MOVABLE)
 
 
 _CATEGORIES = {

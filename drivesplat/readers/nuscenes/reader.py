@@ -29,7 +29,7 @@ from drivesplat.readers.checks import (
 from drivesplat.readers.drive_checks import chain, require_microseconds
 from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.readers.nuscenes.row_checks import check_rows
-from drivesplat.readers.nuscenes.scene_tables import damaged, read_scene_tables, scene_file, write_scene_tables
+from drivesplat.readers.nuscenes.scene_tables import PREFIX, damaged, read_scene_tables, scene_file, write_scene_tables
 from drivesplat.readers.record_names import named
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
@@ -88,7 +88,7 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
         sweeps=sweeps,
         tracks=tuple(_tracks(tables, samples, origin)),
         cameras=tuple({frame.camera: _camera(tables, frame) for frame in images}.values()),
-        lidars=(_lidar(tables, sweeps[0]),) if sweeps else (),
+        lidars=(_lidar(tables, sweeps[0], version),) if sweeps else (),
     )
 
 
@@ -103,12 +103,14 @@ def _camera(tables: Any, frame: Frame) -> Camera:
     )  # fmt: skip
 
 
-def _lidar(tables: Any, sweep: Sweep) -> Lidar:
-    """The LiDAR of a sweep: nuScenes' own, unless a synthetic world states its beams and, where it spins, its spin."""
+def _lidar(tables: Any, sweep: Sweep, version: str) -> Lidar:
+    """The LiDAR of a sweep: nuScenes' own, unless the tables have another version than nuScenes', or a synthetic world
+    states its beams and, where it spins, its spin."""
     sensor = _calibration(tables, sweep.token)
     record = named("calibrated_sensor", sensor["token"])
-    elevations, steps = sensor.get("beam_elevations", BEAM_ELEVATIONS), sensor.get("azimuth_steps", AZIMUTH_STEPS)
-    beams, spin = checked_beams(elevations, steps, record), SPIN
+    known = (BEAM_ELEVATIONS, AZIMUTH_STEPS, SPIN) if version.startswith("v1.0-") else (None, None, None)
+    elevations, steps = sensor.get("beam_elevations", known[0]), sensor.get("azimuth_steps", known[1])
+    beams, spin = checked_beams(elevations, steps, record), known[2]
     if "beam_elevations" in sensor:
         spin = checked_spin(sensor["spin"], record) if "spin" in sensor else None
     return Lidar(LIDAR, *beams, spin)
@@ -133,9 +135,9 @@ def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
             write_scene_tables(root, source.version, [source.scene], Path(folder))
             scene_tables = scene_file(Path(folder), source.scene)
         tables = read_scene_tables(scene_tables)
-        names = [row["name"].removeprefix("scene-") for row in tables["scene"]]
-        if source.scene not in names:
-            available = ", ".join(names)
+        names = [row["name"] for row in tables["scene"]]
+        if not {source.scene, f"{PREFIX}{source.scene}"}.intersection(names):
+            available = ", ".join(name.removeprefix(PREFIX) for name in names)
             raise DatasetError(
                 f"scene {source.scene} is not in nuScenes {source.version} at {root}; there are: {available}"
             )
@@ -143,7 +145,7 @@ def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
         try:
             (Path(folder) / source.version).mkdir()
             for row in tables["map"]:
-                row["filename"] = str(root.absolute() / row["filename"])
+                row["filename"] = folder  # maps are not read, and nuscenes-devkit asks for any path that exists
             for table, rows in tables.items():
                 (Path(folder) / source.version / f"{table}.json").write_text(json.dumps(rows), encoding="utf-8")
             return NuScenes(source.version, folder, verbose=False)

@@ -4,6 +4,7 @@ Poses, sizes and intrinsics are checked where the reader converts them (`drivesp
 rows of sensors that are not read refuse no drive.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +15,8 @@ from drivesplat.readers.checks import MAX_TIMESTAMP, checked_flag, checked_text,
 from drivesplat.readers.drive_checks import chain, require_unique
 from drivesplat.readers.record_names import MAX_TEXT, named, shown
 
+MIN_FRACTIONAL = 1e14
+"""Least timestamp in microseconds that may have a fraction."""
 Rows = dict[str, list[dict[str, Any]]]
 
 
@@ -74,10 +77,13 @@ _REFERENCES = {
 
 
 def check_rows(tables: Rows) -> None:
-    """Raises DatasetError naming the table and the token of the first row whose columns are absent or of another type,
-    whose token is not unique, or that refers to a row that does not exist; and if the scene's samples are no chain."""
+    """Rounds timestamps. Raises DatasetError naming the table and the token of the first row whose columns are absent
+    or of another type, whose token is not unique, or that refers to a row that does not exist; and if the scene's
+    samples are no chain."""
     for table, columns in _COLUMNS.items():
         rows = tables[table]
+        if "timestamp" in columns:
+            _round_timestamps(rows)
         for column, kind in {"token": _TOKEN, **columns}.items():
             _check_column(table, rows, column, kind)
         if table in _OPTIONAL:
@@ -95,6 +101,15 @@ def check_rows(tables: Rows) -> None:
             raise DatasetError(f"{named('log', log['token'])}: no row of the table map refers to it")
     _check_samples(tables)
     _check_key_frames(tables)
+
+
+def _round_timestamps(rows: list[dict[str, Any]]) -> None:
+    """Replaces timestamps with fractions, as Lyft's tables have them, by the nearest microsecond, half a one down. They
+    are microseconds if they are after 1973: seconds and milliseconds are below."""
+    for row in rows:
+        time = row.get("timestamp")
+        if type(time) is float and MIN_FRACTIONAL <= time <= MAX_TIMESTAMP:
+            row["timestamp"] = math.ceil(time - 0.5)
 
 
 def _check_column(table: str, rows: list[dict[str, Any]], column: str, kind: _Kind) -> None:

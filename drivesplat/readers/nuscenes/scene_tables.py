@@ -20,7 +20,9 @@ from drivesplat.io.storage import atomic_path, unwritable, write_json
 from drivesplat.readers.nuscenes.layout import TABLES, all_tables
 from drivesplat.readers.record_names import named, shown
 
-SCHEMA = 1
+SCHEMA = 2
+PREFIX = "scene-"
+"""What may be left out of a scene's name."""
 INDEX = ".index.json"
 """File that records the tables from which the files beside it were made."""
 LARGE = 200_000_000
@@ -192,7 +194,8 @@ def _token(row: dict[str, Any], column: str, table: str) -> str:
 
 
 def _scene_rows(tables: Path, scenes: Sequence[str], owners: dict[str, dict[str, tuple[str, ...]]]) -> Iterator[Found]:
-    """The rows of the table of scenes; adds to `owners`, per table, the scenes to which each token belongs."""
+    """The rows of the table of scenes; adds to `owners`, per table, the scenes to which each token belongs. A scene is
+    called as in the table, or without PREFIX; of one that is not there, the names of those that are."""
     known: dict[str, tuple[str, dict[str, Any]]] = {}
     for text, row in rows(tables / "scene.json"):
         name = _token(row, "name", "scene")
@@ -200,10 +203,11 @@ def _scene_rows(tables: Path, scenes: Sequence[str], owners: dict[str, dict[str,
             raise ValueError(f"{named('scene', row.get('token'))}: its name {name} is that of another scene")
         known[name] = text, row
     for scene in scenes:
-        if f"scene-{scene}" not in known:
+        found = known.get(scene) or known.get(f"{PREFIX}{scene}")
+        if found is None:
             yield from (([scene], "scene", json.dumps({"name": name})) for name in known)
             continue
-        text, row = known[f"scene-{scene}"]
+        text, row = found
         yield [scene], "scene", text
         for table, token in (("scene", _token(row, "token", "scene")), ("log", _token(row, "log_token", "scene"))):
             owners[table][token] = (*owners[table].get(token, ()), scene)

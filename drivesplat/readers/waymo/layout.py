@@ -53,7 +53,7 @@ def segment_files(root: Path, version: str, scene: str) -> SegmentFiles:
     """The files of a scene. `version` selects v1 or v2; with any other text the one that is there is taken.
 
     Raises DatasetError for a segment that is not there, with those that are, for one that is there in both versions,
-    and for one that lacks a component.
+    and for one that lacks a component, or whose name is not that of a file.
     """
     versions = [version] if version in (V1, V2) else [V1, V2]
     segments = {name: _segments(root, name) for name in versions}
@@ -64,6 +64,8 @@ def segment_files(root: Path, version: str, scene: str) -> SegmentFiles:
             f"scene {scene} is in {root} as v1 ({segments[V1][name].name}) and as v2; "
             "set datasets.<name>.version to v1 or v2"
         )
+    if holding == [V1] and not segments[V1][name].is_file():
+        raise DatasetError(f"scene {scene}: {segments[V1][name]} is not a file; download the segment again")
     if holding == [V1]:
         return SegmentFiles(name, V1, {FRAMES: segments[V1][name]})
     files = {component: root / component / f"{name}.parquet" for component in COMPONENTS}

@@ -79,8 +79,16 @@ def _frames(files: SegmentFiles) -> Iterator[Any]:
         try:
             frame = frame_of.FromString(record)
         except DecodeError as error:
-            raise DatasetError(f"record {number} of {path} is no Frame message ({error})") from error
+            raise DatasetError(
+                f"record {number} of {path} is no Frame message ({error}): the file holds no frames, but records of "
+                "another kind; docs/waymo.md says what to download"
+            ) from error
         name = frame.context.name.decode(errors="replace")
+        if name != files.name and not (frame.HasField("timestamp_micros") and frame.HasField("pose")):
+            raise DatasetError(
+                f"{path} holds no frames: record {number} is of another kind, such as those of Waymo's motion dataset; "
+                "docs/waymo.md says what to download"
+            )
         if name != files.name:
             raise DatasetError(
                 f"record {number} of {path} is a frame of segment {shown(name)}, and the file is called {files.name}; "
