@@ -7,9 +7,10 @@ from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.inspection import TracksJob
 
 with job(snakemake, dataset=("images",)) as current:
-    files, camera = current.input, current.settings(TracksJob).eval_camera
+    files, settings = current.input, current.settings(TracksJob)
+    camera, actors = settings.eval_camera, settings.actors if files.actors else None
     recording, _ = read_prepared_drive(files.scene, files.parser, files.masks)
     subjects = subjects_by_image(recording, camera)
-    rows = track_rows(recording, subjects, editable_tracks(files.actors))
+    rows = track_rows(recording, subjects, editable_tracks(files.actors), actors)
     write_tracks(current.output.table, rows)
     save_figure(current.output.picture, draw_tracks(recording, subjects, rows, camera))

@@ -12,6 +12,8 @@ from drivesplat.inspection.figures import draw_outline, image_grid, show
 from drivesplat.inspection.ghost_panel import GhostPanel
 from drivesplat.inspection.removal import RemovalPair
 
+MIN_CHANGED, MAX_HOLES = 0.5, 0.05
+"""Share of the pixels of a box from which the vehicle in it counts as removed, and up to which there are no holes."""
 PATH_COLOR = "#1d6fd1"
 _FIXES = "\n".join(
     [f"Published fixes of ghosts ({GHOSTS_DOCUMENT}):", *(f"{fix.method}: {fix.adds}" for fix in PUBLISHED_FIXES)]
@@ -67,14 +69,23 @@ def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figu
     if record["subject"] is None:
         title += f"\n{record['why_null']}"
     else:
-        changed = record["box"]["changed_share"] or 0.0
-        title += f"\n{record['gaussians_removed']:,} Gaussians removed, {changed:.0%} of the pixels of the box changed"
+        title += f"\n{record['gaussians_removed']:,} Gaussians removed: {_verdict(record)}"
     figure, axes = image_grid(pair.with_car.shape, rows=1, columns=3, title=title)
     show(axes[0], pair.with_car, "Rendering")
     show(axes[1], pair.without_car, without)
     _show_error(axes[2], pair.without_car, pair.with_car, "Absolute difference, mean over the channels")
     _outline(axes, pair.outline)
     return figure
+
+
+def _verdict(record: dict[str, Any]) -> str:
+    """Whether the vehicle is gone, by the pixels of its box."""
+    changed, holes = record["box"]["changed_share"] or 0.0, record["holes"]["share_of_box"] or 0.0
+    figures = f"{changed:.0%} of the pixels of the box changed"
+    if changed < MIN_CHANGED:
+        return f"the vehicle is still there, {figures} (gone: {MIN_CHANGED:.0%} or more)"
+    behind = f"holes in {holes:.0%} of the box" if holes > MAX_HOLES else "no holes"
+    return f"the vehicle is gone, {figures}, {behind}"
 
 
 def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) -> None:

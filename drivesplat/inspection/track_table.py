@@ -16,16 +16,20 @@ from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import MIN_PIXELS
 from drivesplat.scene.scene import Track
 from drivesplat.scene.tracks import box_at, ever_moves, short_ids
+from drivesplat.settings.actor_seed import ActorSeedSettings
 
 MAX_IMAGES = 6
 TITLE = "moving objects, labelled with the start of their ids in tracks.csv"
 DASHED = "; dashed: cannot be edited"
-NOT_EDITABLE = "#e5e7eb"
+PARKED, CLASS, NO_METHOD, NEVER_SEEN = "parked", "class", "no method with actors", "never seen"
+"""Reasons why a track cannot be edited: it does not move; `actors.classes` gives its class to the background; no method
+of the config has actors; no training image shows it."""
+DASHED_COLOR = "#e5e7eb"
 """The colour of the outlines of objects that cannot be edited."""
 MIN_PIXEL_SHARE = 0.5
 """An image shows an object well if the object has at least this share of its maximum number of pixels there."""
-NARROW_BOX_SHARE = 0.06
-"""The labels of boxes narrower than this share of the image are rotated."""
+LABEL_SHARE = np.array([0.11, 0.06])
+"""Width and height of a label as shares of the image's, in figures of two columns."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,8 @@ class TrackRow:
     """A track in the table. `editable`: whether methods with actors represent it with Gaussians of its own.
     `seconds`: from its first annotation to its last; `seconds_visible`: how long it is visible to the evaluated
     camera; horizontal speeds in m/s; sizes in metres; `key_frame`: the one in which it has the most `pixels` of
-    that camera's images, None and 0 if it is never visible."""
+    that camera's images, None and 0 if it is never visible. `not_editable`: PARKED, CLASS, NO_METHOD or NEVER_SEEN,
+    empty for an editable track."""
 
     id: str
     category: str
@@ -48,6 +53,7 @@ class TrackRow:
     height: float
     key_frame: int | None
     pixels: int
+    not_editable: str
 
 
 SubjectsByImage = Mapping[int, Sequence[Subject]]
@@ -65,18 +71,33 @@ def editable_tracks(actors: Sequence[str]) -> set[str]:
     return {actor.id for actor in records if len(actor.points)}
 
 
-def track_rows(recording: PreparedDrive, subjects: SubjectsByImage, editable: Collection[str]) -> list[TrackRow]:
-    """A row per dynamic track: moving ones first, then by visible time. `editable`: the ids of editable tracks."""
+def track_rows(
+    recording: PreparedDrive,
+    subjects: SubjectsByImage,
+    editable: Collection[str],
+    actors: ActorSeedSettings | None,
+) -> list[TrackRow]:
+    """A row per dynamic track: moving ones first, then by visible time. `editable`: the ids of editable tracks;
+    `actors`: the settings that choose them, None if no method has actors."""
     by_track: dict[str, list[Subject]] = {}
     for subject in (subject for seen in subjects.values() for subject in seen):
         by_track.setdefault(subject.box.track_id, []).append(subject)
     interval = recording.scene.key_frame_interval
     tracks = [track for track in recording.scene.tracks if track.object_class.is_dynamic]
-    rows = [_row(track, track.id in editable, by_track.get(track.id, []), interval) for track in tracks]
+    reasons = [None if track.id in editable else _not_editable(track, actors) for track in tracks]
+    rows = [_row(t, reason, by_track.get(t.id, []), interval) for t, reason in zip(tracks, reasons, strict=True)]
     return sorted(rows, key=lambda row: (not row.moves, -row.seconds_visible, -row.pixels, row.id))
 
 
-def _row(track: Track, editable: bool, seen: list[Subject], interval: float) -> TrackRow:
+def _not_editable(track: Track, actors: ActorSeedSettings | None) -> str:
+    if not ever_moves(track):
+        return PARKED
+    if actors is None:
+        return NO_METHOD
+    return NEVER_SEEN if actors.parts_of(track.object_class) else CLASS
+
+
+def _row(track: Track, not_editable: str | None, seen: list[Subject], interval: float) -> TrackRow:
     boxes = (box_at(track, int(time), interval) for time in track.timestamps)
     speeds = [box.speed for box in boxes if box is not None]
     largest = max(seen, key=lambda subject: subject.pixels, default=None)
@@ -85,7 +106,7 @@ def _row(track: Track, editable: bool, seen: list[Subject], interval: float) -> 
         id=track.id,
         category=track.category,
         moves=ever_moves(track),
-        editable=editable,
+        editable=not_editable is None,
         seconds=round(seconds, 2),
         seconds_visible=round(seconds * min(1.0, len(seen) / len(track.timestamps)), 2),
         speed_mean=round(float(np.mean(speeds)), 2),
@@ -93,6 +114,7 @@ def _row(track: Track, editable: bool, seen: list[Subject], interval: float) -> 
         **dict(zip(("length", "width", "height"), (round(float(s), 2) for s in track.size), strict=True)),
         key_frame=largest.frame.sample_index if largest else None,
         pixels=largest.pixels if largest else 0,
+        not_editable=not_editable or "",
     )
 
 
@@ -122,8 +144,10 @@ def draw_tracks(recording: PreparedDrive, subjects: SubjectsByImage, rows: Seque
     figure, axes = image_grid(shape, rows=-(-len(chosen) // columns), columns=columns, title=title)
     for axis, index in zip(axes, chosen, strict=False):
         show(axis, recording.image(index), f"Key frame {recording.frame(index).sample_index}")
+        taken: list[np.ndarray] = []
         for subject in moving[index]:
-            _label(axis, subject, names[subject.box.track_id], shape, subject.box.track_id in editable)
+            place = _label(axis, subject, names[subject.box.track_id], shape, subject.box.track_id in editable, taken)
+            taken.append(place)
     return figure
 
 
@@ -140,11 +164,18 @@ def covering_images(pixels: Mapping[int, Mapping[str, int]]) -> list[int]:
     return sorted(chosen)
 
 
-def _label(axis: Axes, subject: Subject, name: str, shape: tuple[int, ...], editable: bool) -> None:
-    color = BOX if editable else NOT_EDITABLE
+def _label(
+    axis: Axes, subject: Subject, name: str, shape: tuple[int, ...], editable: bool, taken: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Draws the outline of an object and its label above it, higher where other labels are (`taken`, their lower left
+    corners), and a line from one to the other there. Returns the lower left corner of the label."""
+    color = BOX if editable else DASHED_COLOR
     outline = draw_outline(axis, subject.hull.polygon, color, "solid" if editable else "dashed")
-    x, y = np.clip(outline.min(axis=0), 0, [shape[1] * 0.9, shape[0] * 0.97])
-    box = {"facecolor": color, "edgecolor": "none", "pad": 1.5}
-    narrow = np.ptp(outline[:, 0]) < NARROW_BOX_SHARE * shape[1]  # horizontal labels of neighbours would overlap
-    turn = {"rotation": 40 if narrow else 0, "rotation_mode": "anchor", "verticalalignment": "bottom"}
-    axis.text(x, y, name, fontsize=9, bbox=box, **turn)
+    corner = np.clip(outline.min(axis=0), 0, [shape[1] * 0.9, shape[0] * 0.97])
+    place, size = corner.copy(), LABEL_SHARE * [shape[1], shape[0]]
+    while any((np.abs(place - other) < size).all() for other in taken):
+        place[1] -= 0.25 * size[1]
+    box, line = {"facecolor": color, "edgecolor": "none", "pad": 1.5}, {"arrowstyle": "-", "color": color}
+    arrow = {"arrowprops": line} if place[1] < corner[1] else {}
+    axis.annotate(name, corner, place, fontsize=9, bbox=box, verticalalignment="bottom", **arrow)
+    return place

@@ -3,6 +3,7 @@
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.actor_seed import ActorSeedSettings
 
 
 class SubjectSettings(Settings):
@@ -33,6 +34,7 @@ class TracksJob(Settings):
     """All settings that determine one tracks.csv."""
 
     eval_camera: str
+    actors: ActorSeedSettings
 
 
 class PanelJob(Settings):

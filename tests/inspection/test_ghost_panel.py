@@ -386,8 +386,24 @@ def test_a_removal_is_drawn_with_without_and_difference(tiny_scene):
     assert shown(figure, 2).max() > 0.01
     heading = figure.get_suptitle()
     assert "street" in heading
-    assert f"1 Gaussians removed, {record['box']['changed_share']:.0%} of the pixels of the box changed" in heading
-    assert 0.01 < record["box"]["changed_share"] < 0.99
+    assert (
+        f"1 Gaussians removed: the vehicle is still there, {record['box']['changed_share']:.0%} of the pixel" in heading
+    )
+    assert 0.01 < record["box"]["changed_share"] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("changed", "holes", "verdict"),
+    [
+        (0.07, 0.0, "the vehicle is still there, 7% of the pixels of the box changed (gone: 50% or more)"),
+        (0.91, 0.17, "the vehicle is gone, 91% of the pixels of the box changed, holes in 17% of the box"),
+        (0.91, 0.0, "the vehicle is gone, 91% of the pixels of the box changed, no holes"),
+    ],
+)
+def test_the_title_of_a_removal_says_whether_the_vehicle_is_gone(changed, holes, verdict, tiny_scene):
+    pair, record = removal(one_car(tiny_scene), 0, round_gaussians([[7.0, 0.4, 0.8]]))
+    record |= {"box": {"changed_share": changed}, "holes": {"share_of_box": holes}}
+    assert draw_removal(pair, record, "street").get_suptitle().endswith(verdict)
 
 
 def test_the_title_names_a_removal_of_the_actors_gaussians(tiny_scene):

@@ -2,12 +2,15 @@
 
 import csv
 import dataclasses
+import itertools
 from collections.abc import Collection
 
 import numpy as np
 import pytest
 from helpers.hand_made import actor_record, recording_of
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from drivesplat.errors import ResultError
 from drivesplat.inspection.track_table import (
@@ -26,6 +29,7 @@ from drivesplat.scene.motion import Motion
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import MIN_ID_LENGTH, short_ids
+from drivesplat.settings.actor_seed import ActorSeedSettings
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +38,13 @@ def recording(tiny_scene) -> PreparedDrive:
 
 
 def rows_of(recording: PreparedDrive, editable: Collection[str] = ()) -> list:
-    return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"), editable)
+    return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"), editable, ActorSeedSettings())
 
 
 def drawn(recording: PreparedDrive, editable: Collection[str] = ()) -> Figure:
     subjects = subjects_by_image(recording, "CAM_FRONT")
-    return draw_tracks(recording, subjects, track_rows(recording, subjects, editable), "CAM_FRONT")
+    rows = track_rows(recording, subjects, editable, ActorSeedSettings())
+    return draw_tracks(recording, subjects, rows, "CAM_FRONT")
 
 
 def texts(figure: Figure) -> list[str]:
@@ -120,6 +125,43 @@ def test_editable_tracks_are_those_of_actors_with_points(recording, tmp_path):
     assert {row.category: row.editable for row in rows_of(recording, editable)} == {
         "vehicle.car": True, "human.pedestrian.adult": False, "vehicle.truck": False
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("actors", "walker", "car"),
+    [
+        (ActorSeedSettings(), "class", "never seen"),
+        (ActorSeedSettings(classes={"pedestrian": "deformable", "car": "background"}), "never seen", "class"),
+        (None, "no method with actors", "no method with actors"),
+    ],
+    ids=["people are background", "cars are background", "vanilla alone"],
+)
+def test_a_track_that_cannot_be_edited_says_why(actors, walker, car, recording):
+    subjects = subjects_by_image(recording, "CAM_FRONT")
+    rows = {row.category: row for row in track_rows(recording, subjects, (), actors)}
+    assert {name: row.not_editable for name, row in rows.items()} == {
+        "vehicle.car": car, "human.pedestrian.adult": walker, "vehicle.truck": "parked"
+    }  # fmt: skip
+    ids = [row.id for row in rows.values()]
+    assert {row.not_editable for row in track_rows(recording, subjects, ids, actors)} == {""}
+
+
+def test_labels_of_objects_behind_each_other_do_not_cover_each_other(tiny_scene, monkeypatch):
+    """Cars that stand half behind each other, each label drawn at its true size."""
+    car = next(track for track in tiny_scene.tracks if track.category == "vehicle.car")
+    places = [[0.3 * i - 3.0, 0.25 * i, 0.0] for i in range(3)]
+    monkeypatch.setattr("drivesplat.inspection.track_table.MIN_PIXELS", 5)
+    row = [
+        dataclasses.replace(car, id=f"{i}" * 12, object_to_world=_moved(car, place)) for i, place in enumerate(places)
+    ]
+    figure = drawn(recording_of(dataclasses.replace(tiny_scene, tracks=tuple(row))))
+    FigureCanvasAgg(figure).draw()
+    found = 0
+    for axis in figure.axes:
+        boxes = [Text.get_window_extent(text) for text in axis.texts]  # without the lines to the outlines
+        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+        found = max(found, len(boxes))
+    assert found == 3
 
 
 def test_what_cannot_be_edited_is_outlined_otherwise(recording):
