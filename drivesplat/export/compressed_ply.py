@@ -1,6 +1,6 @@
 """Gaussians from .compressed.ply, the packed format of PlayCanvas and SuperSplat.
 
-The element `chunk` has the bounds of positions, logarithms of scales and, in newer files, colours of each 256 Gaussians.
+The element `chunk` has the bounds of positions, logarithms of scales and, in newer files, colours of 256 Gaussians.
 A vertex has four numbers of 32 bits: position and scale (11, 10 and 11 bits within the bounds), rotation (the number of
 the largest component of w, x, y, z in 2 bits, the others in 10 bits each within ±√½), and colour with opacity (8 bits
 each). The element `sh` has further harmonics in 8 bits within ±4.
