@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.export.splat_ply import read_splat_ply
+from drivesplat.export.splat_ply import ALMOST_ONE, TINY, read_splat_ply
 from drivesplat.io.storage import atomic_path
 
 log = logging.getLogger(__name__)
@@ -34,12 +34,12 @@ def export_spz(path: str | Path, splat: str | Path) -> None:
         raise DriveSplatError(
             "splat.spz needs gsply, which is not installed: run 'make setup', or drop spz from export.formats"
         ) from error
-    gaussians = read_splat_ply(splat)
+    gaussians = read_splat_ply(splat, "export")
     data = GSData(
         means=gaussians.means.numpy(),
         scales=torch.log(gaussians.scales).numpy(),
         quats=gaussians.quats.numpy(),
-        opacities=torch.logit(gaussians.opacities.double()).float().numpy(),
+        opacities=torch.logit(gaussians.opacities.double().clamp(TINY, ALMOST_ONE)).float().numpy(),
         sh0=gaussians.sh0[:, 0].numpy(),
         shN=gaussians.shN.numpy(),
     )

@@ -18,14 +18,16 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from drivesplat.errors import ResultError
+from drivesplat.export.compressed_ply import is_compressed, unpacked
 from drivesplat.io.point_cloud import read_ply_data
 from drivesplat.io.storage import atomic_write, canonical_json, unreadable
 from drivesplat.model.gaussians import Gaussians
 
 _NOTE = "drivesplat "
 _MAX_HEADER_BYTES = 10_000
-_TINY = torch.finfo(torch.float32).tiny
-_ALMOST_ONE = 1.0 - 2.0**-24
+TINY = torch.finfo(torch.float32).tiny
+ALMOST_ONE = 1.0 - 2.0**-24
 """The float32 before 1: the largest opacity with a finite logit."""
 
 
@@ -52,23 +54,31 @@ def note_of(path: str | Path) -> dict[str, Any]:
     return {}
 
 
-def read_splat_ply(path: str | Path) -> Gaussians:
-    """Reads a file of this convention, by `write_splat_ply` or another program, on the CPU.
+def read_splat_ply(path: str | Path, rule: str | None = None) -> Gaussians:
+    """Reads a file of this convention, by `write_splat_ply` or another program, or a .compressed.ply of PlayCanvas, on
+    the CPU. An opacity of ±Inf is 1 or 0.
 
-    Raises ResultError naming the file if it is truncated, lacks a property, or contains NaN or Inf.
+    Raises ResultError naming the file if it is truncated, lacks a property, or contains NaN or Inf; with the advice to
+    rebuild it for a file of a run, which is the output of `rule`, or has a note of `write_splat_ply`.
     """
     try:
-        vertices = read_ply_data(path)["vertex"]
+        data = read_ply_data(path)
+        if is_compressed(data):
+            return unpacked(data)
+        vertices = data["vertex"]
         coefficients = _coefficients([p.name for p in vertices.properties])
         names = _property_names(coefficients)
         columns = {name: np.asarray(vertices[name], dtype=np.float32) for name in names if name[0] != "n"}
-        if not all(np.isfinite(column).all() for column in columns.values()):
-            raise ValueError("it contains NaN or Inf")
+        for name, column in columns.items():
+            wrong = np.isnan(column) if name == "opacity" else ~np.isfinite(column)
+            if wrong.any():
+                raise ValueError(f"{name} is NaN or Inf in {wrong.sum()} of {len(column)} Gaussians")
         return _gaussians(torch.from_numpy(np.stack(list(columns.values()), axis=1)), coefficients)
     except (OSError, PlyParseError, KeyError, ValueError, TypeError) as error:
-        raise unreadable(
-            path, "export", f"not a splat in the 3DGS convention ({error or type(error).__name__})"
-        ) from error
+        why = f"not a splat in the 3DGS convention ({error or type(error).__name__})"
+        if rule or note_of(path):
+            raise unreadable(path, rule or "export", why) from error
+        raise ResultError(f"{path}: {why}") from error
 
 
 def _coefficients(names: list[str]) -> int:
@@ -90,14 +100,14 @@ def _vertices(gaussians: Gaussians) -> np.ndarray:
     """The Gaussians as structured records (n,) of the convention."""
     count, coefficients = gaussians.shN.shape[:2]
     names = _property_names(coefficients)
-    opacities = gaussians.opacities.double().clamp(_TINY, _ALMOST_ONE)
+    opacities = gaussians.opacities.double().clamp(TINY, ALMOST_ONE)
     columns = [
         gaussians.means,
         torch.zeros(count, 3),
         gaussians.sh0[:, 0],
         gaussians.shN.transpose(1, 2).reshape(count, 3 * coefficients),
         torch.logit(opacities)[:, None],
-        torch.log(gaussians.scales.clamp_min(_TINY)),
+        torch.log(gaussians.scales.clamp_min(TINY)),
         torch.nn.functional.normalize(gaussians.quats, dim=-1),
     ]
     values = torch.cat([column.detach().cpu().float() for column in columns], dim=1)

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drivesplat.poses.corrections import Corrections, apply_corrections
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import read_drive
 from drivesplat.readers.drive.reader import read
+from drivesplat.readers.drive.reader import scene_of as drive_scene
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, read_scene, write_scene
@@ -139,12 +141,56 @@ def test_a_sweep_without_times_is_a_fault(tmp_path):
     assert "has no column time, which motion_compensated: false needs" in (sweep_fault(sweep) or "")
 
 
-def test_motion_is_not_known_across_a_gap_of_ego_poses(tmp_path):
-    """The vehicle's path over more than a second is a guess."""
-    poses = [{"timestamp": t, **pose_record(ego_at((t - BEGIN) * 1e-6))} for t in (SWEEPS[0] - 1_000_001, *SWEEPS)]
-    sweep, _ = scene_of(write(tmp_path, ego_poses=poses)).sweeps
-    assert sweep.motion.offsets_s[0] == 0.0
-    assert "the vehicle's motion is known from 0 to 0.1 s" in (sweep_fault(sweep) or "")
+def poses_at(*times: int) -> list[dict[str, Any]]:
+    return [{"timestamp": t, **pose_record(ego_at((t - BEGIN) * 1e-6))} for t in times]
+
+
+def test_at_the_ends_of_ego_poses_the_motion_continues_over_half_a_scan(tmp_path, caplog):
+    """As with poses at the scans' own times: within a (dt^2 / 2 + dt T / 2) = 18 mm at 4.8 m/s^2, 0.05 and 0.1 s."""
+    scene = scene_of(write(tmp_path, ego_poses=poses_at(*SWEEPS)))
+    assert [sweep.timestamp for sweep in scene.sweeps] == list(SWEEPS) and not caplog.records
+    for sweep in scene.sweeps:
+        expected, raw = seen(sweep.timestamp)
+        assert np.linalg.norm(raw - expected, axis=1).max() > 0.5
+        assert np.linalg.norm(read_returns(sweep).points - expected, axis=1).max() < 0.06  # turned at 40 m by 0.02 rad
+        assert np.median(np.linalg.norm(read_returns(sweep).points - expected, axis=1)) < 0.012
+
+
+@pytest.mark.parametrize(
+    ("ego_poses", "times", "kept"),
+    [
+        (poses_at(*SWEEPS), offsets() + 0.05, SWEEPS[:1]),  # the last one ends 0.1 s after the last pose
+        (poses_at(*SWEEPS), offsets() - 0.05, SWEEPS[1:]),
+        (poses_at(SWEEPS[0] - 1_000_001, *SWEEPS), offsets() - 0.05, SWEEPS[1:]),  # more than a second is a guess
+        (poses_at(SWEEPS[0], SWEEPS[0] + 20_000, *range(SWEEPS[1], SWEEPS[1] + 90_000, 20_000)), offsets(), SWEEPS[1:]),
+    ],
+)
+def test_a_sweep_that_reaches_farther_is_left_out_with_a_warning(ego_poses, times, kept, tmp_path, caplog):
+    scene = scene_of(write(tmp_path, ego_poses=ego_poses, times=times))
+    assert [sweep.timestamp for sweep in scene.sweeps] == list(kept)
+    assert all(sweep_fault(sweep) is None for sweep in scene.sweeps)
+    (left,) = [record.getMessage() for record in caplog.records]
+    assert "the vehicle's motion is known from" in left and left.endswith("; left out")
+    assert str({*SWEEPS}.difference(kept).pop()) in left
+
+
+def test_without_any_poses_sweeps_take_the_motion_that_is_estimated(tmp_path):
+    """Until then the vehicle stands, and points are as they were recorded."""
+    folder = write(tmp_path, ego_poses=[])
+    assert faults_of(read_drive(folder)) == [
+        fault for fault in faults_of(read_drive(folder)) if fault.startswith("ego_poses: there is none")
+    ]
+    standing = drive_scene(read_drive(folder), folder, SOURCE)
+    for sweep in standing.sweeps:
+        np.testing.assert_allclose(read_returns(sweep).points, seen(sweep.timestamp)[1], atol=1e-9)
+    times = np.arange(BEGIN, BEGIN + 500_001, 10_000)
+    estimated = np.stack([ego_at((time - BEGIN) * 1e-6) for time in times])
+    corrections = Corrections.from_poses(times, np.tile(np.eye(4), (len(times), 1, 1)), estimated)
+    scene = apply_corrections(standing, corrections, poses="images")
+    write_scene(tmp_path / "scene.json", scene)
+    for sweep in read_scene(tmp_path / "scene.json").sweeps:
+        np.testing.assert_allclose(sweep.sensor_to_world, ego_at((sweep.timestamp - BEGIN) * 1e-6) @ MOUNT, atol=1e-9)
+        assert np.linalg.norm(read_returns(sweep).points - seen(sweep.timestamp)[0], axis=1).max() < 1e-4
 
 
 def test_without_ego_poses_it_is_refused(tmp_path):

@@ -87,7 +87,7 @@ def _lidar_faults(drive: Drive) -> Iterator[str]:
                 f"lidars.{name}: its beam_elevations reach {steepest:g}; they are radians above the sensor's "
                 "horizontal plane, at most 1.57"
             )
-        if not lidar.motion_compensated and not drive.ego_poses:
+        if not lidar.motion_compensated and not drive.ego_poses and not is_unposed(drive):
             yield f"lidars.{name}: motion_compensated is false, but there are no ego_poses for motion compensation"
 
 

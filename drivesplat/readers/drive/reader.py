@@ -1,5 +1,6 @@
 """Reads a drive folder into a `Scene`."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,15 @@ from drivesplat.errors import DatasetError
 from drivesplat.readers.drive.faults import faults_of, is_unposed
 from drivesplat.readers.drive.format import FILE, Drive, DriveFrame, DriveTrack, read_drive
 from drivesplat.readers.drive.layout import scene_folder
-from drivesplat.readers.drive.poses import EgoPath, matrix_of
+from drivesplat.readers.drive.poses import EgoPath, matrix_of, reach_us
+from drivesplat.readers.drive.sweep_file import beyond_poses
 from drivesplat.scene.lens import central_intrinsics
 from drivesplat.scene.rigid import interpolate, inverse, rigid
-from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track
+from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track, place_of
 from drivesplat.scene.sensors import Lidar
 from drivesplat.settings.extract import SceneSource
+
+log = logging.getLogger(__name__)
 
 READER = "drive"
 CHECK = "python -m drivesplat.readers.drive check"
@@ -259,7 +263,11 @@ class _Reading:
             motion = None
             if not lidar.motion_compensated:
                 motion = self.ego.motion(sweep.timestamp, sensor_to_ego, lidar.revolution_s)
-            yield Sweep(path, sweep.timestamp, pose, is_key_frame, index, token, name, READER, motion)
+            found = Sweep(path, sweep.timestamp, pose, is_key_frame, index, token, name, READER, motion)
+            if not lidar.motion_compensated and (fault := beyond_poses(found, reach_us(lidar.revolution_s))):
+                log.warning("%s: LiDAR file %s %s; left out", place_of(found), path, fault)
+            else:
+                yield found
 
     def _shifted(self, pose: np.ndarray) -> np.ndarray:
         shifted = pose.copy()

@@ -17,6 +17,8 @@ from plyfile import PlyElementParseError, PlyHeaderParseError
 from drivesplat.io.pcd import header_of, read_pcd
 from drivesplat.io.point_cloud import read_ply_data
 from drivesplat.io.regular_file import regular_file
+from drivesplat.readers.sweep_motion import TOLERANCE_S, motion_fault
+from drivesplat.scene.scene import Sweep
 from drivesplat.scene.sensors import LidarReturns
 
 AXES = ("x", "y", "z")
@@ -62,6 +64,20 @@ def file_fault(path: Path) -> str | None:
     if ring is not None and not ((ring >= -1) & (ring < MAX_RINGS)).all():
         return f"has rings from {np.nanmin(ring):g} to {np.nanmax(ring):g}; they are indices of beams, from 0 on"
     return None
+
+
+def beyond_poses(sweep: Sweep, reach: int) -> str | None:
+    """Why a sweep at the end of the ego poses cannot be motion-compensated, although its points are within `reach`
+    (microseconds) of its timestamp; None for all others. Reads the files of those near an end alone."""
+    assert sweep.motion is not None
+    known = sweep.motion.offsets_s[[0, -1]] * 1e6
+    path = Path(sweep.path)
+    if (known[0] <= -reach and known[1] >= reach) or not path.is_file() or file_fault(path):
+        return None
+    returns = read_file(path)
+    if returns.offsets_s is None or not (np.abs(returns.offsets_s) <= reach * 1e-6 + TOLERANCE_S).all():
+        return None
+    return motion_fault(returns, sweep.motion)
 
 
 def columns_sentence(path: Path) -> str:
