@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow
 import pytest
 from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S
 from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
 from PIL import Image
 from pyarrow import feather
@@ -415,6 +416,6 @@ def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, c
 def test_converters_run_as_documented(name, tmp_path):
     done = subprocess.run(
         [sys.executable, str(REPOSITORY / f"examples/{name}.py"), "--help"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
+        cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0 and "drive folder" in done.stdout and "--cameras" in done.stdout, done.stderr
