@@ -15,6 +15,7 @@ import pytest
 import torch
 from gsplat import MCMCStrategy
 from gsplat.relocation import compute_relocation
+from helpers.patience import PATIENCE_S
 from helpers.reference_rasterizer import rasterize_reference
 from helpers.trainings import (
     ALL_TERMS,
@@ -296,7 +297,7 @@ def train_until_killed(folder: str) -> None:
 
 def test_a_killed_training_ends_as_an_uninterrupted_one(uninterrupted, tmp_path):
     process = in_subprocess(train_until_killed, str(tmp_path))
-    _, errors = process.communicate(timeout=120)
+    _, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == -signal.SIGKILL, errors
     model, summary = trained(tmp_path, gpu_settings("mcmc"), gpu_views(), device=GPU)
     assert summary.resumed_at == [80] and summary.iterations == 200
@@ -326,7 +327,7 @@ def print_what_stops(folder: str, strategy: str, fault: str) -> None:
 )
 def test_a_failing_training_ends_with_a_message(tmp_path, strategy, fault, pattern):
     process = in_subprocess(print_what_stops, str(tmp_path), strategy, fault)
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     assert re.search(pattern, output), output + errors[-3000:]
 
 
@@ -355,7 +356,7 @@ def print_out_of_memory(folder: str, gaussians: str, gigabytes: str) -> None:
 )
 def test_exhausted_memory_is_reported_with_the_number_of_gaussians_and_a_remedy(tmp_path, gaussians, gigabytes):
     process = in_subprocess(print_out_of_memory, str(tmp_path), str(gaussians), str(gigabytes))
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     assert output.startswith("DeviceError "), output + errors[-3000:]
     assert f"{gaussians:,} Gaussians" in output
     assert re.search(r"peak \d+\.\d GB", output) and "train.cap_max" in output

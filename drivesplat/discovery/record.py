@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.io.json_record import read_typed_json, write_typed_json
-from drivesplat.io.storage import Provenance
+from drivesplat.io.storage import Provenance, no_provenance
 from drivesplat.scene.scene import Track
 
 RULE = "discover"
@@ -21,7 +21,7 @@ class DiscoveredTracks:
     scans: int
     tracks: tuple[Track, ...]
     quality: dict[str, Any] | None = None
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
 
 
 def write_discovered(path: str | Path, record: DiscoveredTracks) -> None:

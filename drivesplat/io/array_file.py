@@ -83,7 +83,7 @@ def read_arrays(
         if not isinstance(content, dict):
             raise ValueError("it holds no record")
         return content
-    except FileNotFoundError as error:
+    except OSError as error:
         raise unreadable(path, rule, f"cannot be read ({error.strerror})") from error
     except Exception as error:  # zip, numpy and JSON each fail in their own ways
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import atomic_write, canonical_json, unreadable
+from drivesplat.io.typed_record import require_finite
 
 _NOTE = "drivesplat "
 MAX_HEADER_BYTES = 1_000_000
@@ -46,9 +47,9 @@ def read_ply(path: str | Path, rule: str) -> PointCloud:
         data = read_ply_data(path)
         note = next(json.loads(c.removeprefix(_NOTE)) for c in data.comments if c.startswith(_NOTE))
         vertices = data["vertex"]
-        return PointCloud(
-            _columns(vertices, ("x", "y", "z"), "f4"), _columns(vertices, ("red", "green", "blue"), "u1"), note
-        )
+        positions = _columns(vertices, ("x", "y", "z"), "f4")
+        require_finite("its positions", positions)
+        return PointCloud(positions, _columns(vertices, ("red", "green", "blue"), "u1"), note)
     except (OSError, PlyParseError, KeyError, ValueError, StopIteration) as error:
         raise unreadable(path, rule, f"not a seed of this workflow ({error or type(error).__name__})") from error
 

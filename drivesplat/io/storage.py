@@ -25,6 +25,11 @@ Provenance = dict[str, Any]
 """The settings, code and inputs of a result, as a JSON document (`drivesplat.provenance.record`)."""
 
 
+def no_provenance() -> Provenance:
+    """The provenance of what no stage made."""
+    return {"stages": {}, "inputs": {}}
+
+
 def unreadable(path: str | Path, rule: str, why: str, delete: str | Path | None = None) -> ResultError:
     """The error for a file that cannot be used. `delete` is the rule's declared output, where `path` is not one:
     Snakemake rebuilds declared outputs only."""

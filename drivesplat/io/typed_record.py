@@ -23,9 +23,9 @@ def typed_record(kind: type[R], values: Any, json: bool = False) -> R:
     annotation says, a dict becomes a dataclass, also within lists and tuples, a list a tuple, and a string a member of
     an enum. For values from `json` a list also becomes an array, and further values are an error.
 
-    Raises ValueError where a field without a default value is missing, or a value has another type, dtype or shape than
-    the field's annotation. A dimension has one size in all arrays of the record. Elements of containers are not
-    checked.
+    Raises ValueError where a field without a default value is missing, a value has another type, dtype or shape than
+    the field's annotation, a number is not finite, the provenance is none, or the record's own `fault` names one. A
+    dimension has one size in all arrays of the record. Elements of containers are not checked.
     """
     if not isinstance(values, dict):
         raise ValueError(f"it holds a {type(values).__name__}, no record")
@@ -41,7 +41,27 @@ def typed_record(kind: type[R], values: Any, json: bool = False) -> R:
         classes = _classes(hints[name])
         if not isinstance(value, classes) or not _fits(value, classes, sizes):
             raise ValueError(f"{name} is {_described(value)}, not {getattr(hints[name], '__name__', hints[name])}")
-    return kind(**known)
+        require_finite(name, value)
+    if "provenance" in known:
+        _require_provenance(known["provenance"])
+    record = kind(**known)
+    if hasattr(record, "fault") and (fault := record.fault()):
+        raise ValueError(fault)
+    return record
+
+
+def require_finite(name: str, value: Any) -> None:
+    """Raises ValueError where the number or array `value` called `name` has NaN or infinity."""
+    numbers = np.asarray(value) if isinstance(value, float | np.ndarray) else np.empty(0)
+    if numbers.dtype.kind == "f" and numbers.size and not np.isfinite([numbers.min(), numbers.max()]).all():
+        raise ValueError(f"{name} is not finite")
+
+
+def _require_provenance(record: dict[str, Any]) -> None:
+    """Raises ValueError where a record of provenance lacks what later stages merge."""
+    lacking = [name for name in ("stages", "inputs") if not isinstance(record.get(name), dict)]
+    if lacking:
+        raise ValueError(f"its provenance lacks {', '.join(lacking)}")
 
 
 def _value(hint: Any, value: Any, json: bool) -> Any:

@@ -74,9 +74,9 @@ def _placed(
         xy + wz, 1 - xx - zz, yz - wx,
         xz - wy, yz + wx, 1 - xx - yy,
     ]).reshape(3, 3, -1)  # fmt: skip
-    rotation, translation = world_to_sensor[:3, :3], world_to_sensor[:3, 3:]
-    axes = (rotation @ (rotations * scales.T).reshape(3, -1)).reshape(3, 3, -1)
-    return Placement(rotation @ means.T + translation, axes)
+    rotation, translation = world_to_sensor[:3, :3, None], world_to_sensor[:3, 3:]
+    axes = _turned(rotation, (rotations * scales.T).reshape(3, -1)).reshape(3, 3, -1)
+    return Placement(_turned(rotation, means.T) + translation, axes)
 
 
 def _at_firing(gaussians: Placement, revolution: Revolution, world_to_sensor: Float[Tensor, "4 4"]) -> Placement:
@@ -84,7 +84,7 @@ def _at_firing(gaussians: Placement, revolution: Revolution, world_to_sensor: Fl
     with torch.no_grad():
         relative = -revolution.linear[:, None].expand_as(gaussians.centers)
         if revolution.velocities is not None:
-            relative = relative + world_to_sensor[:3, :3] @ revolution.velocities.T
+            relative = relative + _turned(world_to_sensor[:3, :3, None], revolution.velocities.T)
         offsets, firings = gaussians.centers.new_zeros(gaussians.centers.shape[1]), revolution.firings
         for _ in range(FIRING_STEPS):
             x, y = _turned(_turns(-revolution.angular, offsets)[:2], gaussians.centers + relative * offsets)
@@ -116,7 +116,9 @@ def _turns(angular: Float[Tensor, "3"], seconds: Float[Tensor, " n"]) -> Float[T
     return eye + torch.sin(speed * seconds) * cross + (1.0 - torch.cos(speed * seconds)) * twice
 
 
-def _turned(turns: Float[Tensor, "rows 3 n"], vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "rows n"]:
+def _turned(turns: Float[Tensor, "rows 3 #n"], vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "rows n"]:
+    """The product, of one matrix or one for each vector. Last bits of a matrix product, and of its gradient, depend on
+    the number of threads on some processors."""
     return turns[:, 0] * vectors[0] + turns[:, 1] * vectors[1] + turns[:, 2] * vectors[2]
 
 

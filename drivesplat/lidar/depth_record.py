@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from drivesplat.io.array_file import read_typed_arrays
-from drivesplat.io.storage import Provenance
+from drivesplat.io.storage import Provenance, no_provenance
 
 RULE = "lidar_depth"
 
@@ -23,6 +23,11 @@ class PixelDepths:
     columns: Int[np.ndarray, " m"]
     depth: Float[np.ndarray, " m"]
 
+    def fault(self) -> str | None:
+        """What no record of `lidar_depth` holds, None without a fault."""
+        sound = (self.depth > 0.0).all() and (self.rows >= 0).all() and (self.columns >= 0).all()
+        return None if sound else "it has depths or pixels that are not positive"
+
     def __len__(self) -> int:
         return len(self.depth)
 
@@ -33,7 +38,7 @@ class LidarDepthRecord:
     that are not training images."""
 
     images: list[PixelDepths]
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
 
 
 def read_lidar_depth(path: str | Path) -> LidarDepthRecord:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from drivesplat.io.array_file import read_typed_arrays
-from drivesplat.io.storage import Provenance, unreadable
+from drivesplat.io.storage import Provenance, no_provenance
 
 RULE = "free_space"
 
@@ -27,12 +27,13 @@ class FreeSpace:
     shape: Int64[np.ndarray, "3"]
     voxel: float
     keys: Int64[np.ndarray, " k"]
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
+
+    def fault(self) -> str | None:
+        """What no record of `free_space` holds, None without a fault."""
+        return None if self.voxel > 0 and (np.diff(self.keys) > 0).all() else "its voxels are not in order"
 
 
 def read_free_space(path: str | Path) -> FreeSpace:
     """Reads free_space.npz. Raises ResultError, naming the file and its rule, if it is invalid."""
-    record = read_typed_arrays(path, RULE, FreeSpace, "free space")
-    if not record.voxel > 0 or (np.diff(record.keys) <= 0).any():
-        raise unreadable(path, RULE, "not a record of free space (its voxels are not in order)")
-    return record
+    return read_typed_arrays(path, RULE, FreeSpace, "free space")

@@ -14,6 +14,7 @@ from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import drifting_seed
 from drivesplat.model.exposure import Exposures
+from drivesplat.model.parameters import require_rows
 from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
@@ -91,8 +92,11 @@ def definitions(model: SplatModel) -> list[PartDefinition]:
 def rebuild_model(
     state: Mapping[str, torch.Tensor], parts: list[PartDefinition], sky: SkyKind, settings: TrainSettings
 ) -> SplatModel:
-    """The model whose `state_dict` is `state` and whose `definitions` are `parts`."""
+    """The model whose `state_dict` is `state` and whose `definitions` are `parts`. Raises RuntimeError, ValueError or
+    another error of lookups and types where they do not belong together."""
     made = []
+    if not parts:
+        raise ValueError("it has no parts")
     for i, definition in enumerate(parts):
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
@@ -115,12 +119,16 @@ def rebuild_model(
 
 
 def _rebuilt(params: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
+    if definition.part not in OBJECTS:
+        require_rows(params)
     if definition.part == Background.name:
         return Background(params, settings.gaussians, definition.extent)
     own = getattr(settings, definition.part)
     if definition.part == Drifting.name:
-        assert definition.seconds is not None
+        if definition.seconds is None:
+            raise ValueError("its drifting Gaussians have no times")
         return Drifting(params, own, settings.gaussians, definition.extent, definition.seconds)
+    require_rows(params, own.fourier, len(definition.tracks))
     return OBJECTS[definition.part](params, definition.tracks, own, settings.gaussians)
 
 

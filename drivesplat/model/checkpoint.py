@@ -8,9 +8,10 @@ from pathlib import Path
 
 import torch
 
+from drivesplat.errors import ResultError
 from drivesplat.io.array_file import read_arrays, write_arrays
 from drivesplat.io.storage import Provenance, unreadable
-from drivesplat.io.typed_record import typed_record
+from drivesplat.io.typed_record import require_finite, typed_record
 from drivesplat.kernels import triton_support
 from drivesplat.machine.device import choose_device, explain_out_of_memory
 from drivesplat.model.build import definitions, rebuild_model
@@ -31,6 +32,8 @@ class TrainedCheckpoint:
     job: TrainJob
     parts: list[PartDefinition]
     provenance: Provenance
+    path: str | None = None
+    """The file that it was read from."""
 
     @classmethod
     def of(cls, model: SplatModel, job: TrainJob, provenance: Provenance) -> "TrainedCheckpoint":
@@ -42,23 +45,37 @@ class TrainedCheckpoint:
 def write_checkpoint(path: str | Path, checkpoint: TrainedCheckpoint) -> None:
     """Writes checkpoint.npz, atomically. Raises ResultError naming `path` where the disk is full."""
     state = {name: value.numpy() for name, value in checkpoint.model.items()}
-    write_arrays(path, {**vars(checkpoint), "model": state, "job": checkpoint.job.model_dump_json()})
+    content = {"model": state, "parts": checkpoint.parts, "provenance": checkpoint.provenance}
+    write_arrays(path, {**content, "job": checkpoint.job.model_dump_json()})
 
 
 def read_checkpoint(path: str | Path) -> TrainedCheckpoint:
     """Reads checkpoint.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
     content = read_arrays(path, RULE)
     try:
+        for name, value in content["model"].items():
+            require_finite(name, value)
         state = {name: torch.from_numpy(value) for name, value in content["model"].items()}
         job = TrainJob.model_validate_json(content["job"])
-        return typed_record(TrainedCheckpoint, {**content, "model": state, "job": job})
+        return typed_record(TrainedCheckpoint, {**content, "model": state, "job": job, "path": str(path)})
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, RULE, "not a checkpoint of a finished training") from error
+        raise _no_checkpoint(path, error) from error
+
+
+def _no_checkpoint(path: str | Path, error: Exception) -> ResultError:
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+    return unreadable(path, RULE, f"not a checkpoint of a finished training ({reason})")
 
 
 def trained_model(checkpoint: TrainedCheckpoint) -> SplatModel:
-    """The model in a checkpoint, on the CPU."""
-    return rebuild_model(checkpoint.model, checkpoint.parts, checkpoint.job.sky, checkpoint.job.train)
+    """The model in a checkpoint, on the CPU. Raises ResultError, naming the file and the rule that makes it, where its
+    arrays are not those of the model that its settings describe."""
+    try:
+        return rebuild_model(checkpoint.model, checkpoint.parts, checkpoint.job.sky, checkpoint.job.train)
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        if checkpoint.path is None:
+            raise
+        raise _no_checkpoint(checkpoint.path, error) from error
 
 
 def open_model(checkpoint: TrainedCheckpoint, device_settings: DeviceSettings) -> tuple[SplatModel, torch.device]:

@@ -23,6 +23,8 @@ OFFSETS = {
     "opacities": "lidar_opacities",
 }
 """The parameters that a LiDAR adds to others, by the names of these."""
+_ROWS = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}
+"""The shapes of rows of what all Gaussians have; `shN` for degree 0."""
 
 
 def init_params(
@@ -70,6 +72,26 @@ def make_parameters(params: dict[str, Tensor]) -> nn.ParameterDict:
             for key, value in params.items()
         }
     )
+
+
+def require_rows(params: dict[str, Tensor], fourier: int | None = None, owners: int = 0) -> None:
+    """Raises ValueError where `params` are not the rows of n Gaussians, whose colours vary with time by `fourier`
+    coefficients (None: they do not), and which belong to so many `owners`."""
+    lacking = [name for name in _ROWS if name not in params] + (["owner"] if fourier and "owner" not in params else [])
+    if lacking:
+        raise ValueError(f"it lacks {lacking[0]}")
+    varying = () if fourier is None else (fourier,)
+    expected = _ROWS | {lidar: _ROWS[name] for name, lidar in OFFSETS.items()}
+    expected |= {"sh0": (*varying, 1, 3), "shN": (*varying, params["shN"].shape[-2], 3)}
+    for name, values in params.items():
+        kind = torch.int64 if name == "owner" else torch.float32
+        shape = (params["means"].shape[:1], values.shape[1:] if name not in expected else expected[name])
+        if values.dtype != kind or tuple(values.shape) != (*shape[0], *shape[1]):
+            raise ValueError(f"{name} is {values.dtype} {list(values.shape)}")
+    if math.isqrt(bases := params["shN"].shape[-2] + 1) ** 2 != bases:
+        raise ValueError(f"shN is {list(params['shN'].shape)}")
+    if owners and not ((params["owner"] >= 0) & (params["owner"] < owners)).all():
+        raise ValueError("owner has indices out of range")
 
 
 def learning_rates(settings: GaussianSettings, extent: float) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from drivesplat.io.array_file import read_typed_arrays
-from drivesplat.io.storage import Provenance
+from drivesplat.io.storage import Provenance, no_provenance
 
 RULE = "refine_poses"
 MAX_MEAN_ERROR = 2.0
@@ -38,7 +38,7 @@ class TriangulatedPoints:
     points: Float[np.ndarray, "p 3"]
     seen_by: Int[np.ndarray, " o"]
     seen_point: Int[np.ndarray, " o"]
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
 
     def seen_in(self, images: np.ndarray) -> Bool[np.ndarray, " p"]:
         """Whether at least MIN_VIEWS of `images` (indices of frames) see each point."""

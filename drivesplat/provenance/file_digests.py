@@ -77,7 +77,14 @@ def checked_digest(path: str | Path, warn: bool = True) -> str:
     and the rule that rebuilds it.
     """
     path = Path(path)
-    digest, record = file_digest(path), _read_record(path)
+    record = _read_record(path)
+    try:
+        digest = file_digest(path)
+    except OSError as error:
+        why = f"cannot be read ({error.strerror})"
+        if record is not None:
+            raise unreadable(path, record["rule"], why) from error
+        raise ResultError(f"{path}: {why}; delete it and rerun: its rule rebuilds it") from error
     if record is None:
         if warn:
             log.warning("%s: no digest was recorded (copied without %s/?); its content is not checked", path, FOLDER)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from drivesplat.io.array_file import read_typed_arrays
-from drivesplat.io.storage import Provenance
+from drivesplat.io.storage import Provenance, no_provenance
 from drivesplat.scene.motion import Motion
 
 RULE = "actors"
@@ -38,6 +38,12 @@ class ActorRecord:
     parts: tuple[str, ...] = ("actors",)
     object_class: str = "vehicle"
 
+    def fault(self) -> str | None:
+        """What no record of `actors` holds, None without a fault."""
+        if not (self.size > 0.0).all():
+            return f"size of actor {self.id} is not positive"
+        return None if 0 <= self.lidar_points <= len(self.points) else f"actor {self.id} has fewer points than returns"
+
     def part_in(self, parts: Sequence[str]) -> str | None:
         """The one of a model's `parts` that represents the actor; None: the background shows it."""
         return next((part for part in self.parts if part in parts), None)
@@ -48,7 +54,7 @@ class ActorRecords:
     """The content of actors.npz; `actors` in order of id."""
 
     actors: list[ActorRecord]
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
 
 
 def read_actors(path: str | Path) -> ActorRecords:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.storage import Provenance, read_json, unreadable
+from drivesplat.io.storage import Provenance, no_provenance, read_json, unreadable
 from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.images import read_mask
 from drivesplat.settings.tracks import OTHER_TRACKS
@@ -42,7 +42,7 @@ class MasksRecord:
     semantic_classes: int
     own_car: dict[str, str]
     visibility: str | None
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
 
 
 NO_MASKS = MasksRecord({}, 0, "boxes", "heuristic", 0.0, False, 0, {}, None)

@@ -38,6 +38,14 @@ class Motion:
     reach: float
     turns: Float[np.ndarray, " k"] | None = None
 
+    def fault(self) -> str | None:
+        """What no motion has, None without a fault."""
+        if not len(self.times) or (np.diff(self.times) <= 0.0).any():
+            return "times do not increase"
+        ends = np.array(self.runs).reshape(-1)
+        sound = len(ends) and ends[0] == 0 and ends[-1] == len(self.times) - 1 and (np.diff(ends) >= 0).all()
+        return None if sound else "runs do not cover the annotations"
+
     @classmethod
     def of_track(cls, scene: Scene, track: Track) -> "Motion":
         """The motion through a track's annotations; its reach is half a key-frame interval."""

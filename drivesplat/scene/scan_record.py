@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int16
 
 from drivesplat.io.array_file import read_typed_arrays
-from drivesplat.io.storage import Provenance
+from drivesplat.io.storage import Provenance, no_provenance
 from drivesplat.scene.rigid import apply
 from drivesplat.scene.scan import Scan
 
@@ -67,7 +67,7 @@ class ScanRecords:
 
     scans: list[RecordedScan]
     tracks: list[str]
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
 
     def of_group(self, group: str) -> list[RecordedScan]:
         """The scans of a split."""

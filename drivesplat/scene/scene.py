@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.json_record import read_typed_json, write_typed_json
-from drivesplat.io.storage import Provenance
+from drivesplat.io.storage import Provenance, no_provenance
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.sensors import Camera, Lidar, SweepMotion
@@ -114,7 +114,7 @@ class Scene:
     missing_images: int = 0
     cameras: tuple[Camera, ...] = ()
     lidars: tuple[Lidar, ...] = ()
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
     licence: str = ""
     sky_class: int | None = None
 

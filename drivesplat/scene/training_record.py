@@ -8,11 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from drivesplat.io.plain_pickle import read_plain_pickle, write_plain_pickle
-from drivesplat.io.storage import Provenance, unreadable
+from drivesplat.io.storage import Provenance, no_provenance, unreadable
 from drivesplat.io.typed_record import field_values, typed_record
 from drivesplat.scene.shutter import Shutter
 
 RULE = "parser"
+MAX_SIDE = 65535
+"""Pixels of the longest side of an image: the limit of JPEG."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class TrainingRecord:
     seed: SeedInfo
     readout_s: Float[np.ndarray, "n 3"] | None = None
     camera_velocities: Float[np.ndarray, "n 6"] | None = None
-    provenance: Provenance = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=no_provenance)
 
     @property
     def train_images(self) -> list[int]:
@@ -114,17 +116,26 @@ class TrainingRecord:
     def from_plain(cls, plain: dict[str, Any]) -> "TrainingRecord":
         """The inverse of `to_plain`; further keys are ignored. Raises ValueError if `plain` is not a training
         record."""
-        record = typed_record(cls, plain)
-        count, indices = len(record.Ks), np.concatenate(list(record.splits.values()))
-        if not len(record.image_paths) == len(record.image_names) == count:
-            raise ValueError(f"it has {count} images, {len(record.image_paths)} paths")
+        return typed_record(cls, plain)
+
+    def fault(self) -> str | None:
+        """What no record of `parser` holds, None without a fault."""
+        count = len(self.Ks)
+        if not len(self.image_paths) == len(self.image_names) == count:
+            return f"it has {count} images, {len(self.image_paths)} paths"
+        if "train" not in self.splits or (count and not len(self.splits["train"])):
+            return "splits has no training images"
         for name, index, limit in (
-            ("splits", indices, count),
-            ("camera_indices", record.camera_indices, len(record.camera_names)),
+            ("splits", np.concatenate(list(self.splits.values())), count),
+            ("camera_indices", self.camera_indices, len(self.camera_names)),
         ):
             if index.dtype.kind not in "iu" or ((index < 0) | (index >= limit)).any():
-                raise ValueError(f"{name} has indices out of range")
-        return record
+                return f"{name} has indices out of range"
+        if ((self.image_sizes < 1) | (self.image_sizes > MAX_SIDE)).any():
+            return f"image_sizes has a side outside 1 to {MAX_SIDE} pixels"
+        if (self.Ks[:, [0, 1], [0, 1]] <= 0.0).any():
+            return "Ks has a focal length that is not positive"
+        return None if self.scene_scale > 0.0 else "scene_scale is not positive"
 
 
 def write_training_record(path: str | Path, record: TrainingRecord) -> None:

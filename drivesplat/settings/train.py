@@ -185,7 +185,7 @@ class TrainSettings(Settings):
     """Render the rolling shutter of cameras whose dataset states its readout time and direction: each Gaussian where
     it is at the time of its line. false: as if all lines were recorded at the image's timestamp."""
     checkpoint_every: int = Field(500, ge=1)
-    """Iterations between resume checkpoints."""
+    """Iterations between resume checkpoints. Slow iterations are saved every minute as well."""
     checkpoint_apart_s: float = Field(60.0, ge=0)
     """Minimum time between resume checkpoints (seconds). More frequent ones would slow down short trainings."""
     cuda_graphs: bool = True

@@ -3,7 +3,7 @@
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
@@ -34,6 +34,17 @@ def readable(optimizer: str, model: SplatModel) -> str:
     'sky texels'."""
     owner, *_, name = optimizer.split(".")
     return f"{model.parts[int(owner)].name if owner.isdigit() else owner} {name}"
+
+
+def camera_figures(model: SplatModel) -> dict[str, float]:
+    """The learned figures of cameras by name: 'exposure/CAM_BACK/gain_red', 'camera_poses/CAM_FRONT/shift_m'."""
+    learned = {"exposure": model.exposure, "camera_poses": model.camera_poses}
+    return {
+        f"{kind}/{name}": value
+        for kind, module in learned.items()
+        if module is not None
+        for name, value in module.figures().items()
+    }
 
 
 class FiniteGuard:
@@ -98,7 +109,6 @@ class Monitor:
         with self._writing():
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)
-        self._log_progress(step, time.monotonic())
         self._bar.update(advanced)
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
 
@@ -107,15 +117,18 @@ class Monitor:
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)
 
-    def _log_progress(self, step: int, now: float) -> None:
-        """Logs '43 %, 12.3 it/s, 120 s left' at most every LOGGED_EVERY_S, by the speed since the last message; the
-        first iterations, which compile kernels, do not count. `drivesplat.workflow.costs.progress` reads it."""
-        before, began = self._logged = self._logged or (step, now)
-        if now - began < LOGGED_EVERY_S:
+    def progress(self, step: int, terms: Mapping[str, Tensor]) -> None:
+        """Logs 'iteration 430 of 1000, loss 0.0512, 12.3 it/s, 46 s left' every LOGGED_EVERY_S, by the speed since the
+        last message, and the first iteration of a run, which compiles kernels, without a speed. Only then the host
+        waits for the loss `terms`. `drivesplat.workflow.costs.progress` reads it."""
+        now = time.monotonic()
+        before, logged = self._logged or (step, now)
+        if self._logged and now - logged < LOGGED_EVERY_S:
             return
-        self._logged, speed = (step, now), (step - before) / (now - began)
-        left = (self._iterations - step) / speed
-        log.info("%.0f %%, %.1f it/s, %.0f s left", 100 * step / self._iterations, speed, left)
+        speed = (step - before) / (now - logged) if self._logged else 0.0
+        rest = f", {speed:.3g} it/s, {(self._iterations - step) / speed:.0f} s left" if speed else ""
+        log.info("iteration %d of %d, loss %.4g%s", step, self._iterations, sum(map(float, terms.values())), rest)
+        self._logged = step, time.monotonic()
 
     def image(self, step: int, view: TrainingView, picture: Picture) -> None:
         """Writes the recorded and the rendered image side by side, reduced for fast encoding."""

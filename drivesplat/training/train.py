@@ -24,7 +24,7 @@ from drivesplat.training.averaging import ParameterAverage
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, SensorPath, fade_in_empty_space
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
-from drivesplat.training.monitor import Monitor
+from drivesplat.training.monitor import Monitor, camera_figures
 from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
 from drivesplat.training.scans import TrainingScan
 from drivesplat.training.trainer import Trainer
@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 
 BOUND_EVERY = 100
 """Iterations between steps that bound positions. The last iteration ends with one, too."""
+MAX_UNSAVED_S = 60.0
+"""Seconds of training after which a resume state is saved between the iterations that settings name."""
 
 
 @dataclass(frozen=True)
@@ -185,10 +187,12 @@ class TrainingRun:
 
     @property
     def save_due(self) -> bool:
-        """Whether to save the resume state now; after the last iteration the checkpoint is saved instead."""
+        """Whether to save the resume state now: every `checkpoint_every` iterations, and after slow ones every
+        MAX_UNSAVED_S, but not sooner than settings allow; after the last iteration the checkpoint is saved instead."""
         step, settings = self.trainer.step, self.trainer.settings
-        old_enough = time.monotonic() - self.saved >= settings.checkpoint_apart_s
-        return step % settings.checkpoint_every == 0 and step < self.trainer.iterations and old_enough
+        age = time.monotonic() - self.saved
+        due = step % settings.checkpoint_every == 0 or age >= MAX_UNSAVED_S
+        return due and step < self.trainer.iterations and age >= settings.checkpoint_apart_s
 
     def summary(self) -> TrainingSummary:
         t, on_gpu = self.trainer, self.trainer.device.type == "cuda"
@@ -228,6 +232,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
             if trainer.step % settings.log_every == 0:
                 run.check()
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
+            monitor.progress(trainer.step, terms)
             if with_picture and picture is not None and view is not None:
                 monitor.image(trainer.step, view, _without_dropout(picture, view, trainer))
             monitor.psnrs(trainer.step, run.psnrs())
@@ -284,14 +289,3 @@ def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, floa
     losses = {f"loss/{name}": float(value) for name, value in terms.items()}
     of_cameras = camera_figures(trainer.model)
     return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model)), **of_cameras}
-
-
-def camera_figures(model: SplatModel) -> dict[str, float]:
-    """The learned figures of cameras by name: 'exposure/CAM_BACK/gain_red', 'camera_poses/CAM_FRONT/shift_m'."""
-    learned = {"exposure": model.exposure, "camera_poses": model.camera_poses}
-    return {
-        f"{kind}/{name}": value
-        for kind, module in learned.items()
-        if module is not None
-        for name, value in module.figures().items()
-    }

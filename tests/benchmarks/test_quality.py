@@ -375,7 +375,7 @@ def command(copy: WorkflowCopy) -> subprocess.CompletedProcess:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=600,
+        timeout=PATIENCE_S,
     )
 
 

@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from benchmarks.snakemake_run import Outcome, SnakemakeRun
@@ -446,7 +447,7 @@ def test_seeds_are_trained_in_parallel_on_several_gpus(tmp_path, monkeypatch):
     monkeypatch.setattr(SnakemakeRun, "start", lambda *_: Outcome(0))
     monkeypatch.setattr(command, "write", lambda record, _: record["runs"])
     monkeypatch.setattr(command, "speed", lambda _, measured, profiles: {"runs": list(measured)})
-    both, trained = Barrier(2, timeout=60), []
+    both, trained = Barrier(2, timeout=PATIENCE_S), []
 
     def in_turn(function, task, *_):
         if task.seed not in [seed for seed, *_ in trained]:

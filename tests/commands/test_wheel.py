@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S
 
 from drivesplat.provenance.code_digest import code_digest
 
@@ -44,7 +45,7 @@ def python(site: Path, code: str, *arguments: str, cwd: Path) -> subprocess.Comp
     """Runs code with the installed copy, and no checkout, to import from."""
     environment = {**os.environ, "PYTHONPATH": str(site), "CUDA_VISIBLE_DEVICES": "", "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
 def source_files(folder: Path) -> set[str]:

@@ -5,6 +5,7 @@ import multiprocessing
 
 import numpy as np
 from helpers.demo_worlds import FRONT, names_of, world_of
+from helpers.patience import PATIENCE_S
 
 from drivesplat.demo.optics.raycast import RayCaster, Rays, Sphere
 from drivesplat.demo.recorder import Recorder
@@ -90,6 +91,6 @@ def test_a_forked_process_casts_rays_of_its_own():
     results = context.Queue()
     child = context.Process(target=_in_child, args=(results,))
     child.start()
-    assert results.get(timeout=60) == here
-    child.join(timeout=60)
+    assert results.get(timeout=PATIENCE_S) == here
+    child.join(timeout=PATIENCE_S)
     assert child.exitcode == 0

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.patience import PATIENCE_S
 from scipy.spatial.transform import Rotation
 
 from drivesplat.export import viewer_page
@@ -21,7 +22,7 @@ def by_node(*files: str, expression: str, **values: object) -> object:
     source = [(FOLDER / f"{name}.js").read_text(encoding="utf-8") for name in files]
     source += [f"const {name} = {json.dumps(value)};" for name, value in values.items()]
     source.append(f"Promise.resolve({expression}).then((value) => console.log(JSON.stringify(value)));")
-    done = subprocess.run([str(NODE), "-"], input="\n".join(source), capture_output=True, text=True, timeout=60)
+    done = subprocess.run([str(NODE), "-"], input="\n".join(source), capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

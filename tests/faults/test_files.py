@@ -97,11 +97,18 @@ def write(path: Path, kind: str) -> None:
     }
     if kind == "a malicious checkpoint":
         torch.save(attack, path)
+    elif kind == "a folder":
+        path.mkdir()
+    elif kind == "a link loop":
+        path.symlink_to(path.name)
     else:
         path.write_bytes(content[kind])
 
 
-BROKEN = ["empty", "truncated", "a web page", "bytes", "a malicious pickle", "a malicious checkpoint"]
+BROKEN = [
+    "empty", "truncated", "a web page", "bytes", "a malicious pickle", "a malicious checkpoint", "a folder",
+    "a link loop",
+]  # fmt: skip
 FOREIGN = ["a pickle of another record", "a list", "another record"]
 LEFT_OUT = ("metrics.json", True)
 """The report leaves a foreign one out and names it: tests/report/test_report.py."""

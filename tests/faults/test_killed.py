@@ -3,25 +3,16 @@
 import os
 import signal
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 from helpers.killed_runs import VANILLA, only_complaint, training_process
+from helpers.patience import PATIENCE_S, wait_until
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("killed")]
 
 TARGET = "results/0001/vanilla/train.json"
-PATIENCE = 120
-"""Seconds that anything here may take."""
-
-
-def until(happens: Callable[[], object]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not happens():
-        assert time.monotonic() < deadline, "it never came to this"
-        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +39,7 @@ def at_work(copy: WorkflowCopy) -> subprocess.Popen:
     state = copy.folder / "results/0001/vanilla/resume/state.npz"
     state.unlink(missing_ok=True)
     running = started(copy)
-    until(state.exists)
+    wait_until(state.exists)
     return running
 
 
@@ -63,7 +54,7 @@ def test_a_training_that_outlives_a_killed_run_is_named_and_never_doubled(copy):
     assert f"process {orphan} is still training" in line and f"kill {orphan}" in line
     assert training_process(copy) == orphan
     os.kill(orphan, signal.SIGKILL)
-    until(lambda: training_process(copy) is None)
+    wait_until(lambda: training_process(copy) is None)
     done = copy.run("results/0001/parser.pkl")
     assert done.returncode == 0 and "Nothing to be done" in done.stdout, "no lock is left, and nothing is broken"
 
@@ -75,15 +66,15 @@ def test_an_interrupted_run_takes_its_training_along_and_the_next_one_goes_on(co
         "meanwhile there is no second one"
     )
     os.killpg(running.pid, signal.SIGINT)
-    assert running.wait(PATIENCE) != 0
-    until(lambda: training_process(copy) is None)
+    assert running.wait(PATIENCE_S) != 0
+    wait_until(lambda: training_process(copy) is None)
     folder = copy.folder / "results/0001/vanilla"
     assert not (folder / "checkpoint.npz").exists() and (folder / "resume/state.npz").exists()
     log = copy.folder / "results/logs/0001/vanilla/train.log"
     log.unlink()
     again = started(copy)
     try:
-        until(lambda: log.exists() and "resuming at iteration" in log.read_text())
+        wait_until(lambda: log.exists() and "resuming at iteration" in log.read_text())
     finally:
         os.killpg(again.pid, signal.SIGINT)
-        again.wait(PATIENCE)
+        again.wait(PATIENCE_S)

@@ -8,13 +8,13 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
 from helpers.killed_runs import VANILLA, only_complaint, training_process
+from helpers.patience import PATIENCE_S, wait_until
 from helpers.tiny_world import World
 from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
 
@@ -505,13 +505,11 @@ def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
         killed.command("--cores", "2", "--", "results/0001/metrics.json"), cwd=killed.folder,
         env={**os.environ, "CUDA_VISIBLE_DEVICES": ""}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    deadline = time.monotonic() + 120
-    while not state.exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_until(state.exists)
     trainer = training_process(killed)
-    assert state.exists() and trainer is not None
+    assert trainer is not None
     os.kill(trainer, signal.SIGKILL)
-    assert running.wait(timeout=120) != 0
+    assert running.wait(timeout=PATIENCE_S) != 0
     left = {path.name for path in (killed.folder / "results/0001/vanilla").iterdir()}
     assert not {"checkpoint.npz", "train.json"} & left
     done = killed.run("results/0001/metrics.json")

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.patience import PATIENCE_S
 from helpers.trainings import (
     PROVENANCE,
     EndedError,
@@ -63,7 +64,7 @@ def write_until_killed(folder: str) -> None:
 
 def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(tmp_path):
     process = in_subprocess(write_until_killed, str(tmp_path))
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == -signal.SIGKILL, errors
     (half,) = (tmp_path / "resume").glob(".state.*.partial.npz")
     assert half.stat().st_size > 0
@@ -113,7 +114,7 @@ def train_and_kill_the_parent(folder: str) -> None:
 
 def test_a_training_whose_end_snakemake_missed_resumes_from_its_last_checkpoint(tmp_path, caplog):
     process, files = in_subprocess(train_and_kill_the_parent, str(tmp_path)), files_in(tmp_path / "it")
-    _, errors = process.communicate(timeout=60)  # as long as any of both is there
+    _, errors = process.communicate(timeout=PATIENCE_S)  # as long as any of both is there
     assert process.returncode == -signal.SIGKILL and files.summary.is_file(), errors
     for output in (files.checkpoint, files.summary):
         output.unlink()  # as Snakemake does, which takes them for half made

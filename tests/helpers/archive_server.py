@@ -12,6 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from drivesplat.settings.download import DownloadJob, NuscenesMiniSettings
+from helpers.patience import PATIENCE_S
 
 
 def packed(root: Path) -> bytes:
@@ -75,7 +76,7 @@ class Site:
             return
         if self.silent_after is not None:
             handler.wfile.write(body[: self.silent_after])
-            self.ended.wait(5.0)
+            self.ended.wait(PATIENCE_S)
             return
         handler.wfile.write(body[: self.cut_after.pop(0)] if self.cut_after else body)
 

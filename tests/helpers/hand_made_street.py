@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from drivesplat.io.storage import no_provenance
 from drivesplat.model.actors import Actors
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.part import Part
@@ -111,7 +112,7 @@ def checkpoint_of(model: SplatModel, settings: TrainSettings = SETTINGS) -> Trai
     """What a training that ends with this model leaves."""
     parts = tuple(part.name for part in model.parts)
     job = TrainJob(parts=parts, sky="mask" if model.sky else "none", train=settings, random_seed=0)
-    checkpoint = TrainedCheckpoint.of(model, job, {})
+    checkpoint = TrainedCheckpoint.of(model, job, no_provenance())
     return replace(checkpoint, model={name: value.clone() for name, value in checkpoint.model.items()})
 
 

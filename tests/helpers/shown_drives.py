@@ -15,9 +15,6 @@ from drivesplat.scene.scene import Scene
 from helpers.table_files import time_limit
 from helpers.turning_drive import CAMERA, TIMES, TurningDrive
 
-SECONDS = 10.0
-"""For one conversion; an undamaged one takes 0.1 s."""
-
 
 def origin_of(scene: Scene, drive: TurningDrive) -> np.ndarray:
     """The scene's origin in the drive's world, by the first image."""
@@ -61,7 +58,7 @@ def world_points(scene: Scene, number: int, drive: TurningDrive) -> np.ndarray:
 
 def require_refused_or_sound(convert: Callable[[], int], out: Path, capsys: Any, done: str) -> None:
     """A damaged recording is refused in one line, or gives a folder whose faults `check` lists, or finite values."""
-    with time_limit(SECONDS):
+    with time_limit():
         status = convert()
     said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
     if status:
@@ -69,7 +66,7 @@ def require_refused_or_sound(convert: Callable[[], int], out: Path, capsys: Any,
         assert not (out / "drive.json").exists(), done
         return
     assert not said, done
-    with time_limit(SECONDS):
+    with time_limit():
         if check(out, None):
             return
         scene = whole_scene(read_drive(out), out)

@@ -10,6 +10,7 @@ from pathlib import Path
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.extract import SceneSource
+from helpers.patience import PATIENCE_S
 
 VERSION = "v1.0-mini"
 
@@ -19,14 +20,14 @@ class Hang(BaseException):
 
 
 @contextmanager
-def time_limit(seconds: float) -> Iterator[None]:
-    """Raises Hang in its block after so many seconds."""
+def time_limit() -> Iterator[None]:
+    """Raises Hang in its block after PATIENCE_S."""
 
     def stop(*_) -> None:
-        raise Hang(f"it does not end within {seconds} s")
+        raise Hang(f"it does not end within {PATIENCE_S} s")
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
     try:
         yield
     finally:
@@ -56,11 +57,11 @@ def row(rows: list[dict], token: str) -> dict:
     return next(row for row in rows if row["token"] == token)
 
 
-def extracted(root: Path, seconds: float = 10.0, **changes) -> Scene:
-    """Scene 0001 with its images and sweeps between key frames. Raises Hang after so many seconds."""
+def extracted(root: Path, **changes) -> Scene:
+    """Scene 0001 with its images and sweeps between key frames. Raises Hang where it does not end."""
     plain = {
         "dataset": "tiny", "reader": "nuscenes", "version": VERSION, "scene": "0001", "frames": None,
         "cameras": ("CAM_FRONT",), "sweeps": True, "lidar_sweeps": True, "on_missing": "stop",
     }  # fmt: skip
-    with time_limit(seconds):
+    with time_limit():
         return extract_scene(SceneSource(**{**plain, **changes}), root)

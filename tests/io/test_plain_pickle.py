@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S
 
 from drivesplat.errors import ResultError
 from drivesplat.io.plain_pickle import MAX_DEPTH, MAX_DIMENSIONS, read_plain_pickle, write_plain_pickle
@@ -292,14 +293,19 @@ for path in sorted(Path(sys.argv[1]).iterdir()):
 
 
 def read_apart(files: dict[str, bytes], folder: Path) -> dict[str, str]:
-    """Reads files in a subprocess limited to 2 GB and 30 s, and returns the outcome for each."""
+    """Reads files in a subprocess limited to 2 GB, and returns the outcome for each."""
     (folder / "forged").mkdir()
     for name, content in files.items():
         (folder / "forged" / name).write_bytes(content)
     limited = f"import resource; resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30)){READER}"
     command = [sys.executable, "-c", limited, str(folder / "forged"), str(folder / "again.pkl")]
     done = subprocess.run(
-        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=30, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        command,
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, done.stderr
     return dict(line.split(" ", 1) for line in done.stdout.splitlines())

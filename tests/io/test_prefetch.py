@@ -4,6 +4,7 @@ import threading
 import time
 
 import pytest
+from helpers.patience import PATIENCE_S
 
 from drivesplat.io.prefetch import prefetch, prefetch_items
 
@@ -29,7 +30,7 @@ def test_at_most_the_given_number_of_results_is_computed_before_use():
 
 
 def test_results_are_computed_in_parallel():
-    meeting = threading.Barrier(3, timeout=5.0)
+    meeting = threading.Barrier(3, timeout=PATIENCE_S)
     assert list(prefetch(lambda item: meeting.wait() >= 0, range(3), threads=3)) == [True] * 3
 
 
@@ -41,7 +42,7 @@ def test_an_exception_is_raised_in_place_of_its_result():
 
 
 def test_items_are_prefetched_by_one_thread_while_earlier_ones_are_used():
-    made, meeting = [], threading.Barrier(2, timeout=5.0)
+    made, meeting = [], threading.Barrier(2, timeout=PATIENCE_S)
 
     def items():
         for item in range(20):

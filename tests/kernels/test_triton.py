@@ -18,6 +18,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S
 from helpers.trainings import ALL_TERMS, guided_views, settings_of, untrained_street
 from scipy.spatial.transform import Rotation
 from torch import nn
@@ -661,13 +662,13 @@ def test_triton_is_checked_once_in_a_thread_where_there_is_a_gpu(device, switch,
     def wait() -> None:
         ran.append(threading.current_thread())
         begun.set()
-        released.wait(60.0)
+        released.wait(PATIENCE_S)
 
     monkeypatch.setenv(triton_support.SWITCH, switch)
     monkeypatch.setattr(probe, "run", wait)
     with unchecked():
         triton_support.start_check(torch.device(device))
-        assert begun.wait(60.0 if checks else 0.1) == bool(checks)
+        assert begun.wait(PATIENCE_S if checks else 0.1) == bool(checks)
         released.set()
         assert triton_support.compiles() == (switch == "1")
         triton_support.start_check(torch.device(device))

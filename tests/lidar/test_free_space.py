@@ -318,7 +318,7 @@ def test_held_out_sweeps_prove_nothing(tiny_root, tmp_path):
 
 
 def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
-    record = dataclasses.replace(free_space_record(tiny_scene, job()), provenance={"stages": {}})
+    record = dataclasses.replace(free_space_record(tiny_scene, job()), provenance={"stages": {}, "inputs": {"a": "b"}})
     write_arrays(tmp_path / "free_space.npz", record)
     again = read_free_space(tmp_path / "free_space.npz")
     assert (again.voxel, again.provenance) == (record.voxel, record.provenance)

@@ -29,6 +29,7 @@ from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 SH_C0 = 0.5 / np.sqrt(np.pi)
 SKY_COLOR = np.array([0.2, 0.4, 0.8])
 

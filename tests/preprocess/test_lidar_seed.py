@@ -3,7 +3,6 @@
 import dataclasses
 import re
 import shutil
-import time
 from pathlib import Path
 
 import numpy as np
@@ -593,17 +592,6 @@ def test_returns_that_are_not_finite_are_left_out(root):
     returns.tofile(sweep.path)
     expected = np.delete(returns, [3, 7], axis=0)[:, :3]
     np.testing.assert_array_equal(read_returns(sweep).points, expected.astype(np.float64))
-
-
-def test_1_4_million_points_are_thinned_and_coloured_over_30_views_within_half_a_minute():
-    random = np.random.default_rng(0)
-    points = random.uniform([-60.0, -3.0, 0.0], [60.0, 3.0, 150.0], (1_400_000, 3))
-    views = [full_size(view((i, i, i), 500 * i, at=(0.0, 0.0, 3.0 * i), size=(640, 360))) for i in range(30)]
-    began = time.monotonic()
-    kept = points[thin(points, 0.1)]
-    _, seen = color_by_visibility(kept, np.zeros(len(kept)), views)
-    assert time.monotonic() - began < 30.0
-    assert len(kept) > 1_000_000 and seen.any()
 
 
 def test_the_real_scene_is_seeded_from_its_only_sweep_and_a_file(real_scene_root):

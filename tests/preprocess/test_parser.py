@@ -133,7 +133,9 @@ def test_a_scene_without_training_images_is_refused_with_the_hold_out_settings(t
 
 
 def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, seed, tmp_path):
-    record = dataclasses.replace(training_record(tiny_scene, seed, job()), provenance={"made": "here"})
+    record = dataclasses.replace(
+        training_record(tiny_scene, seed, job()), provenance={"stages": {"made": {}}, "inputs": {}}
+    )
     write_training_record(tmp_path / "parser.pkl", record)
     again = read_training_record(tmp_path / "parser.pkl")
     assert pickle.dumps(again.to_plain()) == pickle.dumps(record.to_plain())
@@ -161,6 +163,16 @@ def test_an_invalid_parser_record_is_refused_naming_file_and_rule(tmp_path, cont
         ({"splits": {"train": np.array([19])}}, "splits has indices out of range"),
         ({"splits": {"train": np.array([0.5])}}, "splits has indices out of range"),
         ({"scene": {"name": "0001"}}, "it lacks dataset, version, poses"),
+        ({"points": np.full((50, 3), np.nan, np.float32)}, "points is not finite"),
+        ({"Ks": np.zeros((19, 3, 3))}, "Ks has a focal length that is not positive"),
+        ({"image_sizes": np.zeros((19, 2), int)}, "image_sizes has a side outside 1 to 65535 pixels"),
+        ({"image_sizes": np.full((19, 2), -96)}, "image_sizes has a side outside 1 to 65535 pixels"),
+        ({"image_sizes": np.full((19, 2), 10**9)}, "image_sizes has a side outside 1 to 65535 pixels"),
+        ({"splits": {}}, "splits has no training images"),
+        ({"splits": {"train": np.empty(0, int)}}, "splits has no training images"),
+        ({"scene_scale": float("nan")}, "scene_scale is not finite"),
+        ({"scene_scale": -1.0}, "scene_scale is not positive"),
+        ({"provenance": {"stages": {}}}, "its provenance lacks inputs"),
     ],
 )
 def test_a_record_with_inconsistent_fields_is_refused_with_the_reason(tiny_scene, seed, tmp_path, changes, reason):

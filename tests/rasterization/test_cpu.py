@@ -14,6 +14,7 @@ import pytest
 import torch
 from gsplat import DefaultStrategy
 from helpers.agreement import differing
+from helpers.patience import PATIENCE_S
 from helpers.random_gaussians import Scene, random_scene
 from helpers.reference_rasterizer import rasterize_reference
 
@@ -284,7 +285,7 @@ def test_several_threads_can_render_at_the_same_time():
     for worker in workers:
         worker.start()
     for worker in workers:
-        worker.join(timeout=60)
+        worker.join(timeout=PATIENCE_S)
     assert len(found) == 9
     assert all(torch.equal(value, seen[name]) for seen in found for name, value in expected.items())
 
@@ -304,7 +305,7 @@ def test_a_process_forked_after_rendering_can_render():
     child = context.Process(target=_image_in_child, args=(scene, there))
     child.start()
     try:
-        assert here.poll(60), "the forked process hangs or has died"
+        assert here.poll(PATIENCE_S), "the forked process hangs or has died"
         np.testing.assert_array_equal(here.recv(), expected)
     finally:
         child.kill()
@@ -329,5 +330,7 @@ from drivesplat.kernels.numba.tiles import _sorted_by
 print(_sorted_by(np.arange(3, dtype=np.int32), np.array([2, 0, 1], np.uint32)).tolist())
 """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=PATIENCE_S
+    )
     assert done.stdout.strip() == "[1, 2, 0]", done.stderr

@@ -7,10 +7,12 @@ import pytest
 import torch
 from helpers.agreement import differing
 from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from drivesplat.kernels.numba import scan_tiles
 from drivesplat.kernels.scan_compositing import composite_scan
 from drivesplat.kernels.scan_part import MetPart
+from drivesplat.kernels.scan_projection import scanned
 from drivesplat.rasterization import RayGrid, ScanMotion
 from drivesplat.scene.scan import ScanRays
 
@@ -255,6 +257,29 @@ def test_results_are_bitwise_equal_for_every_run_and_number_of_threads(count):
             assert all(torch.equal(found[name], value) for name, value in expected.items())
     finally:
         torch.set_num_threads(before)
+
+
+class ShapesOfProducts(TorchDispatchMode):
+    """Collects the shapes that matrix products take."""
+
+    def __init__(self):
+        super().__init__()
+        self.shapes: list[torch.Size] = []
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        if "mm" in operation.__name__:
+            self.shapes += [value.shape for value in args if isinstance(value, torch.Tensor)]
+        return operation(*args, **(kwargs or {}))
+
+
+def test_projection_has_no_matrix_product_over_gaussians():
+    """Its last bits, and those of its gradient, depend on the number of threads on some processors."""
+    scene = random_scan(3, n=50, rays=even_rays(4, 16)).float()
+    means, quats, scales, opacities, _, pose = (getattr(scene, name).requires_grad_() for name in INPUTS)
+    with ShapesOfProducts() as products:
+        (part,) = scanned(means, quats, scales, opacities, pose, None, (4e-3, 6e-3), 100.0)
+        (part.means2d.sum() + part.conics.sum() + part.ranges.sum()).backward()
+    assert pose.grad[:3].all() and not any(50 in shape for shape in products.shapes)
 
 
 def _float(motion: ScanMotion) -> ScanMotion:

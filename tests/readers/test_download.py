@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from helpers import REPOSITORY
 from helpers.archive_server import Site, packed, served
+from helpers.patience import wait_until
 from helpers.tiny_world import World, write_world
 
 from drivesplat.errors import ConfigError, DatasetError
@@ -228,13 +229,6 @@ def in_a_process(call, *arguments) -> multiprocessing.Process:
     return process
 
 
-def wait_for(condition) -> None:
-    until = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.01)
-
-
 def kill(process: multiprocessing.Process) -> None:
     os.kill(process.pid, signal.SIGKILL)
     process.join()
@@ -244,7 +238,7 @@ def test_a_run_killed_while_fetching_is_resumed(site, world, tmp_path):
     job, part = site.job(tmp_path / "mini"), tmp_path / "mini.download/v1.0-mini.tgz.part"
     site.silent_after = len(site.content) // 2
     process = in_a_process(download, job)
-    wait_for(lambda: fetching.size_of(part) == site.silent_after)
+    wait_until(lambda: fetching.size_of(part) == site.silent_after)
     kill(process)
     site.silent_after = None
     download(job)
@@ -275,7 +269,7 @@ def slow_download(job) -> None:
 def test_a_run_killed_while_unpacking_unpacks_again_without_fetching(site, world, tmp_path):
     job = site.job(tmp_path / "mini")
     process = in_a_process(slow_download, job)
-    wait_for((work_folder(job) / "v1.0-mini.tgz").is_file)
+    wait_until((work_folder(job) / "v1.0-mini.tgz").is_file)
     refused("another run is downloading", call=lambda: download(job))
     kill(process)
     assert not (tmp_path / "mini").exists()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S
 from helpers.small_drives import scene_at
 from PIL import Image
 from plyfile import PlyData, PlyElement
@@ -569,6 +570,6 @@ def test_the_command_runs_as_documented(folder, tmp_path):
     arguments = ["check", str(folder / "0001"), "--picture", str(tmp_path / "check.png")]
     done = subprocess.run(
         [sys.executable, "-m", "drivesplat.readers.drive", *arguments],
-        cwd=REPOSITORY, capture_output=True, text=True, timeout=120, check=False,
+        cwd=REPOSITORY, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0 and done.stderr == "", done.stderr

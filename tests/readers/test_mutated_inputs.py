@@ -19,8 +19,6 @@ from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.scene import Scene, read_scene, write_scene
 from drivesplat.settings.masks import MaskJob
 
-SECONDS = 10.0
-"""For one input; an undamaged one takes 0.02 s."""
 USED = [table for table in TABLES if table not in ("attribute", "visibility")]
 LARGE = ["sample", "sample_data", "ego_pose", "calibrated_sensor", "sample_annotation"]
 
@@ -82,7 +80,7 @@ def test_damaged_tables_are_refused_in_one_line_or_give_a_sound_scene(small_root
     root = copy_of(small_root, tmp_path / "data")
     done = [mutate_table(random, root / VERSION / f"{random.choice(USED + 2 * LARGE)}.json")]
     try:
-        scene = extracted(root, SECONDS, on_missing=random.choice(["stop", "warn"]))
+        scene = extracted(root, on_missing=random.choice(["stop", "warn"]))
     except DatasetError as error:
         one_line(error, done)
     else:
@@ -95,7 +93,7 @@ def test_damaged_images_are_refused_in_one_line_or_read(small_root, tmp_path, se
     root = Path(shutil.copytree(small_root, tmp_path / "data"))
     done = mutate_bytes(random, random.choice(sorted(root.glob("s*/CAM_FRONT/*"))))
     try:
-        require_sound(extracted(root, SECONDS), root, tmp_path)
+        require_sound(extracted(root), root, tmp_path)
     except DatasetError as error:
         one_line(error, done)
         assert "image" in str(error), done
@@ -106,9 +104,9 @@ def test_damaged_sweeps_are_refused_in_one_line_or_have_returns_near_the_sensor(
     random = Random(seed)
     root = Path(shutil.copytree(small_root, tmp_path / "data"))
     done = mutate_bytes(random, random.choice(sorted(root.glob("s*/LIDAR_TOP/*"))))
-    for sweep in extracted(root, SECONDS).sweeps:
+    for sweep in extracted(root).sweeps:
         try:
-            with time_limit(SECONDS):
+            with time_limit():
                 returns = read_returns(sweep)
         except DatasetError as error:
             one_line(error, done)
@@ -143,7 +141,7 @@ def test_damaged_masks_are_refused_in_one_line_or_give_labels_of_the_image(small
     done = f"{kind} {random_mask(random, folder / f'{small_scene.frames[1].timestamp}.png')}"
     job = MaskJob.model_validate({"masks": {kind: str(folder.parent)}, "holdout": {}, "images": {}})
     try:
-        with time_limit(SECONDS):
+        with time_limit():
             record = make_masks(small_scene, job, tmp_path / "masks")
     except DatasetError as error:
         one_line(error, done)

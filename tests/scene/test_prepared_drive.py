@@ -22,6 +22,10 @@ from drivesplat.scene.training_record import write_training_record
 GREY = (0.45, 0.5, 0.4)
 
 
+def made(by: str) -> dict:
+    return {"stages": {by: {}}, "inputs": {}}
+
+
 @pytest.fixture(scope="module")
 def labels() -> np.ndarray:
     """Label images at half the recorded width: a moving car above static pixels above the body of the ego vehicle."""
@@ -35,7 +39,7 @@ def masks(labels, tiny_scene, tmp_path_factory):
     folder = write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
     known = {"labels": {}, "images": 0, "regions": "boxes", "sky": "heuristic", "sky_share": 0.0}
     known |= {"own_car": {}, "sky_known": True, "semantic_classes": 0, "visibility": "annotated"}
-    write_json(folder / "masks.json", {**known, "provenance": {"made": "masks"}})
+    write_json(folder / "masks.json", {**known, "provenance": made("masks")})
     return folder
 
 
@@ -70,12 +74,12 @@ def test_every_image_has_its_split(tiny_scene):
 
 
 def test_a_prepared_drive_is_read_with_the_provenance_of_its_three_files(tiny_scene, masks, labels, tmp_path):
-    record = dataclasses.replace(recording_of(tiny_scene, width=48).record, provenance={"made": "parser"})
-    write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance={"made": "scene"}))
+    record = dataclasses.replace(recording_of(tiny_scene, width=48).record, provenance=made("parser"))
+    write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance=made("scene")))
     write_training_record(tmp_path / "parser.pkl", record)
     paths = (tmp_path / "scene.json", tmp_path / "parser.pkl", masks / "masks.json")
     drive, provenances = read_prepared_drive(*paths)
-    assert provenances == [{"made": "scene"}, {"made": "parser"}, {"made": "masks"}]
+    assert provenances == [made("scene"), made("parser"), made("masks")]
     assert drive.frame(2).token == tiny_scene.frames[2].token and drive.size(2) == (48, 27)
     np.testing.assert_array_equal(drive.labels(2), labels)
     (tmp_path / "masks.json").write_text("[]")

@@ -34,7 +34,8 @@ def some_scene(times: tuple[int, ...] = (1_532_402_927_647_951, 1_532_402_928_14
         "0061", "nuscenes", "v1.0-mini", "Parked truck, ä", np.array([411.3039349319818, 1180.8903791765097, 0.1]),
         np.array(times), (frame, between), (sweep,), (track,), "refined", 2.0, [0, 2], 3,
         (Camera("CAM_FRONT", 1600, 900, intrinsics, np.zeros(5), 0.03, "down"), Camera("CAM_BACK", 8, 9, intrinsics)),
-        (Lidar("LIDAR_TOP", np.array([-0.1, 0.1]), 1085), Lidar("LIDAR_SIDE")), {"stages": {"extract": {}}},
+        (Lidar("LIDAR_TOP", np.array([-0.1, 0.1]), 1085), Lidar("LIDAR_SIDE")),
+        {"stages": {"extract": {}}, "inputs": {}},
         "of the tests", 25,
     )  # fmt: skip
 

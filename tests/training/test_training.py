@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.patience import PATIENCE_S
 from helpers.trainings import (
     ALL_TERMS,
     CHECKPOINT_AT,
@@ -114,7 +115,7 @@ class Killed:
 def killed(tmp_path_factory) -> Killed:
     folder = tmp_path_factory.mktemp("trainings")
     process = in_subprocess(train_whole_and_until_killed, str(folder))
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     return Killed(folder / "killed", process.returncode, output, errors)
 
 
@@ -144,18 +145,19 @@ def test_one_seed_gives_one_result_on_the_cpu(uninterrupted, strategy, tmp_path)
     assert same_parameters(again, uninterrupted[strategy][0])
 
 
-def test_visits_see_the_model_and_neither_change_it_nor_count_as_training(tmp_path):
+def test_visits_see_the_model_and_neither_change_it_nor_count_as_training(tmp_path, monkeypatch):
     settings, views, seen = settings_of(iterations=10), recorded_views(), []
 
     def see(step: int, seconds: float, model: SplatModel) -> None:
         assert not torch.is_grad_enabled()
         seen.append((step, seconds, mean_psnr(model, views)))
-        time.sleep(0.3)
+        away.append(3600.0)
 
     visited, plain = untrained(settings), untrained(settings)
-    began = time.monotonic()
+    away, clock = [], time.monotonic  # a visit takes an hour
+    monkeypatch.setattr(time, "monotonic", lambda: clock() + sum(away))
     summary = train(visited, views, settings, 0, CPU, folders_of(tmp_path / "a", ""), visits=Visits(4, see))
-    assert summary.seconds < time.monotonic() - began - 4 * 0.3
+    assert summary.seconds < 3600.0
     assert [step for step, *_ in seen] == [3, 5, 8, 10]
     assert all(0.0 < earlier[1] < later[1] < summary.seconds + 0.1 for earlier, later in pairwise(seen))
     train(plain, views, settings, 0, CPU, folders_of(tmp_path / "b", ""))
@@ -467,12 +469,13 @@ def test_a_training_ended_twice_resumes_twice_and_counts_all_its_time(uninterrup
 
 
 class TickingViews(EndingViews):
-    """Training images of which a look takes a second, by the clock that the training sees."""
+    """Training images of which a look takes `look_s` seconds, by the clock that the training sees."""
 
     seconds = 0.0
+    look_s = 1.0
 
     def __getitem__(self, index: int) -> TrainingView:
-        self.seconds += 1.0
+        self.seconds += self.look_s
         return super().__getitem__(index)
 
 
@@ -484,6 +487,17 @@ def test_resume_states_come_no_sooner_than_their_time(apart, kept, tmp_path, mon
         trained(tmp_path, settings_of(checkpoint_every=10, checkpoint_apart_s=apart), views)
     state = tmp_path / "resume/state.npz"
     assert (checkpoint_file.load(state, "train")["step"] if state.exists() else None) == kept
+
+
+def test_slow_iterations_are_saved_by_time_and_resume_to_the_same_result(uninterrupted, tmp_path, monkeypatch):
+    views = TickingViews(recorded_views(), 45)
+    views.look_s = 3.3
+    with monkeypatch.context() as patched, pytest.raises(EndedError):
+        patched.setattr("drivesplat.training.train.time", SimpleNamespace(monotonic=lambda: views.seconds))
+        trained(tmp_path, settings_of(checkpoint_every=1000), views)
+    assert checkpoint_file.load(tmp_path / "resume/state.npz", "train")["step"] == 38, "each 19th look is past 60 s"
+    again, summary = trained(tmp_path, settings_of(checkpoint_every=1000))
+    assert summary.resumed_at == [38] and same_parameters(again, uninterrupted["mcmc"][0])
 
 
 def test_a_training_ended_before_its_first_checkpoint_starts_at_0(uninterrupted, tmp_path):
@@ -617,7 +631,7 @@ def test_a_second_trainer_is_refused_naming_the_first_and_a_killed_one_frees_the
     holder = context.Process(target=hold_the_lock, args=(tmp_path / "resume", there))
     holder.start()
     try:
-        assert here.poll(60) and here.recv() == "held"
+        assert here.poll(PATIENCE_S) and here.recv() == "held"
         assert_refused(tmp_path / "resume", holder.pid)
     finally:
         holder.kill()

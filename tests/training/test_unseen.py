@@ -21,6 +21,7 @@ from drivesplat.training.run import run_training
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import TrainingView
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 WIDTH, HEIGHT = 64, 48
 RED, BLUE = (0.8, 0.1, 0.1), (0.2, 0.3, 0.9)
 

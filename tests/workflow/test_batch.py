@@ -2,7 +2,6 @@
 two cores)."""
 
 import os
-import time
 
 import pytest
 import yaml
@@ -19,8 +18,6 @@ DONE = (
     "stands_at_night",
 )  # fmt: skip
 METHODS = ("vanilla", "street")
-PLANNING_S = 3.0
-"""To plan ten drives, of two methods each, on two idle cores."""
 
 
 @pytest.fixture(scope="module")
@@ -50,11 +47,8 @@ def test_nine_finish_and_the_tenth_is_named_in_a_partial_report(batch):
 
 
 def test_a_second_call_plans_the_broken_drive_and_nothing_else(batch):
-    began = time.monotonic()
     planned = batch.planned("all")
-    seconds = time.monotonic() - began
     assert planned["extract"] == planned["gap_report"] == 1 and planned["train"] == len(METHODS)
     assert not any(name.startswith("demo_world") for name in planned)
     done = batch.run(*(f"results/demo_batch/{scene}/metrics.json" for scene in DONE), flags=("-n",))
     assert "Nothing to be done" in done.stdout
-    assert seconds < PLANNING_S

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from helpers import REPOSITORY
+from helpers.patience import wait_until
 
 from drivesplat.settings.config import load
 from drivesplat.training import monitor
@@ -24,7 +26,13 @@ MASKS, TRAIN, FILM = (
 COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=CONFIG.train.iterations), Cost(FILM, 100.0, "")]
 BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
 ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.workflow.job: street/train 0103 ends\n"
+AT_HALF = "(iteration 3500 of 7000, loss 0.04, 7 min left)"
 LOGGED = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
+
+
+def at(step: int, rest: str) -> str:
+    """A line of a training's log."""
+    return LOGGED.format(f"iteration {step} of 7000, loss 0.04, {rest}")
 
 
 def progress(
@@ -42,21 +50,21 @@ def test_trainings_weigh_in_proportion_to_their_seconds(tmp_path):
 
 
 def test_a_running_training_reports_its_progress(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("10 %, 9.0 it/s, 999 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + at(700, "9 it/s, 999 s left"))
     with open(tmp_path / "train.log", "a") as log:
-        log.write(LOGGED.format("50 %, 18.8 it/s, 400 s left"))
+        log.write(at(3500, "18.8 it/s, 400 s left"))
     line = progress(tmp_path, {MASKS}).line(0.0)
-    assert line == "50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train (50 %)"
+    assert line == f"50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train {AT_HALF}"
 
 
 def test_a_training_slower_than_expected_takes_as_long_as_it_says(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("50 %, 1.0 it/s, 4000 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + at(3500, "1 it/s, 4000 s left"))
     assert progress(tmp_path, {MASKS}).line(0.0).startswith("50 % of the work, 1 of 3 jobs, about 68 min left")
 
 
 def test_a_training_faster_than_expected_is_no_further_than_it_says(tmp_path):
     """4 % of 200 s, and the masks' 100, of 400."""
-    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("4 %, 99.0 it/s, 192 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + at(280, "99 it/s, 192 s left"))
     assert progress(tmp_path, {MASKS}).line(0.0).startswith("27 % of the work, 1 of 3 jobs, about 5 min left")
 
 
@@ -72,14 +80,14 @@ def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
     """A running training says how long it still takes."""
     alone = progress(tmp_path, {MASKS}, costs=COSTS[:1])
     assert alone.line(0.0) == "1 of 3 jobs, 2 jobs not measured yet left"
-    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("50 %, 18.8 it/s, 400 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + at(3500, "18.8 it/s, 400 s left"))
     line = alone.line(0.0)
-    assert line == "1 of 3 jobs, about 7 min and 1 job not measured yet left; at work: 0103 street train (50 %)"
+    assert line == f"1 of 3 jobs, about 7 min and 1 job not measured yet left; at work: 0103 street train {AT_HALF}"
 
 
 def test_a_job_that_has_ended_is_done_before_it_is_counted(tmp_path):
     """Snakemake looks for outputs, and at other jobs, before it counts one."""
-    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("99 %, 18.8 it/s, 8 s left") + ENDS)
+    (tmp_path / "train.log").write_text(BEGINS + at(6930, "18.8 it/s, 8 s left") + ENDS)
     assert progress(tmp_path, {MASKS}).line(0.0) == "90 % of the work, 1 of 3 jobs, about 2 min left"
 
 
@@ -89,34 +97,53 @@ def test_a_log_without_a_beginning_gives_no_times(tmp_path):
 
 
 def test_logs_of_earlier_runs_are_not_running_jobs(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("50 %, 18.8 it/s, 400 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + at(3500, "18.8 it/s, 400 s left"))
     assert "at work" not in progress(tmp_path, {MASKS}, began=time.time() + 60).line(0.0)
 
 
+def test_a_training_that_began_shows_its_iteration_and_loss(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("iteration 1 of 120, loss 0.31"))
+    line = progress(tmp_path, {MASKS}).line(0.0)
+    assert line.endswith("about 15 min left; at work: 0103 street train (iteration 1 of 120, loss 0.31)")
+
+
 def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):
-    clock = iter([60.0, 65.0, 72.0, 73.0, 84.0])
-    monkeypatch.setattr(monitor.time, "monotonic", lambda: next(clock))
+    now = [60.0]
+    monkeypatch.setattr(monitor.time, "monotonic", lambda: now[0])
     watched = monitor.Monitor(tmp_path / "tensorboard", iterations=1000, start=40, label="x")
+    read = []
     with caplog.at_level(logging.INFO, logger="drivesplat.training.monitor"):
-        for step in (100, 200, 340, 350, 460):
-            watched.scalars(step, {"loss/total": 1.0, "gaussians": 5.0}, 100)
+        for step, now[0] in ((41, 60.0), (100, 65.0), (200, 69.9), (281, 72.0), (350, 73.0), (401, 84.0)):
+            watched.progress(step, Terms(read, {"l1": torch.tensor(0.25), "ssim": torch.tensor(0.5)}))
     monkeypatch.undo()
     watched.close()
-    assert [record.message for record in caplog.records] == ["34 %, 20.0 it/s, 33 s left", "46 %, 10.0 it/s, 54 s left"]
+    assert [record.message for record in caplog.records] == [
+        "iteration 41 of 1000, loss 0.75",
+        "iteration 281 of 1000, loss 0.75, 20 it/s, 36 s left",
+        "iteration 401 of 1000, loss 0.75, 10 it/s, 60 s left",
+    ]
+    assert len(read) == 3, "other iterations do not wait for the device"
     (tmp_path / "train.log").write_text(BEGINS + LOGGED.format(caplog.records[-1].message))
-    assert "(46 %)" in progress(tmp_path, {MASKS}).line(0.0)
+    assert "train (iteration 401 of 1000, loss 0.75, 60 s left)" in progress(tmp_path, {MASKS}).line(0.0)
+
+
+class Terms(dict):
+    """Loss terms that note when they are read."""
+
+    def __init__(self, read: list, terms: dict):
+        super().__init__(terms)
+        self._read = read
+
+    def values(self):
+        self._read.append(1)
+        return super().values()
 
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_watch_prints_and_outlives_what_goes_wrong(tmp_path, capsys, fails):
     finished = set() if not fails else None
     ended = watch(progress(tmp_path, finished), every_s=0.01)
-    deadline, printed = time.monotonic() + 10, ""
-    while printed.count("\n") < 2 and time.monotonic() < deadline:
-        time.sleep(0.02)
-        printed += capsys.readouterr().err
+    printed: list[str] = []
+    wait_until(lambda: printed.append(capsys.readouterr().err) or "".join(printed).count("drivesplat: ") >= 2)
     ended.set()
-    assert (
-        printed.count("drivesplat: ") >= 2
-        and ("the progress of the run is unknown" if fails else "0 % of the work") in printed
-    )
+    assert ("the progress of the run is unknown" if fails else "0 % of the work") in "".join(printed)

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S
 
 from drivesplat.workflow.job import Job
 from drivesplat.settings.device import DeviceSettings
@@ -109,15 +110,15 @@ class Machine:
         program.write_text(f"#!/bin/sh\n{lines}" if uuids else "#!/bin/sh\nexit 9\n")
         program.chmod(0o755)
 
-    def start(self, visible: str | None, jobs_per_card: int = 1, seconds: float = 60) -> subprocess.Popen:
-        """A job that holds a GPU for `seconds`."""
+    def start(self, visible: str | None, jobs_per_card: int = 1) -> subprocess.Popen:
+        """A job that holds a GPU until it is killed."""
         path = f"{self.folder / 'bin'}:{os.environ['PATH']}"
         environment = {k: v for k, v in os.environ.items() if not k.endswith("_VISIBLE_DEVICES")}
         environment |= {"PATH": path, "TMPDIR": str(self.folder / "tmp"), "PYTHONPATH": str(REPOSITORY)}
         if visible is not None:
             environment["CUDA_VISIBLE_DEVICES"] = visible
         job = subprocess.Popen(
-            [sys.executable, "-c", HOLD, str(jobs_per_card), str(seconds)],
+            [sys.executable, "-c", HOLD, str(jobs_per_card), str(PATIENCE_S)],
             env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
         self.jobs.append(job)
@@ -163,10 +164,12 @@ def test_one_more_job_waits_with_a_warning_and_gets_the_gpu_of_a_killed_one(mach
 
 def test_on_one_gpu_one_job_at_a_time(machine):
     machine.set_uuids(["GPU-a"])
-    first, began = machine.start("0", seconds=0.8), time.monotonic()
+    first = machine.start("0")
     assert machine.gpu_of(first) == "0"
-    assert machine.gpu_of(machine.start("0")) == "0"
-    assert time.monotonic() - began > 0.8
+    second = machine.start("0")
+    assert second.stdout.readline().startswith("waits for a GPU")
+    first.kill()
+    assert machine.gpu_of(second) == "0"
 
 
 def test_more_jobs_share_the_gpus_evenly_where_they_may(machine):
@@ -199,7 +202,7 @@ def test_without_gpus_nothing_is_held_and_nothing_changed(machine, visible):
 
 def test_locks_that_cannot_be_written_are_named(machine):
     (machine.folder / f"tmp/drivesplat-cards-{os.getuid()}").write_text("a file")
-    output = machine.start("0,1").communicate(timeout=60)[0].strip().splitlines()[-1]
+    output = machine.start("0,1").communicate(timeout=PATIENCE_S)[0].strip().splitlines()[-1]
     assert output.startswith("drivesplat.errors.DeviceError") and "TMPDIR" in output and "GPU-a.0" in output
 
 

@@ -7,6 +7,7 @@ import subprocess
 
 import pytest
 import yaml
+from helpers.patience import PATIENCE_S
 from helpers.workflow_copy import REPOSITORY, WorkflowCopy
 
 PROFILES = REPOSITORY / "profiles"
@@ -36,7 +37,7 @@ def test_a_scene_through_slurm_comes_out_as_one_that_runs_here(tmp_path):
     environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"}
     done = subprocess.run(
         there.command(*ON_SLURM, "--", TARGET), cwd=there.folder, env=environment,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=500,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
     jobs = re.findall(r"submitted with SLURM jobid (\d+) \(log: \S*/rule_(\w+)/", done.stdout)
@@ -61,6 +62,7 @@ def planned(copy: WorkflowCopy) -> str:
     """The rules that a further call through the profile would run, by its table."""
     done = subprocess.run(
         copy.command("-n", "--workflow-profile", "profiles/slurm", "--", TARGET), cwd=copy.folder,
-        capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"},
+        capture_output=True, text=True, timeout=PATIENCE_S,
+        env={**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"},
     )  # fmt: skip
     return done.stdout.rpartition("Job stats:")[2] if "Job stats:" in done.stdout else ""

@@ -15,7 +15,7 @@ from drivesplat.workflow.job_logs import has_begun, is_cut_short
 EVERY_S = 30.0
 MAX_NAMED = 4
 """Running jobs that are named at most."""
-_PROGRESS = re.compile(r"([\d.]+) %, [\d.]+ it/s, (\d+) s left")
+_PROGRESS = re.compile(r"iteration (\d+) of (\d+), loss ([^\s,]+)(?:, \S+ it/s, (\d+) s left)?$", re.MULTILINE)
 """The progress that a training logs (`drivesplat.training.monitor`)."""
 
 
@@ -36,8 +36,8 @@ class RunProgress:
     _since: dict[JobId, float] = field(default_factory=dict)
 
     def line(self, now: float) -> str:
-        """'37 % of the work, 12 of 40 jobs, about 9 min left; at work: 0103 street train (43 %)'; without a share of
-        the work while the costs of some jobs are unknown."""
+        """'37 % of the work, 12 of 40 jobs, about 9 min left; at work: 0103 street masks'; without a share of the work
+        while the costs of some jobs are unknown. A training is named with its iteration, loss and remaining time."""
         expectations, finished = self.expectations(), self.finished()
         done, unknown, left, at_work = 0.0, 0, [], []
         for one in self.planned:
@@ -45,10 +45,10 @@ class RunProgress:
             working = False if one.job in finished else self._is_at_work(one.job)
             remaining = seconds if working is None else 0.0
             if working:
-                part, remaining = self._of_running(one.job, seconds, now)
-                at_work.append(f"{one.job.name} ({part:.0f} %)" if part is not None else one.job.name)
+                part, remaining, described = self._of_running(one.job, seconds, now)
+                at_work.append(f"{one.job.name}{described}")
                 if part is not None and remaining is not None:
-                    seconds = remaining / (1.0 - min(part, 99.0) / 100.0)
+                    seconds = remaining / (1.0 - min(part, 0.99))
             if remaining is None:
                 unknown += 1
                 continue
@@ -73,13 +73,19 @@ class RunProgress:
             return None
         return is_cut_short(text) if has_begun(text) else None
 
-    def _of_running(self, job: JobId, expected: float | None, now: float) -> tuple[float | None, float | None]:
-        """The percentage of a running job where its log tells it, and the seconds it still needs where known."""
+    def _of_running(self, job: JobId, expected: float | None, now: float) -> tuple[float | None, float | None, str]:
+        """The fraction of a running job that is done where its log tells it, the seconds it still needs where known,
+        and both in words."""
         elapsed = now - self._since.setdefault(job, now)
+        left = None if expected is None else max(0.0, expected - elapsed)
         logged = _PROGRESS.findall(self.logs[job].read_text("utf-8")) if job.stage == TRAIN else []
-        if logged:
-            return float(logged[-1][0]), float(logged[-1][1])
-        return None, None if expected is None else max(0.0, expected - elapsed)
+        if not logged:
+            return None, left, ""
+        step, iterations, loss, seconds = logged[-1]
+        if not seconds:
+            return None, left, f" (iteration {step} of {iterations}, loss {loss})"
+        described = f" (iteration {step} of {iterations}, loss {loss}, {spelled(float(seconds))} left)"
+        return int(step) / int(iterations), float(seconds), described
 
 
 def watch(progress: RunProgress, every_s: float = EVERY_S) -> threading.Event:
