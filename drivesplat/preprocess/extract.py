@@ -9,9 +9,8 @@ from pathlib import Path
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.undistort import undistorted
 from drivesplat.readers.datasets import reader, unpacker
-from drivesplat.readers.drive_checks import jumps
+from drivesplat.readers.drive_warnings import drive_warnings
 from drivesplat.readers.image_file import image_fault
-from drivesplat.readers.plausibility import pose_warnings
 from drivesplat.scene.scene import Frame, Scene, place_of
 from drivesplat.scene.scene_warnings import luminance, scene_warnings
 from drivesplat.settings.extract import SceneSource
@@ -66,7 +65,7 @@ def extract_scene(
         resampled = _folder(results, source) / "undistorted"
         shutil.rmtree(resampled, ignore_errors=True)
         scene = undistorted(scene, resampled)
-    for sentence in (*jumps(scene), *pose_warnings(scene), *scene_warnings(scene, luminance(scene))):
+    for sentence in (*drive_warnings(scene), *scene_warnings(scene, luminance(scene))):
         log.warning("scene %s: %s", scene.name, sentence)
     return scene
 

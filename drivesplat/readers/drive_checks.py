@@ -88,20 +88,19 @@ def returns_fault(returns: LidarReturns) -> str | None:
 
 
 def jumps(scene: Scene) -> list[str]:
-    """A sentence for every track with a speed above MAX_SPEED between two annotations (at most MAX_NAMED), and for the
-    ego vehicle. These are warnings, since annotations and positions have errors."""
-    found, tracks = [], []
+    """A sentence if the ego vehicle has a speed above MAX_SPEED, otherwise one for every track that has it between two
+    annotations (at most MAX_NAMED). These are warnings, since annotations and positions have errors."""
+    tracks = []
     for times, positions in _ego_paths(scene):
         where = _jump(times, positions)
         if where:
-            found.append(f"the ego vehicle jumps, {where}: check its poses, that they are metres, and their times")
-            break
+            return [f"the ego vehicle jumps, {where}: check its poses, that they are metres, and their times"]
     for track in scene.tracks:
         where = _jump(track.timestamps, track.object_to_world[:, :3, 3])
         if where:
             tracks.append(f"track {track.id} ({track.category}) jumps, {where}: check its boxes")
     more = [f"{len(tracks) - MAX_NAMED} more tracks jump"] if len(tracks) > MAX_NAMED else []
-    return [*found, *tracks[:MAX_NAMED], *more]
+    return [*tracks[:MAX_NAMED], *more]
 
 
 def _ego_paths(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -46,7 +46,8 @@ def lidar_warnings(scene: Scene) -> list[str]:
         if chosen and _ground_share(scene, chosen) < MIN_GROUND:
             found.append(
                 f"LiDAR {lidar.name}: hardly any return lies near the ground (z = 0 of the ego frame): check its "
-                "sensor_to_ego, and the rotations of ego_poses"
+                "sensor_to_ego, the rotations of ego_poses, and that points of sweeps are in the sensor's frame, "
+                "not in the world"
             )
     return [*found, *_unseen_warnings(scene)]
 

@@ -31,3 +31,8 @@ def text_fault(value: Any) -> str | None:
 def is_printable(text: str) -> bool:
     """Whether a text can be printed in a line and written to a file: no lone surrogates, no control characters."""
     return text.isprintable() or not any(ord(c) < 32 or 127 <= ord(c) < 160 or 0xD800 <= ord(c) < 0xE000 for c in text)
+
+
+def counted(number: int, name: str, plural: str = "") -> str:
+    """A number of things in words: '1 track', '2 tracks'."""
+    return f"{number} {name if number == 1 else plural or f'{name}s'}"

@@ -12,7 +12,7 @@ from drivesplat.scene.scene import Sweep, place_of
 from drivesplat.scene.sensors import LidarReturns, Spin
 
 SWEEP_FILE = "drivesplat.readers.*.sweep_file"
-"""The module of a reader with `read_file` and `file_fault`."""
+"""The module of a reader with `read_file` and `file_fault`, or `read_checked`, which reads a file once for both."""
 
 
 def read_returns(sweep: Sweep) -> LidarReturns:
@@ -45,22 +45,33 @@ def read_scan(sweep: Sweep, spin: Spin | None) -> Scan | None:
 
 def sweep_fault(sweep: Sweep) -> str | None:
     """The fault of a sweep's file, with its token and path; None if there is none."""
-    returns = _returns(sweep)
+    returns = _returns(sweep, compensate=False)
     return _named(sweep, returns) if isinstance(returns, str) else None
 
 
-def _returns(sweep: Sweep) -> LidarReturns | str:
+def sound_returns(sweep: Sweep) -> LidarReturns | None:
+    """The returns of a sweep, as `read_returns` gives them; None where its file has a fault."""
+    returns = _returns(sweep)
+    return None if isinstance(returns, str) else returns
+
+
+def _returns(sweep: Sweep, compensate: bool = True) -> LidarReturns | str:
     """The returns of a sweep, or the fault of its file."""
     path, files = Path(sweep.path), _files(sweep)
-    fault = files.file_fault(path) if path.is_file() else "is missing"
-    if fault:
-        return fault
-    returns = files.read_file(path)
+    if not path.is_file():
+        return "is missing"
+    if (read_checked := getattr(files, "read_checked", None)) is not None:
+        returns = read_checked(path)
+    else:
+        returns = files.file_fault(path) or files.read_file(path)
+    if isinstance(returns, str):
+        return returns
     if fault := returns_fault(returns):
         return fault
     if sweep.motion is None:
         return returns
-    return motion_fault(returns, sweep.motion) or compensated(returns, sweep.motion)
+    fault = motion_fault(returns, sweep.motion)
+    return fault or (compensated(returns, sweep.motion) if compensate else returns)
 
 
 def _named(sweep: Sweep, fault: str) -> str:

@@ -12,6 +12,7 @@ from helpers.tiny_world import KEY_FRAME_US, START_US, World, write_world
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive_checks import jumps
 from drivesplat.readers.nuscenes.layout import TABLES, camera_names
+from drivesplat.readers.nuscenes.scene_tables import index_tables
 
 SAMPLE, IMAGE, SWEEP = "0001 sample 1", "0001 CAM_FRONT 2", "0001 LIDAR_TOP 1"
 BETWEEN = "0001 CAM_FRONT 3"
@@ -429,3 +430,12 @@ def test_an_undamaged_drive_jumps_nowhere(root, caplog):
     with caplog.at_level(logging.WARNING):
         extracted(root)
     assert "jumps" not in caplog.text
+
+
+@pytest.mark.parametrize("table", ["sample_annotation", "sample_data"])
+def test_a_row_of_a_sample_that_exists_nowhere_is_refused_with_its_token(root, tmp_path, table):
+    """Rows are split by the scene of their sample; this one would belong to none."""
+    token = {"sample_annotation": BOX, "sample_data": BETWEEN}[table]
+    edit(root, table, lambda rows: row(rows, token).update(sample_token="nowhere"))
+    with pytest.raises(DatasetError, match=rf"sample nowhere is referred to by {table} {token}, but not in the tables"):
+        index_tables(root, "v1.0-mini", ["0001"], tmp_path / "rows")

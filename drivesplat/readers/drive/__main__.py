@@ -7,12 +7,13 @@ from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
-from drivesplat.readers.drive.check import check, column_sentences, summary, whole_scene
-from drivesplat.readers.drive.format import Drive, grouped, read_drive
+from drivesplat.readers.drive.check import column_sentences, examine, summary, what_to_see
+from drivesplat.readers.drive.format import Drive, grouped
+from drivesplat.readers.drive.needed_settings import needed_settings
 from drivesplat.readers.drive.nerfstudio import add_command
 from drivesplat.readers.drive.write import write_drive
-from drivesplat.readers.drive_checks import jumps
-from drivesplat.readers.plausibility import lidar_warnings, pose_warnings
+from drivesplat.readers.drive_warnings import drive_warnings
+from drivesplat.readers.record_names import counted
 from drivesplat.scene.scene import read_scene
 
 
@@ -44,20 +45,22 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _check(asked: argparse.Namespace) -> int:
     picture = asked.picture or asked.folder / "check.png"
-    faults = check(asked.folder, picture)
-    for line in grouped(faults):
+    found = examine(asked.folder, picture)
+    for line in grouped(found.faults):
         print(line)
-    if picture.exists():
-        print(f"picture: {picture}: returns must lie on surfaces, also those of other times, and boxes around objects")
-    if faults:
-        print(f"{len(faults)} fault{'s' if len(faults) > 1 else ''}")
+    if found.no_picture:
+        print(found.no_picture)
+    elif found.scene is not None:
+        print(": ".join(filter(None, (f"picture: {picture}", what_to_see(found.scene)))))
+    if found.faults or found.scene is None:
+        print(counted(len(found.faults), "fault"))
         return 1
-    scene = whole_scene(read_drive(asked.folder), asked.folder)
-    for sentence in (*jumps(scene), *pose_warnings(scene), *lidar_warnings(scene)):
+    for sentence in drive_warnings(found.scene):
         print(f"warning: {sentence}")
-    for sentence in column_sentences(scene):
+    for sentence in column_sentences(found.scene):
         print(sentence)
-    print(summary(scene))
+    print(summary(found.scene))
+    print(f"settings to copy:\n\n{needed_settings(found.scene, asked.folder)}", end="")
     return 0
 
 

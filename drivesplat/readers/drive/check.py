@@ -1,10 +1,14 @@
 """The check of a drive folder: every fault in a sentence, and a picture with LiDAR and boxes in images."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, Drive, structure_of
@@ -12,6 +16,7 @@ from drivesplat.readers.drive.from_above import seen_from_above
 from drivesplat.readers.drive.reader import scene_of
 from drivesplat.readers.drive.sweep_file import columns_sentence
 from drivesplat.readers.image_file import image_fault
+from drivesplat.readers.record_names import counted
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.images import continuous_intrinsics, project, read_image
 from drivesplat.scene.regions import hulls_in
@@ -19,8 +24,11 @@ from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep
 from drivesplat.settings.extract import SceneSource
 
-WIDTH = 960
-"""Width of an image in the picture."""
+WIDTH, MAX_WIDTH, FONT = 960, 1920, 14
+"""Width of an image in a picture of one camera, and of the whole picture of several; height of its labels, in pixels.
+"""
+NEAREST_US = 20_000
+"""Steps in microseconds in which the time between an image and a sweep counts for the choice of the image."""
 NO_IMAGES = "no images: methods that render LiDAR are trained and measured with cameras: [] (docs/lidar.md)"
 MAX_DEPTH = 60.0
 """Metres at which the colour of returns ends."""
@@ -30,24 +38,41 @@ SCALE_STEPS = 6
 """Colours in the legend of distances."""
 
 
+class Examined(NamedTuple):
+    """What a check found: faults of a folder, its scene unless drive.json has faults, and why there is no picture."""
+
+    faults: list[str]
+    scene: Scene | None = None
+    no_picture: str | None = None
+
+
 def check(folder: Path, picture: Path | None) -> list[str]:
-    """The faults of a drive folder, a sentence each. Without faults of drive.json, and with a path for it, writes a
-    picture: for every camera its middle key frame with boxes and the nearest sweep, and again with sweeps 1.5 s earlier
-    and later. Without images: the middle sweep from above."""
+    """The faults of a drive folder, a sentence each, with the picture that `examine` draws."""
+    return examine(folder, picture).faults
+
+
+def examine(folder: Path, picture: Path | None) -> Examined:
+    """Checks a drive folder. Without faults of drive.json, and with a path for it, draws a picture: for every camera a
+    key frame with boxes and the nearest sweep, and again with sweeps 1.5 s earlier and later; without images the middle
+    sweep from above. An older picture is removed."""
     if picture is not None:
-        picture.unlink(missing_ok=True)
+        with suppress(OSError):  # writing the new one finds the same fault
+            picture.unlink(missing_ok=True)
     faults, drive = structure_of(folder / FILE)
-    if drive is None:
-        return faults
-    faults = [f"{folder / FILE}: {fault}" for fault in faults_of(drive)]
-    if faults:
-        return faults
+    faults = faults if drive is None else [f"{folder / FILE}: {fault}" for fault in faults_of(drive)]
+    if drive is None or faults:
+        return Examined(faults)
     scene = whole_scene(drive, folder)
-    of_sweeps = [sweep_fault(sweep) for sweep in scene.sweeps]
+    with ThreadPoolExecutor() as pool:
+        of_sweeps = list(pool.map(sweep_fault, scene.sweeps))
+        of_images = list(pool.map(image_fault, scene.frames))
+    images = ((frame.token, fault, frame.image_path) for frame, fault in zip(scene.frames, of_images, strict=True))
+    faults = [*_image_faults(images), *filter(None, of_sweeps)]
+    no_picture = None
     if picture is not None:
         sound = [sweep for sweep, fault in zip(scene.sweeps, of_sweeps, strict=True) if not fault]
-        write_picture(scene, sound, picture)
-    return [*_image_faults(scene), *filter(None, of_sweeps)]
+        no_picture = write_picture(scene, sound, picture)
+    return Examined(faults, scene, no_picture)
 
 
 def whole_scene(drive: Drive, folder: Path) -> Scene:
@@ -64,12 +89,13 @@ def whole_scene(drive: Drive, folder: Path) -> Scene:
 def summary(scene: Scene) -> str:
     """What a drive holds, in a sentence."""
     key_frames = len(scene.key_frame_timestamps)
+    images = f"{counted(len(scene.frames), 'image')} of {counted(len(scene.cameras), 'camera')}"
     parts = [
-        f"{key_frames} key frames at {scene.key_frame_hz:g} Hz",
-        f"{len(scene.frames)} images of {len(scene.cameras)} cameras" if scene.frames else NO_IMAGES,
-        f"{len(scene.sweeps)} LiDAR sweeps" if scene.sweeps else "no LiDAR",
+        counted(key_frames, "key frame") + (f" at {scene.key_frame_hz:g} Hz" if key_frames > 1 else ""),
+        images if scene.frames else NO_IMAGES,
+        counted(len(scene.sweeps), "LiDAR sweep") if scene.sweeps else "no LiDAR",
         *(["no poses: set refine_poses: {enabled: true, start: images}"] if scene.poses == UNPOSED else []),
-        f"{len(scene.tracks)} tracks" if scene.tracks else "no boxes: all is treated as static",
+        counted(len(scene.tracks), "track") if scene.tracks else "no boxes: all is treated as static",
     ]
     return ", ".join(parts)
 
@@ -80,38 +106,70 @@ def column_sentences(scene: Scene) -> list[str]:
     return [f"LiDAR {sweep.lidar}: {Path(sweep.path).name} {columns_sentence(Path(sweep.path))}" for sweep in firsts]
 
 
-def _image_faults(scene: Scene) -> Iterator[str]:
-    for frame in scene.frames:
-        if fault := image_fault(frame):
-            yield f"frame {frame.token}: {fault}"
+def what_to_see(scene: Scene) -> str:
+    """What the picture of a scene must show, as the end of a sentence; empty where it shows images alone."""
+    seen = ["returns must lie on surfaces, also those of other times"] if scene.frames and scene.sweeps else []
+    boxes = ["boxes around objects"] if scene.tracks and scene.poses != UNPOSED else []
+    return ", and ".join([*seen, *boxes]) if seen else "".join(f"{words[:5]} must lie {words[6:]}" for words in boxes)
 
 
-def write_picture(scene: Scene, sweeps: Sequence[Sweep], path: Path) -> None:
-    """Writes the middle key frames of all cameras, one below the other, or without images the middle sweep. `sweeps`
-    are those without faults."""
-    images = []
-    for camera in scene.cameras:
-        indices = scene.key_frames(camera.name)
-        if indices:
-            frame = scene.frames[sorted(indices)[len(indices) // 2]]
-            images += [
-                _drawn(scene, sweeps, frame, offsets) for offsets in ((0,), OTHER_TIMES)[: 2 if scene.sweeps else 1]
-            ]
+def _image_faults(images: Iterable[tuple[str, str | None, str]]) -> Iterator[str]:
+    """The faults of images, given with token, fault and path; one that several have is named once, with a count."""
+    alike: dict[str, list[str]] = {}
+    for token, fault, path in images:
+        if fault:
+            alike.setdefault(fault.replace(path, ""), []).append(f"frame {token}: {fault}")
+    for first, *others in alike.values():
+        yield first + (f" ({counted(len(others), 'other image')} the same)" if others else "")
+
+
+def write_picture(scene: Scene, sweeps: Sequence[Sweep], path: Path) -> str | None:
+    """Writes a key frame of every camera, in a grid, or without images the middle sweep. `sweeps` are those without
+    faults. Returns a sentence if the file cannot be written."""
+    cameras = [camera.name for camera in scene.cameras if scene.key_frames(camera.name)]
+    columns = max(1, math.ceil(math.sqrt(len(cameras))))
+    width = WIDTH if columns == 1 else MAX_WIDTH // columns
+    tiles = []
+    for camera in cameras:
+        frame = _shown_frame(scene, sweeps, camera)
+        offsets = ((0,), OTHER_TIMES)[: 2 if scene.sweeps else 1]
+        tiles.append(_stacked([[_drawn(scene, sweeps, frame, times, width)] for times in offsets]))
     if not scene.frames and scene.sweeps:
-        images.append(seen_from_above(scene, WIDTH))
-    if not images:
-        return
-    canvas = Image.new("RGB", (WIDTH, sum(image.height for image in images)))
-    top = 0
-    for image in images:
-        canvas.paste(image, (0, top))
-        top += image.height
-    canvas.save(path)
+        tiles.append(seen_from_above(scene, WIDTH))
+    if not tiles:
+        return None
+    try:
+        _stacked([tiles[i : i + columns] for i in range(0, len(tiles), columns)]).save(path)
+    except OSError as error:
+        return f"{path.name} cannot be written there ({error.strerror or error}); --picture names another place"
+    return None
 
 
-def _drawn(scene: Scene, sweeps: Sequence[Sweep], frame: Frame, offsets: Sequence[int]) -> Image.Image:
-    """An image with boxes, and with the returns of the sweeps nearest to its time plus `offsets` (microseconds)."""
-    size = WIDTH, round(WIDTH * frame.height / frame.width)
+def _shown_frame(scene: Scene, sweeps: Sequence[Sweep], camera: str) -> Frame:
+    """The key frame of a camera that is nearest to a sweep in time, within NEAREST_US, and then to the middle."""
+    frames = sorted((scene.frames[i] for i in scene.key_frames(camera)), key=lambda frame: frame.timestamp)
+    times = np.array([sweep.timestamp for sweep in sweeps])
+    gaps = [int(np.abs(times - frame.timestamp).min()) // NEAREST_US if len(times) else 0 for frame in frames]
+    middle = len(frames) // 2
+    return frames[min(range(len(frames)), key=lambda i: (gaps[i], abs(i - middle)))]
+
+
+def _stacked(rows: Sequence[Sequence[Image.Image]]) -> Image.Image:
+    """Images beside each other in rows, one below the other."""
+    heights = [max(image.height for image in row) for row in rows]
+    canvas = Image.new("RGB", (max(sum(image.width for image in row) for row in rows), sum(heights)))
+    for row, top in zip(rows, np.cumsum([0, *heights]), strict=False):
+        left = 0
+        for image in row:
+            canvas.paste(image, (left, int(top)))
+            left += image.width
+    return canvas
+
+
+def _drawn(scene: Scene, sweeps: Sequence[Sweep], frame: Frame, offsets: Sequence[int], width: int) -> Image.Image:
+    """An image of `width` pixels with boxes, and the returns of the sweeps nearest to its time plus `offsets`
+    (microseconds)."""
+    size = width, max(1, round(width * frame.height / frame.width))
     image = Image.new("RGB", size) if image_fault(frame) else Image.fromarray(read_image(frame.image_path, size))
     draw, seconds = ImageDraw.Draw(image), []
     for offset in offsets if sweeps else ():
@@ -121,7 +179,8 @@ def _drawn(scene: Scene, sweeps: Sequence[Sweep], frame: Frame, offsets: Sequenc
     for hull in hulls_in(scene, frame, size):
         draw.polygon([tuple(corner) for corner in hull.polygon], outline=(255, 90, 0), width=2)
     text = [f"{frame.camera} at {frame.timestamp}", *([f"returns at {' and '.join(seconds)}"] if seconds else [])]
-    outlined = {"fill": (255, 255, 255), "stroke_width": 2, "stroke_fill": (0, 0, 0)}
+    font = ImageFont.load_default(FONT)
+    outlined = {"fill": (255, 255, 255), "stroke_width": 1, "stroke_fill": (0, 0, 0), "font": font}
     draw.text((8, 8), ", ".join(text), **outlined)
     for step in range(SCALE_STEPS + 1 if seconds else 0):
         share = step / SCALE_STEPS

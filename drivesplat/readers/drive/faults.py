@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import (
@@ -23,6 +24,11 @@ MAX_ELEVATION = 1.6
 UNITS = {"seconds": 1e6, "milliseconds": 1e3, "nanoseconds": 1e-3}
 """Units that are taken for microseconds by mistake, and the microseconds in one."""
 COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
+MAX_FROM_ORIGIN, MAX_SPAN = 10_000.0, 100_000.0
+"""Metres from the origin, where it is given, to the first pose, and from there to any other: single precision, in which
+models are trained, has steps of 1 mm at the first distance and of 8 mm at the second."""
+MAX_FROM_PATH = 500.0
+"""Metres from the ego vehicle's path within which at least one track begins."""
 
 
 def faults_of(drive: Drive) -> list[str]:
@@ -31,6 +37,7 @@ def faults_of(drive: Drive) -> list[str]:
         *_camera_faults(drive),
         *_lidar_faults(drive),
         *_timed_faults("ego_poses", drive.ego_poses),
+        *_place_faults(drive),
         *_recording_faults(drive),
         *_track_faults(drive),
         *_key_frame_faults(drive),
@@ -116,6 +123,35 @@ def _timed_faults(list_name: str, poses: Sequence[TimedPose]) -> Iterator[str]:
     yield from order_faults([pose.timestamp for pose in poses], lambda i: f"{list_name}[{i}]")
 
 
+def _path_of(drive: Drive) -> list[tuple[int, tuple[float, ...]]]:
+    """The times and positions of the ego vehicle and its sensors, in the order of time."""
+    poses = [(pose.timestamp, pose.translation) for pose in drive.ego_poses]
+    for frame in drive.frames:
+        poses += [(frame.timestamp, p.translation) for p in (frame.camera_to_world, frame.ego_to_world) if p]
+    poses += [(sweep.timestamp, s.translation) for sweep in drive.sweeps if (s := sweep.lidar_to_world)]
+    return sorted(poses)
+
+
+def _place_faults(drive: Drive) -> Iterator[str]:
+    """The fault of poses that are too far from the world's origin, or from each other."""
+    path = np.array([place for _, place in _path_of(drive)])
+    if not len(path):
+        return
+    far = float(np.linalg.norm(path[0]))
+    span = np.linalg.norm(path - path[0], axis=1)
+    if drive.origin is not None and far > MAX_FROM_ORIGIN:
+        yield (
+            f"origin: poses are relative to it, yet the first one lies {far * 1e-3:.0f} km away; leave origin out "
+            "where poses are global, or subtract it from them"
+        )
+    elif span.max() > MAX_SPAN:
+        time = _path_of(drive)[int(np.argmax(span > MAX_SPAN))][0]
+        yield (
+            f"ego_poses: positions lie up to {span.max() * 1e-3:.0f} km from the first one, from time {time} on; has "
+            "the UTM zone changed, or is the unit not the metre? All poses need one coordinate system"
+        )
+
+
 def _recording_faults(drive: Drive) -> Iterator[str]:
     """Faults of frames and sweeps."""
     if drive.frames and not drive.cameras:
@@ -182,6 +218,33 @@ def _track_faults(drive: Drive) -> Iterator[str]:
         except DatasetError as error:
             yield str(error)
         yield from _timed_faults(f"{where}: poses", track.poses)
+    yield from _elsewhere_faults(drive)
+
+
+def _elsewhere_faults(drive: Drive) -> Iterator[str]:
+    """The fault of tracks none of which is there during the drive, or near its path."""
+    times = [one.timestamp for one in (*drive.frames, *drive.sweeps)]
+    if not drive.tracks or not times:
+        return
+    count = len(drive.tracks)
+    poses = [pose for track in drive.tracks for pose in track.poses]
+    first, last = min(pose.timestamp for pose in poses), max(pose.timestamp for pose in poses)
+    if first > max(times) or last < min(times):
+        yield (
+            f"tracks: {count} track{'s' if count > 1 else ''}, none has a pose during the drive ({min(times)} to "
+            f"{max(times)}); theirs are at {first} to {last}: check their clock"
+        )
+        return
+    path = _path_of(drive)
+    if path:
+        places = np.array([place for _, place in path])[:, :2]
+        own = np.array([track.poses[0].translation[:2] for track in drive.tracks])
+        nearest = float(cKDTree(places).query(own)[0].min())
+        if nearest > MAX_FROM_PATH:
+            yield (
+                f"tracks: {count} track{'s' if count > 1 else ''}, none begins within {nearest:.0f} m of the vehicle's "
+                "path: their poses must be in the world of ego_poses"
+            )
 
 
 def _key_frame_faults(drive: Drive) -> Iterator[str]:

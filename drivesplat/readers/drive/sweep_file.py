@@ -31,7 +31,27 @@ BYTE = 255.0
 
 def read_file(path: Path) -> LidarReturns:
     """The returns with finite coordinates, of a file without a fault."""
-    columns = _columns(path)
+    return _returns_of(_columns(path))
+
+
+def file_fault(path: Path) -> str | None:
+    """The fault of an existing file, or None. `drivesplat.readers.sweeps` checks the returns, as for all readers."""
+    found = read_checked(path)
+    return found if isinstance(found, str) else None
+
+
+def read_checked(path: Path) -> LidarReturns | str:
+    """The returns with finite coordinates of an existing file, or its fault: reads the file once."""
+    if path.suffix.lower() not in SUFFIXES:
+        return f"is no sweep that can be read: sweeps are {', '.join(SUFFIXES)} files (docs/own_data.md)"
+    try:
+        columns = _columns(path)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, PlyHeaderParseError, PlyElementParseError) as error:
+        return f"is corrupt ({' '.join(str(error).split())[:200]})"
+    return _columns_fault(columns) or _returns_of(columns)
+
+
+def _returns_of(columns: Mapping[str, np.ndarray]) -> LidarReturns:
     points = np.stack([columns[name] for name in AXES], axis=1).astype(np.float64)
     finite = np.isfinite(points).all(axis=1)
     optional: dict[str, Any] = {name: columns[name][finite] for name in OPTIONAL if name in columns}
@@ -44,14 +64,7 @@ def read_file(path: Path) -> LidarReturns:
     )
 
 
-def file_fault(path: Path) -> str | None:
-    """The fault of an existing file, or None. `drivesplat.readers.sweeps` checks the returns, as for all readers."""
-    if path.suffix.lower() not in SUFFIXES:
-        return f"is no sweep that can be read: sweeps are {', '.join(SUFFIXES)} files (docs/own_data.md)"
-    try:
-        columns = _columns(path)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, PlyHeaderParseError, PlyElementParseError) as error:
-        return f"is corrupt ({' '.join(str(error).split())[:200]})"
+def _columns_fault(columns: Mapping[str, np.ndarray]) -> str | None:
     lengths = {len(values) for values in columns.values()}
     if len(lengths) != 1:
         return f"is corrupt (its columns have {', '.join(map(str, sorted(lengths)))} rows)"

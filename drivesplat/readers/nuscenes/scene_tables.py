@@ -161,11 +161,18 @@ def _rows_of_scenes(tables: Path, scenes: Sequence[str]) -> Iterator[Found]:
     """The rows of `scenes` in a folder of tables."""
     owners: dict[str, dict[str, tuple[str, ...]]] = defaultdict(dict)
     yield from _scene_rows(tables, scenes, owners)
+    samples: set[str] = set()
     no_scenes: tuple[str, ...] = ()
     for table, column, owner, references in _REFERENCES:
         owned_by, referred = owners[owner], [(owners[other], token) for other, token in references.items()]
         for text, row in rows(tables / f"{table}.json"):
-            row_scenes = owned_by.get(_token(row, column, table), no_scenes)
+            token = _token(row, column, table)
+            row_scenes = owned_by.get(token, no_scenes)
+            if table == "sample":
+                samples.add(_token(row, "token", table))
+            elif owner == "sample" and token not in samples:
+                by = named(table, row.get("token"))
+                raise ValueError(f"{named('sample', token)} is referred to by {by}, but not in the tables")
             if row_scenes:
                 yield row_scenes, table, text
             for others, token in referred if row_scenes else ():

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.io.storage import atomic_write
-from drivesplat.readers.drive.sweep_file import file_fault, read_file
+from drivesplat.readers.drive.sweep_file import file_fault, read_checked, read_file
 from drivesplat.readers.waymo.range_image import Rays
 from drivesplat.scene.scan import Scan, ScanRays, wrapped
 from drivesplat.scene.sensors import Spin
 
-__all__ = ["file_fault", "read_file", "read_rays", "read_scan", "write_file"]
+__all__ = ["file_fault", "read_checked", "read_file", "read_rays", "read_scan", "write_file"]
 
 
 def write_file(
