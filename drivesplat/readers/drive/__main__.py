@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
+from drivesplat.preprocess.camera_check import camera_warnings
+from drivesplat.preprocess.undistort import distortion_fault
 from drivesplat.readers.drive.check import check, summary, whole_scene
 from drivesplat.readers.drive.format import Drive, grouped, read_drive
 from drivesplat.readers.drive.nerfstudio import add_command
@@ -41,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _check(asked: argparse.Namespace) -> int:
     picture = asked.picture or asked.folder / "check.png"
-    faults = check(asked.folder, picture)
+    faults = check(asked.folder, picture) or _distortion_faults(asked.folder)
     for line in grouped(faults):
         print(line)
     if picture.exists():
@@ -50,10 +52,15 @@ def _check(asked: argparse.Namespace) -> int:
         print(f"{len(faults)} fault{'s' if len(faults) > 1 else ''}")
         return 1
     scene = whole_scene(read_drive(asked.folder), asked.folder)
-    for sentence in (*jumps(scene), *pose_warnings(scene), *lidar_warnings(scene)):
+    for sentence in (*jumps(scene), *pose_warnings(scene), *lidar_warnings(scene), *camera_warnings(scene)):
         print(f"warning: {sentence}")
     print(summary(scene))
     return 0
+
+
+def _distortion_faults(folder: Path) -> list[str]:
+    cameras = whole_scene(read_drive(folder), folder).cameras
+    return [fault for camera in cameras if (fault := distortion_fault(camera))]
 
 
 def _schema(_: argparse.Namespace) -> int:
