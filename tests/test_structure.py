@@ -44,9 +44,12 @@ def module_graph() -> Graph:
 
 
 def package_graph(graph: Graph) -> Graph:
-    """The same between the places directly in the library."""
+    """The same between the places directly in the library. `__main__` is a command that nothing imports: it may use
+    packages above its own."""
     packages: Graph = {}
     for module, others in graph.items():
+        if module.endswith(".__main__"):
+            continue
         place = top(module)
         packages.setdefault(place, set()).update(top(other) for other in others if top(other) != place)
     return packages

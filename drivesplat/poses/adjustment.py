@@ -5,19 +5,24 @@ of the motion between successive images from the given one. The latter two are i
 translation of refined @ inverse(given), of world to ego and of ego to ego (pycolmap.cost_functions).
 """
 
+import logging
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyceres
 import pycolmap
 from pycolmap import cost_functions
 
-from drivesplat.poses.rig import RigImages, to_pycolmap
+from drivesplat.poses.readout import RollingFeatures
+from drivesplat.poses.rig import RigImages, from_pycolmap, to_pycolmap
 from drivesplat.poses.triangulated import Observations
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob, RefinePosesSettings
+
+log = logging.getLogger(__name__)
 
 MAX_REPROJECTION_ERROR = 8.0
 """Maximum reprojection error (pixels) of a triangulated point while poses are inaccurate."""
@@ -74,10 +79,38 @@ def triangulate(
     return pycolmap.triangulate_points(copy, database, database.parent, folder, True, options, False)
 
 
+def adjust_in_rounds(
+    start: pycolmap.Reconstruction,
+    rolling: RollingFeatures,
+    priors: Priors,
+    database: Path,
+    job: RefinePosesJob,
+    threads: int,
+) -> tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]:
+    """Rounds of triangulation and bundle adjustment: before and after the last adjustment."""
+    reconstruction = start
+    rolling.move_to_timestamp(reconstruction)
+    for number in range(1, job.refine_poses.rounds + 1):
+        reconstruction = triangulate(reconstruction, database, job, threads)
+        rolling.move_to_timestamp(reconstruction)
+        unadjusted = pycolmap.Reconstruction(reconstruction)
+        bundle_adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
+        log.info(
+            "round %d of %d: %d points adjusted with %d images",
+            number, job.refine_poses.rounds, len(reconstruction.points3D), len(reconstruction.images),
+        )  # fmt: skip
+    return unadjusted, reconstruction
+
+
 def bundle_adjust(
-    reconstruction: pycolmap.Reconstruction, priors: Priors | None, robust_pixels: float, threads: int
+    reconstruction: pycolmap.Reconstruction,
+    priors: Priors | None,
+    robust_pixels: float,
+    threads: int,
+    lens: Literal["fixed", "radial", "free"] = "fixed",
 ) -> None:
-    """Optimises points and poses in place; without `priors` only points. Images without points keep their poses."""
+    """Optimises points and poses in place; without `priors` only points. Images without points keep their poses. With
+    `lens`, also the radial coefficients of cameras with one, or these, focal lengths and principal points."""
     config = pycolmap.BundleAdjustmentConfig()
     # Only these have residuals of their own, and only their rotations get the manifold of rotations in the solver.
     constrained = sorted(number for number, image in reconstruction.images.items() if image.num_points3D)
@@ -85,9 +118,11 @@ def bundle_adjust(
         config.add_image(number)
         if priors is None:
             config.set_constant_rig_from_world_pose(number)
-    for camera in reconstruction.cameras:
-        config.set_constant_cam_intrinsics(camera)
+    if lens == "fixed":
+        for camera in reconstruction.cameras:
+            config.set_constant_cam_intrinsics(camera)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_sensor_from_rig=False)
+    options.refine_focal_length = options.refine_principal_point = lens == "free"
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = robust_pixels
     options.ceres.solver_options.num_threads = threads
@@ -107,6 +142,12 @@ def with_poses(reconstruction: pycolmap.Reconstruction, ego_to_world: np.ndarray
     for number, pose in zip(sorted(copy.frames), ego_to_world, strict=True):
         copy.frames[number].rig_from_world = to_pycolmap(inverse(pose))
     return copy
+
+
+def poses_of(reconstruction: pycolmap.Reconstruction) -> np.ndarray:
+    """ego_to_world (n, 4, 4) of all images, in the order of their numbers."""
+    frames = (reconstruction.frames[number] for number in sorted(reconstruction.frames))
+    return np.stack([inverse(from_pycolmap(frame.rig_from_world)) for frame in frames])
 
 
 def observations_of(reconstruction: pycolmap.Reconstruction) -> Observations:

@@ -5,6 +5,9 @@ joint model would depend on the few points that two cameras share. Intrinsics ar
 scale, so only camera poses are taken from it, never ego poses: mounts are metric.
 """
 
+import logging
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +20,8 @@ from drivesplat.poses.rig import RigImages, from_pycolmap
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.refine_poses import RefinePosesJob
 
+log = logging.getLogger(__name__)
+
 REMEDY = "such a drive needs recorded poses (refine_poses.start: recorded)"
 """The end of every message about a failure of poses from images."""
 MIN_ANGLE = 1.5
@@ -24,6 +29,8 @@ MIN_ANGLE = 1.5
 INITIAL_ANGLE = 6.0
 """Preferred angle (degrees) between the rays of the first two images. pycolmap accepts a quarter of it."""
 MIN_MODEL_IMAGES = 3
+LOG_INTERVAL_S = 10.0
+"""Minimum seconds between two lines of progress in the log."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +84,39 @@ def _models(
     folder.mkdir(parents=True, exist_ok=True)
     options = _options(job, threads)
     options.image_names = [image_name(number) for number in images.key_frames()[camera].values()]
-    models = pycolmap.incremental_mapping(database, database.parent, folder, options)
+    progress = MappingProgress(camera, len(options.image_names))
+    models = pycolmap.incremental_mapping(
+        database, database.parent, folder, options,
+        initial_image_pair_callback=progress.begin_model, next_image_callback=progress.add_image,
+    )  # fmt: skip
     return sorted(models.values(), key=_extent, reverse=True)
+
+
+class MappingProgress:
+    """Logs how many images of a camera the mapper has placed, at most every LOG_INTERVAL_S seconds."""
+
+    def __init__(self, camera: str, images: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._camera, self._images, self._clock = camera, images, clock
+        self._models = self._placed = 0
+        self._begun = self._logged = clock()
+
+    def begin_model(self) -> None:
+        """The mapper has placed the first two images of a model; it tries another one where images are left."""
+        self._models, self._placed = self._models + 1, 2
+        self._begun = self._clock()
+        log.info("camera %s: model %d begins, %d images", self._camera, self._models, self._images)
+
+    def add_image(self) -> None:
+        """The mapper has placed one more image."""
+        self._placed += 1
+        now = self._clock()
+        if now - self._logged >= LOG_INTERVAL_S:
+            self._logged = now
+            left = (now - self._begun) / max(1, self._placed - 2) * max(0, self._images - self._placed)
+            log.info(
+                "camera %s: model %d, %d of %d images placed, about %.0f s left",
+                self._camera, self._models, self._placed, self._images, left,
+            )  # fmt: skip
 
 
 def _extent(model: pycolmap.Reconstruction) -> tuple[int, int]:

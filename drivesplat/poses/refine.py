@@ -7,7 +7,7 @@ points clearly better.
 
 import logging
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,24 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.adjustment import Priors, bundle_adjust, observations_of, priors_of, triangulate, with_poses
+from drivesplat.poses.adjustment import (
+    Priors,
+    adjust_in_rounds,
+    bundle_adjust,
+    observations_of,
+    poses_of,
+    priors_of,
+    with_poses,
+)
 from drivesplat.poses.corrections import Corrections, apply_corrections
 from drivesplat.poses.features import detect_features, match_features
 from drivesplat.poses.from_images import estimate_poses
+from drivesplat.poses.lens import lens_warnings, with_tested_images
 from drivesplat.poses.readout import RollingFeatures
 from drivesplat.poses.refinement_record import Refinement, record_header
-from drivesplat.poses.rig import RigImages, from_pycolmap
+from drivesplat.poses.rig import RigImages
 from drivesplat.poses.triangulated import Observations, no_points, triangulated_points
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
-from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import LimitSettings, RefinePosesJob
 
@@ -59,10 +67,18 @@ def refine_poses(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_M
     images = RigImages.of(scene, key_frames, ego_mask)
     with tempfile.TemporaryDirectory(prefix="drivesplat-poses-") as folder:
         database = Path(folder) / "features.db"
+        log.info("scene %s: features of %d images are searched", scene.name, len(images))
         start = detect_features(images, job, database, threads)
+        log.info("scene %s: features are detected", scene.name)
         match_features(images, job, database, threads)
-        refine = estimate_from_matches if job.refine_poses.start == "images" else refine_from_matches
-        return refine(images, start, database, job, threads)
+        log.info("scene %s: features are matched", scene.name)
+        if job.refine_poses.start == "images":
+            return estimate_from_matches(images, start, database, job, threads)
+        refinement = refine_from_matches(images, start, database, job, threads)
+    sentences = lens_warnings(with_tested_images(scene), ego_mask, threads)
+    for sentence in sentences:
+        log.warning("scene %s: %s", scene.name, sentence)
+    return replace(refinement, record={**refinement.record, "lens_warnings": sentences})
 
 
 def refine_from_matches(
@@ -73,7 +89,7 @@ def refine_from_matches(
     points."""
     scene, priors = images.scene, priors_of(images, job.refine_poses)
     rolling = RollingFeatures.of(images, start)
-    unadjusted, reconstruction = _adjust_in_rounds(start, rolling, priors, database, job, threads)
+    unadjusted, reconstruction = adjust_in_rounds(start, rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
     corrections = _corrections(images, observations, poses_of(reconstruction))
     trial, at_given = _trial(unadjusted, priors, job, threads) if len(observations.positions) else (None, None)
@@ -81,7 +97,9 @@ def refine_from_matches(
     flaw = unusable(images, observations, changes, trial, limits)
     reason = flaw or no_gain(trial, limits)
     record = {**record_header(scene, job, reason), **_record(images, observations, changes, trial)}
+    log.info("scene %s: %s", scene.name, _figures(record))
     if reason is None:
+        log.info("scene %s: the refined poses are taken", scene.name)
         points = triangulated_points(images.indices, observations)
         return Refinement(apply_corrections(scene, corrections), record, points)
     log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
@@ -98,7 +116,7 @@ def estimate_from_matches(
     scene = apply_corrections(images.scene, estimate.corrections)
     placed = RigImages.of(scene, images.indices, images.ego_mask)
     priors, rolling = priors_of(placed, job.refine_poses), RollingFeatures.of(placed, start)
-    _, reconstruction = _adjust_in_rounds(with_poses(start, priors.given), rolling, priors, database, job, threads)
+    _, reconstruction = adjust_in_rounds(with_poses(start, priors.given), rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
     corrections = _corrections(images, observations, poses_of(reconstruction))
     measured = _record(images, observations, corrections.at(images.timestamps), None)
@@ -106,27 +124,9 @@ def estimate_from_matches(
         measured |= {"shift_m": None, "turn_deg": None}
         corrections = corrections.extrapolated(images.scene.key_frame_interval)
     record = {**record_header(scene, job, None), "placement": estimate.record, **measured}
+    log.info("scene %s: poses from images alone: %s", scene.name, _figures(record))
     scene = apply_corrections(images.scene, corrections, poses="images")
     return Refinement(scene, record, triangulated_points(images.indices, observations))
-
-
-def _adjust_in_rounds(
-    start: pycolmap.Reconstruction,
-    rolling: RollingFeatures,
-    priors: Priors,
-    database: Path,
-    job: RefinePosesJob,
-    threads: int,
-) -> tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]:
-    """Rounds of triangulation and bundle adjustment: before and after the last adjustment."""
-    reconstruction = start
-    rolling.move_to_timestamp(reconstruction)
-    for _ in range(job.refine_poses.rounds):
-        reconstruction = triangulate(reconstruction, database, job, threads)
-        rolling.move_to_timestamp(reconstruction)
-        unadjusted = pycolmap.Reconstruction(reconstruction)
-        bundle_adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
-    return unadjusted, reconstruction
 
 
 def _corrections(images: RigImages, observations: Observations, refined: np.ndarray) -> Corrections:
@@ -135,12 +135,6 @@ def _corrections(images: RigImages, observations: Observations, refined: np.ndar
     if not len(constrained):
         return Corrections.from_poses(images.timestamps[:1], given[:1], given[:1])
     return Corrections.from_poses(images.timestamps[constrained], given[constrained], refined[constrained])
-
-
-def poses_of(reconstruction: pycolmap.Reconstruction) -> np.ndarray:
-    """ego_to_world (n, 4, 4) of all images, in the order of their numbers."""
-    frames = (reconstruction.frames[number] for number in sorted(reconstruction.frames))
-    return np.stack([inverse(from_pycolmap(frame.rig_from_world)) for frame in frames])
 
 
 def _trial(
@@ -186,7 +180,10 @@ def unusable(
     shift, turn = _magnitudes(changes)
     for largest, limit, unit in ((shift.max(), limits.max_shift, "m"), (turn.max(), limits.max_turn, "degrees")):
         if not largest <= limit:
-            return f"one of them would be moved by {largest:.2f} {unit}, more than {limit:g}"
+            return (
+                f"one of them would be moved by {largest:.2f} {unit}, more than {limit:g} (as with a camera matrix K "
+                "of another image size, a lens distortion that is not stated, or wrong poses or mounts)"
+            )
     return None
 
 
@@ -233,6 +230,21 @@ def _record(
             for frame, count, change, rotation in zip(images.frames, points, changes, rotations, strict=True)
         ],
     }
+
+
+def _figures(record: dict[str, Any]) -> str:
+    """The figures of poses.json in a line."""
+    trial, parts = record["trial"], [f"{record['images']} images, {record['points']} points"]
+    for name, value in {
+        "reprojection error": record["reprojection_px"],
+        "of withheld points with given poses": trial and trial["before_px"],
+        "and with refined ones": trial and trial["after_px"],
+    }.items():
+        parts += [f"{name} {value:.2f} pixels"] if value is not None else []
+    for name, key, unit in (("shift", "shift_m", "m"), ("turn", "turn_deg", "degrees")):
+        if record[key]:
+            parts.append(f"median {name} {record[key]['median']:.3f} {unit}, largest {record[key]['largest']:.3f}")
+    return ", ".join(parts)
 
 
 def _median(errors: np.ndarray) -> float:

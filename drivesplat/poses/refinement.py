@@ -11,7 +11,17 @@ from drivesplat.settings.refine_poses import RefinePosesJob
 
 log = logging.getLogger(__name__)
 
-MEASURED = ("images", "points", "observations", "points_per_image", "reprojection_px", "trial", "shift_m", "turn_deg")
+MEASURED = (
+    "images",
+    "points",
+    "observations",
+    "points_per_image",
+    "reprojection_px",
+    "trial",
+    "shift_m",
+    "turn_deg",
+    "lens_warnings",
+)
 """Keys of poses.json that are null without an attempt."""
 
 

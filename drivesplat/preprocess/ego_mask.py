@@ -84,9 +84,11 @@ def camera_outlines(scene: Scene, camera: str, job: EgoMaskJob) -> tuple[tuple[O
 
 @dataclass(frozen=True)
 class ComparedImages:
-    """One camera's images for the search, and the scene's training sweeps, both in time order; `interval` is the
-    maximum time in microseconds from an image to its sweep, `own_car_radius` that of the ego vehicle in metres."""
+    """One camera's images for the search, chosen from `recorded` training images, and the scene's training sweeps, both
+    in time order; `interval` is the maximum time in microseconds from an image to its sweep, `own_car_radius` that of
+    the ego vehicle in metres."""
 
+    recorded: int
     frames: tuple[Frame, ...]
     sweeps: tuple[Sweep, ...]
     interval: float
@@ -95,10 +97,10 @@ class ComparedImages:
     @classmethod
     def of(cls, scene: Scene, camera: str, search: EgoMaskSearch) -> "ComparedImages":
         """From a scene's training images and training sweeps."""
-        frames = (scene.frames[i] for i in training_images(scene, search.holdout))
-        moving = spaced_frames([frame for frame in frames if frame.camera == camera])
+        frames = [scene.frames[i] for i in training_images(scene, search.holdout) if scene.frames[i].camera == camera]
+        moving = spaced_frames(frames)
         sweeps = tuple(sweeps_of(scene, search.holdout))
-        return cls(tuple(moving), sweeps, scene.key_frame_interval, search.own_car_radius)
+        return cls(len(frames), tuple(moving), sweeps, scene.key_frame_interval, search.own_car_radius)
 
     @property
     def path_length(self) -> float:
@@ -144,9 +146,11 @@ def _distance(a: Frame, b: Frame) -> float:
 
 def find_outlines(drive: ComparedImages) -> tuple[tuple[Outline, ...], str | None]:
     """The body's outlines, where the images show it with certainty; otherwise none, and the reason."""
+    if drive.recorded < MIN_IMAGES:
+        return (), f"too few images: {drive.recorded} for training; {MIN_IMAGES} are needed"
     if len(drive.frames) < MIN_IMAGES or drive.path_length < MIN_PATH_LENGTH:
         return (), (
-            f"the car hardly moves: {len(drive.frames)} images at least {MIN_STEP:g} m apart over "
+            f"too short a path: {len(drive.frames)} images at least {MIN_STEP:g} m apart over "
             f"{drive.path_length:.0f} m; {MIN_IMAGES} over {MIN_PATH_LENGTH:g} m are needed"
         )
     hits = lidar_images(drive)

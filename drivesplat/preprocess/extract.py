@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
+from drivesplat.preprocess.intrinsics import intrinsics_warnings
 from drivesplat.preprocess.undistort import undistorted
 from drivesplat.readers.datasets import reader, unpacker
 from drivesplat.readers.drive_warnings import drive_warnings
@@ -61,11 +62,12 @@ def extract_scene(
             f"{scene.frames[0].image_path})"
         )
     scene = dataclasses.replace(scene, dataset=source.dataset, frames=kept, missing_images=len(bad))
+    of_cameras = intrinsics_warnings(scene)
     if any(camera.distortion_model != "none" for camera in scene.cameras):
         resampled = _folder(results, source) / "undistorted"
         shutil.rmtree(resampled, ignore_errors=True)
         scene = undistorted(scene, resampled)
-    for sentence in (*drive_warnings(scene), *scene_warnings(scene, luminance(scene))):
+    for sentence in (*of_cameras, *drive_warnings(scene), *scene_warnings(scene, luminance(scene))):
         log.warning("scene %s: %s", scene.name, sentence)
     return scene
 

@@ -20,15 +20,18 @@ from drivesplat.scene.sensors import Camera
 
 LONGER = 1.01
 """Factor between the focal lengths that are tried."""
-LONGEST = 10.0
-"""Largest factor on the focal length."""
+LONGEST = 3.0
+"""Largest factor on the focal length. Coefficients that need more are those of another model."""
+MAX_TANGENTIAL = 0.1
+"""Largest p1 and p2 of OpenCV's model. Real lenses are below 0.02."""
+_LIKELY_CAUSE = "its coefficients are probably those of another model, or in another order or unit"
 
 
 def undistorted(scene: Scene, folder: Path) -> Scene:
     """The scene with the images of distorted cameras resampled into `folder`, {camera}/{timestamp}.png, and with the
     intrinsics of these images. Class maps are resampled by nearest neighbour, into {camera}/{timestamp}_classes.png.
 
-    Raises DatasetError naming a camera whose distortion cannot be undone at ten times its focal length.
+    Raises DatasetError naming a camera whose distortion cannot be undone: `distortion_fault`.
     """
     maps = {camera.name: _maps(camera) for camera in scene.cameras if camera.distortion_model != "none"}
 
@@ -70,8 +73,20 @@ def _readout(camera: Camera, x: np.ndarray, y: np.ndarray) -> float | None:
     return camera.readout_s * float(np.polyfit(lines, sources.mean(axis=0), 1)[0])
 
 
+def _require_small_tangential(camera: Camera) -> None:
+    """Raises DatasetError where radial coefficients stand in the place of tangential ones."""
+    assert camera.distortion is not None
+    if camera.distortion_model == "opencv" and np.abs(camera.distortion[2:4]).max() > MAX_TANGENTIAL:
+        p1, p2 = camera.distortion[2:4]
+        raise DatasetError(
+            f"camera {camera.name}: its distortion has p1 = {p1:g} and p2 = {p2:g}, more than {MAX_TANGENTIAL:g}; the "
+            f"order of opencv coefficients is k1, k2, p1, p2, k3, and {_LIKELY_CAUSE}"
+        )
+
+
 def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The new intrinsics (3, 3), and for each pixel of the new image (h, w) the x and the y of its source."""
+    _require_small_tangential(camera)
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     every = np.stack([columns, rows], axis=-1).astype(np.float64)
     border = np.concatenate([every[[0, -1]].reshape(-1, 2), every[:, [0, -1]].reshape(-1, 2)])
@@ -82,10 +97,12 @@ def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             sources = _sources(camera, k, every.reshape(-1, 2))
             if _inside(camera, sources):
                 x, y = sources.T.reshape(2, camera.height, camera.width).astype(np.float32)
+                _require_unfolded(camera, x, y)
                 return k, x, y
         factor *= LONGER
     raise DatasetError(
-        f"camera {camera.name}: its distortion leaves no image without empty pixels; check its coefficients"
+        f"camera {camera.name}: its distortion leaves no image without empty pixels at {LONGEST:g} times its focal "
+        f"length; {_LIKELY_CAUSE}"
     )
 
 
@@ -97,3 +114,35 @@ def _sources(camera: Camera, k: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def _inside(camera: Camera, pixels: np.ndarray) -> bool:
     """Whether all pixels (n, 2) are within the image."""
     return bool(((pixels >= -0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5])).all())
+
+
+def _require_unfolded(camera: Camera, x: np.ndarray, y: np.ndarray) -> None:
+    """Raises DatasetError where a step to the right and a step down in the new image (h, w) are not so, up to a
+    rotation, in their sources: two directions would have one pixel."""
+    (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
+    folded = float((x_right * y_down - x_down * y_right <= 0).mean())
+    if folded:
+        raise DatasetError(
+            f"camera {camera.name}: its distortion folds in {folded:.1%} of the image: two directions have one pixel; "
+            f"{_LIKELY_CAUSE}"
+        )
+
+
+def distortion_fault(camera: Camera) -> str | None:
+    """Why images of a camera cannot be resampled, or None."""
+    try:
+        view_kept(camera)
+    except DatasetError as error:
+        return str(error)
+    return None
+
+
+def view_kept(camera: Camera) -> float:
+    """The part of the recorded image that the resampled one shows, 1 without distortion. Raises DatasetError where
+    it cannot be resampled."""
+    if camera.distortion_model == "none":
+        return 1.0
+    _, x, y = _maps(camera)
+    border = [np.concatenate([m[0], m[1:, -1], m[-1, -2::-1], m[-2:0:-1, 0]]).astype(np.float64) for m in (x, y)]
+    area = 0.5 * abs(float(border[0] @ np.roll(border[1], -1) - border[1] @ np.roll(border[0], -1)))
+    return area / (camera.width * camera.height)

@@ -72,6 +72,7 @@ def test_images_of_a_street_reduce_the_errors_of_noisy_poses(tmp_path):
     scene, truth = filmed(recorder_of(pose_noise=True), tmp_path)
     refined = refine_poses(scene, JOB, threads=2)
     assert refined.record["refined"], refined.record["kept_because"]
+    assert refined.record["lens_warnings"] == []
     before, after = wobble(scene, truth), wobble(refined.scene, truth)
     assert (before[:2] > 0.2).all() and (after[:2] < 0.25 * before[:2]).all() and after[2] < 0.05
     trial = refined.record["trial"]

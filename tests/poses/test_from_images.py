@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import canonical_json
+from drivesplat.poses import mapping
 from drivesplat.poses.from_images import align_poses
+from drivesplat.poses.mapping import MappingProgress
 from drivesplat.poses.refine import estimate_from_matches
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
@@ -306,3 +309,27 @@ def test_a_misplaced_image_is_interpolated(tmp_path):
     assert apart(inverse(truth[0]) @ truth, poses_of(made))[0] < 0.15
     with pytest.raises(DatasetError, match=r"LiDAR, 1 of 10 images are misplaced \(min_images\), .*start: recorded"):
         case.made(limits={"min_images": 0.95})
+
+
+def test_progress_of_the_mapper_is_logged_with_the_time_left(caplog):
+    """A clock that advances 4 s at each call: one image takes 4 s, and a line is written every 12 s."""
+    times = iter(range(0, 1000, 4))
+    progress = MappingProgress("CAM_FRONT", 20, lambda: float(next(times)))
+    with caplog.at_level(logging.INFO):
+        progress.begin_model()
+        for _ in range(6):
+            progress.add_image()
+    assert [record.message for record in caplog.records] == [
+        "camera CAM_FRONT: model 1 begins, 20 images",
+        "camera CAM_FRONT: model 1, 4 of 20 images placed, about 64 s left",
+        "camera CAM_FRONT: model 1, 7 of 20 images placed, about 52 s left",
+    ]
+
+
+def test_the_mapper_reports_its_images(unlocated, caplog, monkeypatch):
+    monkeypatch.setattr(mapping, "LOG_INTERVAL_S", 0.0)
+    with caplog.at_level(logging.INFO):
+        unlocated.made()
+    count = len(unlocated.drive.scene.key_frame_timestamps)
+    lines = [record.message for record in caplog.records]
+    assert any(f"model 1, {count} of {count} images placed, about 0 s left" in line for line in lines)

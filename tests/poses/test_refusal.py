@@ -131,6 +131,25 @@ def test_limits_keep_the_given_poses_with_a_warning(tmp_path, caplog, limits, wo
     assert refined.record["shift_m"]["largest"] > 0.02, "the rejected corrections are recorded"
 
 
+def test_the_log_has_the_decision_with_its_figures(tmp_path, caplog):
+    with caplog.at_level(logging.INFO):
+        record = refined_of(tmp_path, drive_of(8), rounds=2).record
+    lines = [line.message for line in caplog.records]
+    assert [line for line in lines if line.startswith("round ")] == [
+        line for line in lines if " points adjusted with 8 images" in line
+    ] and sum(line.startswith("round ") for line in lines) == 2
+    trial, shift = record["trial"], record["shift_m"]
+    (figures,) = [line for line in lines if "of withheld points" in line]
+    assert f"with given poses {trial['before_px']:.2f} pixels, and with refined ones {trial['after_px']:.2f}" in figures
+    assert f"median shift {shift['median']:.3f} m, largest {shift['largest']:.3f}" in figures
+    assert record["refined"] and any("the refined poses are taken" in line for line in lines)
+
+
+def test_a_correction_beyond_its_limit_names_the_camera_matrix():
+    reason = unusable(FOUR, seen_of([30] * 4), moved(1, turn(4.05)), GOOD, LimitSettings())
+    assert "4.05 degrees, more than 3" in reason and "a camera matrix K of another image size" in reason
+
+
 def test_a_fraction_of_images_may_lack_points(tmp_path):
     """The last images look where there are no points any more."""
     drive = drive_of(14, ego_path=lambda s: ego_at(2 * s), error=error_at)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from drivesplat.errors import DatasetError
-from drivesplat.preprocess.undistort import undistorted
+from drivesplat.preprocess.undistort import _maps, distortion_fault, undistorted, view_kept
 from drivesplat.scene.images import read_image
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.sensors import Camera
@@ -129,3 +129,38 @@ def test_a_distortion_that_cannot_be_undone_is_named(scene, tmp_path):
     wild = dataclasses.replace(scene.cameras[0], distortion=np.array([1e7, 0.0, 0.0, 0.0]))
     with pytest.raises(DatasetError, match="camera CAM_FRONT: its distortion leaves no image"):
         undistorted(dataclasses.replace(scene, cameras=(wild,)), tmp_path / "straight")
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_part_of_the_view_that_is_kept_is_the_part_of_pixels_that_the_new_image_shows(lens):
+    """By OpenCV's own inverse: recorded pixels whose direction falls into the new image."""
+    model, values = LENSES[lens]
+    camera = Camera("CAM_FRONT", *SIZE, K, np.array(values), distortion_model=model)
+    kept, k = view_kept(camera), _maps(camera)[0]
+    if model == "fisheye":
+        rays = cv2.fisheye.undistortPoints(pixels(), K, camera.distortion.reshape(4, 1))
+    else:
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+        rays = cv2.undistortPointsIter(pixels(), K, camera.distortion, None, None, criteria)
+    seen_at = rays.reshape(-1, 2) * k.diagonal()[:2] + k[:2, 2]
+    inside = ((seen_at >= -0.5) & (seen_at <= np.array(SIZE) - 0.5)).all(axis=1)
+    assert abs(kept - inside.mean()) < 0.03 and kept < 1.0
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "words"),
+    [
+        ("fisheye", [339.749, -31.988, 48.275, -7.201], "at 3 times its focal length; its coefficients are probably"),
+        ("opencv", [0.001, -0.0005, -0.25, 0.06], "has p1 = -0.25 and p2 = 0.06, more than 0.1"),
+        ("opencv", [-0.9, 0.0, 0.0, 0.0], "folds in "),
+    ],
+)
+def test_coefficients_of_another_model_are_refused_with_the_likely_cause(model, values, words):
+    camera = Camera("CAM_FRONT", *SIZE, K, np.array(values), distortion_model=model)
+    fault = distortion_fault(camera)
+    assert fault and fault.startswith("camera CAM_FRONT: its distortion ") and words in fault
+    for lens in LENSES.values():
+        assert (
+            distortion_fault(dataclasses.replace(camera, distortion_model=lens[0], distortion=np.array(lens[1])))
+            is None
+        )

@@ -11,6 +11,7 @@ import pytest
 from helpers.small_drives import scene_at
 from scipy.spatial.transform import Rotation
 
+from drivesplat.poses import lens
 from drivesplat.readers.drive.__main__ import main
 from drivesplat.readers.drive.format import Pose
 from drivesplat.readers.drive.poses import matrix_of
@@ -91,6 +92,26 @@ def rolled(pose: Content, degrees: float) -> None:
     pose |= as_record(matrix)
 
 
+def scaled(k: list[list[float]], factor: float) -> list[list[float]]:
+    return [[value * factor for value in row] for row in k[:2]] + k[2:]
+
+
+def test_what_images_say_against_intrinsics_is_a_warning(content, folder, capsys, monkeypatch):
+    monkeypatch.setattr(lens, "lens_warnings", lambda scene: [f"{scene.name} looks distorted"])
+    status, said = said_of(content, lambda drive: None, folder, capsys)
+    assert status == 0 and f"warning: {folder.name} looks distorted\n" in said
+
+
+def test_coefficients_of_another_model_are_a_fault(content, folder, capsys):
+    """A polynomial of angles to pixels, given as `fisheye`."""
+    coefficients = {"model": "fisheye", "coefficients": [339.749, -31.988, 48.275, -7.201]}
+    status, said = said_of(
+        content, lambda drive: drive["cameras"]["CAM_FRONT"].update(distortion=coefficients), folder, capsys
+    )
+    assert status == 1 and "camera CAM_FRONT: its distortion leaves no image without empty pixels" in said
+    assert "probably those of another model" in said and said.endswith("1 fault\n")
+
+
 def test_a_drive_without_mistakes_has_no_warnings(content, folder, capsys):
     status, said = said_of(content, lambda drive: None, folder, capsys)
     assert status == 0 and "warning" not in said, said
@@ -121,10 +142,14 @@ def test_a_drive_without_mistakes_has_no_warnings(content, folder, capsys):
             lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(translation=[90.0, 60.0, 90.0]),
             "no return of a LiDAR falls into its images",
         ),
+        (
+            lambda d: d["cameras"]["CAM_FRONT"].update(K=scaled(d["cameras"]["CAM_FRONT"]["K"], 1.0 / 0.75)),
+            "K may belong to another image size",
+        ),
     ],
     ids=[
         "poses with w last", "poses rolled", "poses turned", "camera axes", "a camera upside down", "LiDAR rolled",
-        "camera far above",
+        "camera far above", "K of another image size",
     ],
 )  # fmt: skip
 def test_a_mistake_is_a_warning_that_says_what_to_check(change, words, content, folder, capsys):

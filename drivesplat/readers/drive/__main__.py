@@ -7,6 +7,8 @@ from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
+from drivesplat.preprocess.camera_check import camera_warnings
+from drivesplat.preprocess.undistort import distortion_fault
 from drivesplat.readers.drive.check import column_sentences, examine, summary, what_to_see
 from drivesplat.readers.drive.format import Drive, grouped
 from drivesplat.readers.drive.needed_settings import needed_settings
@@ -14,7 +16,7 @@ from drivesplat.readers.drive.nerfstudio import add_command
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.drive_warnings import drive_warnings
 from drivesplat.readers.record_names import counted
-from drivesplat.scene.scene import read_scene
+from drivesplat.scene.scene import Scene, read_scene
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -46,22 +48,27 @@ def main(arguments: list[str] | None = None) -> int:
 def _check(asked: argparse.Namespace) -> int:
     picture = asked.picture or asked.folder / "check.png"
     found = examine(asked.folder, picture)
-    for line in grouped(found.faults):
+    faults = found.faults or _distortion_faults(found.scene)
+    for line in grouped(faults):
         print(line)
     if found.no_picture:
         print(found.no_picture)
     elif found.scene is not None:
         print(": ".join(filter(None, (f"picture: {picture}", what_to_see(found.scene)))))
-    if found.faults or found.scene is None:
-        print(counted(len(found.faults), "fault"))
+    if faults or found.scene is None:
+        print(counted(len(faults), "fault"))
         return 1
-    for sentence in drive_warnings(found.scene):
+    for sentence in (*drive_warnings(found.scene), *camera_warnings(found.scene)):
         print(f"warning: {sentence}")
     for sentence in column_sentences(found.scene):
         print(sentence)
     print(summary(found.scene))
     print(f"settings to copy:\n\n{needed_settings(found.scene, asked.folder)}", end="")
     return 0
+
+
+def _distortion_faults(scene: Scene | None) -> list[str]:
+    return [fault for camera in (scene.cameras if scene else ()) if (fault := distortion_fault(camera))]
 
 
 def _schema(_: argparse.Namespace) -> int:
