@@ -426,7 +426,7 @@ def test_the_recorded_fragment_of_argoverse2_is_converted(tmp_path):
     assert (len(drive.key_frames or ()), len(drive.sweeps), len(drive.tracks)) == (2, 4, 114)
 
 
-# Both
+# All converters
 
 
 IMAGES, SCANS, OXTS = "{drive}/image_02", "{drive}/velodyne_points", "{drive}/oxts"
