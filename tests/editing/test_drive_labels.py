@@ -261,7 +261,7 @@ def test_a_drive_that_shows_no_object_has_tables_that_the_devkit_loads(scene, tm
     [
         ([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.1, 0.2, 0.0]], (4.5, 1.8, 1.5), {"background"}),
         ([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]], (4.5, 1.8, 1.5), {"background"}),
-        ([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]], (0.7, 0.7, 1.8), set()),
+        ([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], (0.7, 0.7, 1.8), set()),
         ([[0.0, 0.0, 0.0], [8.0, 0.0, 0.0], [8.0, 0.0, 0.0]], (4.5, 1.8, 1.5), set()),
     ],
     ids=["jitter of an annotation", "a fifth of its length", "more than its length", "it stands only later"],
