@@ -169,8 +169,8 @@ def test_beams_of_another_sensor_than_the_rings_are_measured(known):
     scan = scan_of(
         pattern_returns(MANY, 90, np.zeros(32), ALL & (np.arange(90) % 9 > 0)), Lidar("top", known, 90), standing
     )
-    np.testing.assert_allclose(scan.rays.beam_elevations[:32], MANY, atol=1e-5)
-    assert scan.rays.shape == (len(known), 90)
+    assert scan.rays.shape == (len(known), 90) and (~scan.returned[:32]).sum() == 320
+    np.testing.assert_allclose(scan.rays.elevations[:32], np.tile(MANY[:, None], 90), atol=1e-5)  # also of holes
 
 
 def test_times_of_returns_are_kept_and_holes_have_those_of_their_firing():
