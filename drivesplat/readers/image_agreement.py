@@ -78,8 +78,9 @@ class _View(NamedTuple):
 
 def image_warnings(scene: Scene, sweeps: list[SampledSweep]) -> list[str]:
     """A sentence about a drive that is mirrored, or about cameras, all or one by one, whose clock, matrix or mount is
-    another one than stated."""
-    views = {camera.name: list(_views(scene, sweeps, camera.name)) for camera in scene.cameras}
+    another one than stated. Images of distorted cameras are compared once they are resampled."""
+    rectified = [camera.name for camera in scene.cameras if camera.distortion_model == "none"]
+    views = {name: list(_views(scene, sweeps, name)) for name in rectified}
     every = [view for of_camera in views.values() for view in of_camera]
     given, mirrored = (
         [view.score(view.frame.camera_to_world, mirrored=flag) for view in every] for flag in (False, True)

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from drivesplat.readers.sweeps import read_returns
+from drivesplat.readers.sweeps import sound_returns
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep
@@ -36,7 +36,8 @@ def pose_warnings(scene: Scene) -> list[str]:
 
 def lidar_warnings(scene: Scene) -> list[str]:
     """Sentences about LiDARs with hardly any return near the ground, and cameras whose images no return falls into.
-    Reads a few sweeps, which have no faults. Without images nothing is known of the vehicle's path, and there are none.
+    Reads a few sweeps, without those whose file has a fault. Without images nothing is known of the vehicle's path, and
+    there are none.
     """
     if scene.poses == UNPOSED or not scene.frames:
         return []
@@ -96,7 +97,10 @@ def _ground_share(scene: Scene, sweeps: list[Sweep]) -> float:
     """The share of the returns around the vehicle that lie near the ground under it."""
     near = total = 0
     for sweep in sweeps:
-        points = apply(inverse(_ego_at(scene, sweep.timestamp)) @ sweep.sensor_to_world, read_returns(sweep).points)
+        returns = sound_returns(sweep)
+        if returns is None:
+            continue
+        points = apply(inverse(_ego_at(scene, sweep.timestamp)) @ sweep.sensor_to_world, returns.points)
         distances = np.linalg.norm(points[:, :2], axis=1)
         around = (distances > GROUND_RING[0]) & (distances < GROUND_RING[1])
         near += int((np.abs(points[around, 2]) < GROUND_HEIGHT).sum())
@@ -118,9 +122,12 @@ def _unseen_warnings(scene: Scene) -> Iterator[str]:
 
 
 def _seen(frame: Frame, sweeps: list[Sweep]) -> bool:
-    """Whether a return of the sweep nearest in time falls into an image."""
+    """Whether a return of the sweep nearest in time falls into an image, or its file cannot be read."""
     sweep = min(sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp))
-    points = apply(sweep.sensor_to_world, read_returns(sweep).points)
+    returns = sound_returns(sweep)
+    if returns is None:
+        return True
+    points = apply(sweep.sensor_to_world, returns.points)
     size = (frame.width, frame.height)
     pixels, depth = project(points, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
     return bool(((depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)).any())
