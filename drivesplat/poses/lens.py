@@ -7,6 +7,7 @@ lens better: images of a vehicle that drives straight ahead, for example, do not
 """
 
 import dataclasses
+import logging
 import tempfile
 from dataclasses import dataclass
 from itertools import pairwise
@@ -31,6 +32,8 @@ from drivesplat.poses.rig import RigImages
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.scene import UNPOSED, Frame, Scene
 from drivesplat.settings.refine_poses import FeatureSettings, RefinePosesJob, RefinePosesSettings
+
+log = logging.getLogger(__name__)
 
 FEATURES = FeatureSettings(max_image_size=640, max_features=1000, neighbours=4)
 MAX_IMAGES = (20, 48)
@@ -136,6 +139,7 @@ def lens_warnings(scene: Scene, ego_mask: EgoMask = NO_EGO_MASK, threads: int = 
     for camera in dict.fromkeys(frame.camera for frame in scene.frames):
         of_camera = [i for i, frame in enumerate(scene.frames) if frame.camera == camera]
         images = RigImages.of(scene, of_camera, ego_mask)
+        log.info("camera %s: its lens is tried on %d images", camera, len(images))
         with tempfile.TemporaryDirectory(prefix="drivesplat-lens-") as folder:
             database = Path(folder) / "features.db"
             start = detect_features(images, job, database, threads)
