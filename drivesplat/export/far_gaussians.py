@@ -25,9 +25,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from drivesplat.io.array_file import read_arrays, write_arrays
-from drivesplat.io.storage import Provenance, unreadable
-from drivesplat.io.typed_record import typed_record
+from drivesplat.io.array_file import read_typed_arrays, write_arrays
+from drivesplat.io.storage import Provenance
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.reach import INSIDE, reach_of
@@ -153,11 +152,7 @@ def write_far(path: str | Path, far: FarGaussians) -> None:
 
 def read_far(path: str | Path) -> FarGaussians:
     """Reads far.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
-    content = read_arrays(path, RULE)
-    try:
-        return typed_record(FarGaussians, content)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, RULE, "not a record of far Gaussians") from error
+    return read_typed_arrays(path, RULE, FarGaussians, "far Gaussians")
 
 
 def _changed(gaussians: Gaussians, far: FarGaussians) -> Gaussians:

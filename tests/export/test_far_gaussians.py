@@ -23,7 +23,8 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.export import ExportJob, SplatJob
 from drivesplat.settings.train import TrainJob, TrainSettings
 
-PROVENANCE = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64, "stages": {}}
+DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
+PROVENANCE = {**DIGESTS, "stages": {}, "inputs": {}}
 LIMIT = 1000.0
 RED, BLUE, SKY = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.5, 0.7)
 

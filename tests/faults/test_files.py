@@ -24,6 +24,7 @@ from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.poses.triangulated import read_triangulated
+from drivesplat.provenance.file_digests import checked_digest, record_output
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.ego_mask import read_ego_mask
@@ -128,6 +129,22 @@ def test_every_reader_stops_names_file_and_rule_and_executes_nothing(tmp_path, n
     assert message.startswith(f"{path}: ") and f"delete it and rerun: the rule '{rule}' rebuilds it" in message
     assert "\n" not in message
     assert not (path.parent / "executed").exists()
+
+
+@pytest.mark.parametrize("kind", ["a folder", "a link loop"])
+@pytest.mark.parametrize(
+    ("recorded", "advice"), [(True, "the rule 'train' rebuilds it"), (False, "its rule rebuilds it")]
+)
+def test_an_input_that_is_no_file_is_refused_before_a_job_begins(tmp_path, kind, recorded, advice):
+    path = tmp_path / "checkpoint.npz"
+    path.write_bytes(b"sound")
+    if recorded:
+        record_output(path, "train", {}, {})
+    path.unlink()
+    write(path, kind)
+    advice = "the rule 'train' rebuilds it" if recorded else "its rule rebuilds it"
+    with pytest.raises(ResultError, match=rf"checkpoint\.npz: cannot be read \(.*delete it and rerun: {advice}"):
+        checked_digest(path)
 
 
 @pytest.mark.parametrize("kind", BROKEN)

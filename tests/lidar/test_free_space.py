@@ -15,6 +15,7 @@ from helpers.tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.array_file import write_arrays
+from drivesplat.io.storage import no_provenance
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.lidar.traversal import OCCUPIED, count_passing
@@ -328,7 +329,13 @@ def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
     assert len(record.keys) > 1000 and (np.diff(record.keys) > 0).all()
 
 
-GRID = {"lower": np.zeros(3), "voxel": 0.3, "shape": np.array([9, 9, 9]), "keys": np.array([1, 5]), "provenance": {}}
+GRID = {
+    "lower": np.zeros(3),
+    "voxel": 0.3,
+    "shape": np.array([9, 9, 9]),
+    "keys": np.array([1, 5]),
+    "provenance": no_provenance(),
+}
 
 
 @pytest.mark.parametrize(

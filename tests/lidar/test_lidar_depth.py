@@ -27,6 +27,7 @@ from PIL import Image
 from drivesplat.demo.world import make_world
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
+from drivesplat.io.storage import no_provenance
 from drivesplat.lidar.depth import split_sweep
 from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
@@ -337,7 +338,7 @@ def test_a_drive_without_lidar_has_a_record_without_depths(root, tmp_path):
 
 
 def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
-    record = LidarDepthRecord(lidar_depths(tiny_scene, job()), {"stages": {}})
+    record = LidarDepthRecord(lidar_depths(tiny_scene, job()), {"stages": {}, "inputs": {"a": "b"}})
     write_arrays(tmp_path / "lidar_depth.npz", record)
     assert pickle.dumps(read_lidar_depth(tmp_path / "lidar_depth.npz")) == pickle.dumps(record)
     assert pickle.dumps(lidar_depths(tiny_scene, job())) == pickle.dumps(record.images)
@@ -346,7 +347,7 @@ def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     "content",
     [None, b"", b"text", [], {}, {"images": []},
-     *({"images": images, "provenance": {}} for images in (None, ["x"], [{"rows": 1}]))],
+     *({"images": images, "provenance": no_provenance()} for images in (None, ["x"], [{"rows": 1}]))],
     ids=str,
 )  # fmt: skip
 def test_an_invalid_file_is_refused_with_its_name_and_rule(tmp_path, content):

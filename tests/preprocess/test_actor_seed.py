@@ -25,6 +25,7 @@ from pydantic import ValidationError
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
+from drivesplat.io.storage import no_provenance
 from drivesplat.io.typed_record import field_values
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
@@ -516,7 +517,7 @@ def test_a_static_drive_has_an_empty_record_of_actors(tmp_path):
 @pytest.mark.parametrize(
     "content",
     [None, b"", b"text", [], {}, {"actors": []},
-     *({"actors": actors, "provenance": {}} for actors in (None, ["x"], [{"id": "x"}]))],
+     *({"actors": actors, "provenance": no_provenance()} for actors in (None, ["x"], [{"id": "x"}]))],
     ids=str,
 )  # fmt: skip
 def test_an_invalid_record_is_named_with_its_rule(tmp_path, content):
