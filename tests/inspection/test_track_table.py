@@ -118,8 +118,10 @@ def test_editable_tracks_are_those_of_actors_with_points(recording, tmp_path):
                    for kind in ("vehicle.car", "human"))  # fmt: skip
     track = next(track for track in recording.scene.tracks if track.id == car)
     actor = actor_record(ActorTrack(car, track.size, Motion.of_track(recording.scene, track)))
-    empty = dataclasses.replace(actor, id=walker, points=actor.points[:0], points_rgb=actor.points_rgb[:0])
-    write_arrays(tmp_path / "actors.npz", ActorRecords([actor, empty], {"stages": {}}))
+    empty = dataclasses.replace(
+        actor, id=walker, lidar_points=0, points=actor.points[:0], points_rgb=actor.points_rgb[:0]
+    )
+    write_arrays(tmp_path / "actors.npz", ActorRecords([actor, empty]))
     editable = editable_tracks([str(tmp_path / "actors.npz")])
     assert editable == {car} and editable_tracks([]) == set()
     assert {row.category: row.editable for row in rows_of(recording, editable)} == {

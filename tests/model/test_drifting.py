@@ -9,6 +9,7 @@ import torch
 from helpers.hand_made import looking_at
 from helpers.records import training_record_of
 
+from drivesplat.io.storage import no_provenance
 from drivesplat.model.background import Background
 from drivesplat.model.build import ModelInit, build_model
 from drivesplat.model.checkpoint import TrainedCheckpoint, read_checkpoint, trained_model, write_checkpoint
@@ -239,7 +240,7 @@ def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(echo, tmp_path):
         for value in (value for value in model.parameters() if value.requires_grad):
             value += 0.2 * torch.randn_like(value)
     job = TrainJob(parts=("background", "drifting"), sky="none", train=settings, random_seed=0)
-    write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, {}))
+    write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, no_provenance()))
     rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
     for time in (-0.2, 0.5, 1.3, 3.5, 9.0):
         ours, again = (it.gaussians_at(time, True, echo is not None) for it in (model, rebuilt))

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.errors import ResultError
+from drivesplat.io.storage import no_provenance
 from drivesplat.model import splat_model
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
@@ -353,7 +354,7 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
     for value in model.parts[1].params.values():
         value.data = value.data[3:]
     job = TrainJob(parts=parts, sky=sky, train=settings, random_seed=0)
-    write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, {}))
+    write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, no_provenance()))
     rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
     assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
     for time in (-0.2, 0.0, 0.61, 1.0, 1.8, 2.7, 5.0):
