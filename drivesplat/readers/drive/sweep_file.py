@@ -83,12 +83,14 @@ def beyond_poses(sweep: Sweep, reach: int) -> str | None:
     """Why a sweep at the end of the ego poses cannot be motion-compensated, although its points are within `reach`
     (microseconds) of its timestamp; None for all others. Reads the files of those near an end alone."""
     assert sweep.motion is not None
-    known = sweep.motion.offsets_s[[0, -1]] * 1e6
+    known = np.rint(sweep.motion.offsets_s[[0, -1]] * 1e6)
     path = Path(sweep.path)
-    if (known[0] <= -reach and known[1] >= reach) or not path.is_file() or file_fault(path):
+    if (known[0] <= -reach and known[1] >= reach) or not path.is_file():
         return None
-    returns = read_file(path)
-    if returns.offsets_s is None or not (np.abs(returns.offsets_s) <= reach * 1e-6 + TOLERANCE_S).all():
+    returns = read_checked(path)
+    if isinstance(returns, str) or returns.offsets_s is None:
+        return None
+    if not (np.abs(returns.offsets_s) <= reach * 1e-6 + TOLERANCE_S).all():
         return None
     return motion_fault(returns, sweep.motion)
 
