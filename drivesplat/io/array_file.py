@@ -84,7 +84,7 @@ def read_arrays(
             raise ValueError("it holds no record")
         return content
     except OSError as error:
-        raise unreadable(path, rule, f"cannot be read ({error.strerror})") from error
+        raise unreadable(path, rule, f"cannot be read ({error.strerror or error})") from error
     except Exception as error:  # zip, numpy and JSON each fail in their own ways
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise unreadable(path, rule, f"not a file of arrays of this workflow ({reason})") from error

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivesplat.errors import DatasetError
 from drivesplat.scene.images import read_image, read_mask, write_png
-from drivesplat.scene.lens import central_intrinsics, pixels_of
+from drivesplat.scene.lens import central_intrinsics, lens_fault, pixels_of
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.sensors import Camera
 
@@ -87,6 +87,8 @@ def _require_small_tangential(camera: Camera) -> None:
 def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The new intrinsics (3, 3), and for each pixel of the new image (h, w) the x and the y of its source."""
     _require_small_tangential(camera)
+    if fault := lens_fault(camera):
+        raise DatasetError(f"camera {camera.name}: {fault}")
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     every = np.stack([columns, rows], axis=-1).astype(np.float64)
     border = np.concatenate([every[[0, -1]].reshape(-1, 2), every[:, [0, -1]].reshape(-1, 2)])

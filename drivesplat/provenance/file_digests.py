@@ -81,9 +81,11 @@ def checked_digest(path: str | Path, warn: bool = True) -> str:
     try:
         digest = file_digest(path)
     except OSError as error:
-        why = f"cannot be read ({error.strerror})"
+        why = f"cannot be read ({error.strerror or error})"
         if record is not None:
             raise unreadable(path, record["rule"], why) from error
+        if isinstance(error, FileNotFoundError):
+            raise
         raise ResultError(f"{path}: {why}; delete it and rerun: its rule rebuilds it") from error
     if record is None:
         if warn:

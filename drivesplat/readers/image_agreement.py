@@ -61,7 +61,7 @@ class _View(NamedTuple):
         k = np.diag([factor, factor, 1.0]) @ continuous_intrinsics(self.frame, (width, height))
         pixels, depth = project(self.mirrored if mirrored else self.points, inverse(pose), k)
         inside = (depth > DEPTHS[0]) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-        if inside.sum() < MIN_POINTS:
+        if inside.sum() < MIN_POINTS or not self.edges.any():
             return float("nan")
         columns, rows = pixels[inside].astype(int).T
         return float(self.edges[rows, columns].mean() / self.edges.mean())

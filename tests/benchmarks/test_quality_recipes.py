@@ -119,7 +119,7 @@ def test_recipe_settings_take_precedence_over_dataset_settings(runs):
         ("recipes: [", ["mine.yaml", "not YAML"]),
         ("scene: '0061'\nrecipes: {a: {}, a: {}}", ["mine.yaml", "'a' stands twice"]),
         ("[]", ["mine.yaml", "docs/quality.md"]),
-        ({"scene": 49}, ["mine.yaml", "scene", '"0061" or "0049" in quotes', "octal"]),
+        ({"scene": 49}, ["mine.yaml", "scene", "in quotes", "octal"]),
         ({"scene": "9999"}, ["scene '9999' is not in the config"]),
         ({"recipe": {}}, ["mine.yaml", "unknown key 'recipe'", "docs/quality.md"]),
         ("scene: '0061'", ["mine.yaml", "'recipes' is missing"]),

@@ -68,7 +68,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "alexnet.pth": (alexnet, "lpips_backbone"),
     "far.npz": (read_far, "far_gaussians"),
     "metrics.json": (lambda path: read_json(path, rule="scene_metrics"), "scene_metrics"),
-    "splat.ply": (read_splat_ply, "export"),
+    "splat.ply": (partial(read_splat_ply, rule="export"), "export"),
 }
 """By the name of a file, who reads it, and the rule that makes it."""
 

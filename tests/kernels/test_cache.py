@@ -47,6 +47,7 @@ def small_package(root: Path) -> Path:
         "provenance/code_digest",
         "provenance/syntax_digest",
         "io/file_lock",
+        "io/regular_file",
         "io/storage",
         "errors",
     )

@@ -152,7 +152,7 @@ def test_the_part_of_the_view_that_is_kept_is_the_part_of_pixels_that_the_new_im
     [
         ("fisheye", [339.749, -31.988, 48.275, -7.201], "at 3 times its focal length; its coefficients are probably"),
         ("opencv", [0.001, -0.0005, -0.25, 0.06], "has p1 = -0.25 and p2 = 0.06, more than 0.1"),
-        ("opencv", [-0.9, 0.0, 0.0, 0.0], "folds in "),
+        ("opencv", [-0.9, 0.0, 0.0, 0.0], "its distortion folds"),
     ],
 )
 def test_coefficients_of_another_model_are_refused_with_the_likely_cause(model, values, words):

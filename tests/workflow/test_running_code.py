@@ -23,8 +23,8 @@ EDIT = f"""
 from pathlib import Path
 edited = Path({EDITED!r})
 source = edited.read_text()
-assert source.count("positions.append(points)") == 1
-edited.write_text(source.replace("positions.append(points)", "positions.append(points + 5.0)"))
+assert source.count("new.append((points,") == 1
+edited.write_text(source.replace("new.append((points,", "new.append((points + 5.0,"))
 """
 
 
