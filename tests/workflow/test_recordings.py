@@ -137,7 +137,7 @@ def test_a_range_beyond_the_drive_is_refused(tmp_path):
     assert said == "scene one: the frame range (2, 11) ends beyond its 10 key frames"
 
 
-@pytest.mark.parametrize("kind", ["npz", "ply"])
+@pytest.mark.parametrize("kind", ["npz", "ply", "pcd"])
 def test_a_lidar_without_rings_and_elevations_is_refused_where_it_is_rendered(tmp_path, kind):
     drive = changed(sweeps=[{"lidar": "top", "timestamp": 0, "file": f"top/bare.{kind}"}])
     made = plan(tmp_path, {"one": drive})
@@ -147,6 +147,8 @@ def test_a_lidar_without_rings_and_elevations_is_refused_where_it_is_rendered(tm
         if kind == "npz":
             with zipfile.ZipFile(bare, "w") as arrays:
                 arrays.writestr(f"{name}.npy", b"")
+        elif kind == "pcd":
+            bare.write_bytes(f"FIELDS x {name}\nPOINTS 0\nDATA ascii\nFIELDS ring".encode())
         else:
             bare.write_bytes(f"ply\nelement vertex 1\nproperty float {name}\nend_header\nproperty float ring".encode())
         said = refusal(Plan(made.config.model_dump(mode="json"), str(REPOSITORY)), "scans")

@@ -109,11 +109,14 @@ def _key_frames(drive: Any, frames: list[Any], sweeps: list[Any]) -> list[int]:
 def _has_rings(file: Path) -> bool:
     """Whether the returns of a sweep's file have rings; True for a file that cannot be read, which others report."""
     try:
-        if file.suffix == ".npz":
+        if file.suffix.lower() == ".npz":
             with ZipFile(file) as arrays:
-                return "ring.npy" in arrays.namelist()
-        with open(file, "rb") as opened:
-            header = opened.read(MAX_HEADER).partition(b"end_header")[0]
-        return any(line.split()[-1:] == [b"ring"] for line in header.splitlines() if line.startswith(b"property"))
+                names = [name.removesuffix(".npy").encode() for name in arrays.namelist()]
+        else:
+            with open(file, "rb") as opened:
+                header = opened.read(MAX_HEADER).partition(b"end_header")[0].partition(b"\nDATA")[0]
+            lines = (line for line in header.splitlines() if line.startswith((b"property", b"FIELDS")))
+            names = [name for line in lines for name in line.split()[1:]]
+        return any(name.lower().removeprefix(b"scalar_") == b"ring" for name in names)
     except (BadZipFile, OSError):
         return True
