@@ -10,7 +10,6 @@ from drivesplat.scene.scene import UNPOSED, Scene
 from drivesplat.scene.splits import held_out_key_frames, training_images
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.names import require_name
-from drivesplat.settings.render import RenderSettings
 
 MAX_WIDTH = 1600
 """Width in pixels to which wider images are resized."""
@@ -40,13 +39,8 @@ def needed_settings(scene: Scene, folder: Path) -> str:
         settings["refine_poses"] = {"enabled": True, "start": "images"}
     if cameras:
         frame = scene.frames[scene.middle_key_frame(settings["eval_camera"])]
-        width = min(MAX_WIDTH, frame.width)
-        if width < frame.width:
-            settings["images"] = {"width": width}
-        films = RenderSettings.model_fields["width"].default, RenderSettings.model_fields["height"].default
-        size = _even(width), _even(frame.height * width / frame.width)
-        if size != films:
-            settings["render"] = dict(zip(("width", "height"), size, strict=True))
+        if frame.width > MAX_WIDTH:
+            settings["images"] = {"width": MAX_WIDTH}
         if holdout := _holdout(scene, settings["eval_camera"]):
             settings["holdout"] = holdout
     return yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
@@ -65,10 +59,6 @@ def _camera_ahead(scene: Scene, cameras: list[str]) -> str:
     """The camera that looks ahead most."""
     ahead = {frame.camera: float(frame.camera_to_ego[0, 2]) for frame in scene.frames if frame.camera in cameras}
     return max(cameras, key=lambda camera: round(ahead[camera], 1))
-
-
-def _even(pixels: int | float) -> int:
-    return max(16, 2 * round(pixels / 2))
 
 
 def _holdout(scene: Scene, camera: str) -> dict[str, Any]:
