@@ -1,1 +1,1 @@
-"""Measurements of the workflow: quality of recipes, training speed, and rendering speed."""
+"""Measurements of the workflow: quality of recipes, speed of training and rendering, and what the tests find."""
