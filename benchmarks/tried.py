@@ -1,8 +1,9 @@
 """The ledger of experiments: `python -m benchmarks.tried` writes docs/tried.md from docs/tried.csv.
 
 A row of the ledger is one experiment. `commit` has its code or recorded its figures, and `date` is the commit's.
-`what` was changed, on which `data`, with which random `seeds`, to which `effect`, and was it `kept`: `yes` (the code or
-the default has it), `option` (a setting or preset has it), `no`, or `finding` (a measurement that changed nothing).
+`what` was changed, on which `data`, with which random `seeds` (empty where none matters), and to which `effect`.
+`kept` is `yes` (the code or the default has it), `option` (a setting or preset has it), `no`, or `finding` (a
+measurement that changed nothing).
 """
 
 import csv
@@ -53,7 +54,7 @@ class Experiment:
             raise ValueError(f"{self.commit!r}: a commit has seven hexadecimal digits")
         if self.kept not in SECTIONS:
             raise ValueError(f"{self.what}: kept is {self.kept!r}, but has to be one of {', '.join(SECTIONS)}")
-        if not (self.what and self.data and self.seeds and self.effect):
+        if not (self.what and self.data and self.effect):
             raise ValueError(f"{self.commit} {self.what}: a value is empty")
 
 

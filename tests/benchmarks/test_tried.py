@@ -48,9 +48,7 @@ def test_newest_experiments_come_first_under_their_heading(tmp_path):
     assert page.count("| a \\| b |") == 2 and "## Kept" not in page
 
 
-@pytest.mark.parametrize(
-    ("column", "value"), [(0, "21.11.2026"), (1, "main"), (2, ""), (3, ""), (4, ""), (5, ""), (6, "maybe")]
-)
+@pytest.mark.parametrize(("column", "value"), [(0, "21.11.2026"), (1, "main"), (2, ""), (3, ""), (5, ""), (6, "maybe")])
 def test_a_value_of_another_form_stops_the_command(tmp_path, capsys, column, value):
     written(tmp_path, [(*ROW[:column], value, *ROW[column + 1 :])])
     assert main(tmp_path) == 1 and not (tmp_path / "tried.md").exists()
