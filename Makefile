@@ -11,9 +11,10 @@
 # make bench        the measurements of benchmarks/ against their bounds (two idle cores)
 # make quality      RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
 # make speed        FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
+# make ledger       docs/tried.md from the ledger of experiments docs/tried.csv
 # make config       config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
 # make help         this list
-.PHONY: help demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch mutants bench quality speed config
+.PHONY: help demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch mutants bench quality speed config ledger
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -77,3 +78,6 @@ speed: setup
 
 config: setup
 	$(BIN)/python -m drivesplat.settings.config_document $(FORCE)
+
+ledger: setup
+	$(BIN)/python -m benchmarks.tried
