@@ -40,15 +40,17 @@ from drivesplat.workflow.without_cameras import (
     no_camera,
 )
 
+TRAIN, WORLD = "train", "demo_world"
+"""The stages of a training and of a synthetic world."""
 SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
-METHOD_STAGES = ("train", "evaluate")
+METHOD_STAGES = (TRAIN, "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
 ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
-    "demo_world", "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
+    WORLD, "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
     "scan_folder",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
