@@ -1,12 +1,14 @@
 """The structure of the library: few places at its top, no import circles, bounded chains of imports."""
 
 import ast
+from collections import defaultdict
 from graphlib import CycleError
 
 import pytest
 from helpers import REPOSITORY
 from helpers.structure import (
     LIBRARY,
+    classes,
     imported,
     longest_chain,
     module_graph,
@@ -104,3 +106,10 @@ def test_readers_of_intermediates_return_typed_records():
         if "dict[str, Any]" in ast.unparse(node.returns)
     }
     assert untyped == JSON_DOCUMENTS | {"read_arrays"}, "a reader returns a dict; io/typed_record.py makes records"
+
+
+def test_no_class_name_is_used_twice():
+    places = defaultdict(set)
+    for module, node in classes():
+        places[node.name].add(module)
+    assert not {name: sorted(found) for name, found in places.items() if len(found) > 1}

@@ -38,9 +38,9 @@ def composite_scan(met: Sequence[MetPart], values: Float[Tensor, "n v"]) -> list
 
 
 def _on_cpu(met: MetPart, values: Float[Tensor, "n v"]) -> CompositedScan:
-    from drivesplat.kernels.numba.scan_compositing import ScanCompositing
+    from drivesplat.kernels.numba.scan_compositing import NumbaScanCompositing
 
     inputs, rays = [tensor.cpu() for tensor in (*met.gaussians, values)], met.rays.on_cpu
     until = torch.zeros_like(rays.azimuths) if met.until is None else met.until.cpu()
-    composited = ScanCompositing.apply(*inputs, rays.within, rays.elevations, until, rays.borders)
+    composited = NumbaScanCompositing.apply(*inputs, rays.within, rays.elevations, until, rays.borders)
     return CompositedScan(*(tensor.to(values.device) for tensor in composited))

@@ -45,7 +45,7 @@ class Listed(NamedTuple):
     chunks_of: Callable[..., ScanChunks]
 
 
-class ScanCompositing(torch.autograd.Function):
+class TritonScanCompositing(torch.autograd.Function):
     """Sums of ranges, alpha, alpha before `until` and values along the rays of each part of a scan, and the median
     range without gradient, in the order of `drivesplat.kernels.scan_compositing.CompositedScan`, part after part.
 
@@ -126,13 +126,13 @@ def _composited(
 def composite_parts(
     met: Sequence[MetPart], values: Tensor, chunks_of: Callable[..., ScanChunks]
 ) -> list[tuple[Tensor, ...]]:
-    """The results of `ScanCompositing` for each part of a scan. The host waits for the device once.
+    """The results of `TritonScanCompositing` for each part of a scan. The host waits for the device once.
 
     `chunks_of` takes Gaussians, their values and the lists of tiles; its chunks choose the kernels.
     """
     parts = [Listed(part.rays, part.until, *lists, chunks_of) for part, lists in zip(met, _lists_of(met), strict=True)]
     projected = [field for part in met for field in part.gaussians[: len(PROJECTED)]]
-    return _by_part(ScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
+    return _by_part(TritonScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
 
 
 def _lists_of(met: Sequence[MetPart]) -> list[tuple[ReachedTiles | None, int]]:
