@@ -1,1 +1,1 @@
-"""Measurements of the workflow: quality of recipes, training speed, and rendering speed."""
+"""Measurements of the workflow: quality of recipes, training speed, rendering speed. The library does not import it."""
