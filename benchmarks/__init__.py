@@ -1,1 +1,2 @@
-"""Measurements of the workflow: quality of recipes, speed of training and rendering, and what the tests find."""
+"""Measurements of the workflow: quality of recipes, speed of training and rendering, and faults that the tests find.
+The library does not import it."""
