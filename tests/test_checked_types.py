@@ -10,7 +10,7 @@ from jaxtyping import Float, TypeCheckError, jaxtyped
 
 def scaling(factor: float, kind: type) -> Callable:
     @jaxtyped(typechecker=checked)
-    def scaled(values: Float[np.ndarray, "n"], others: Float[np.ndarray, "n"]) -> kind:
+    def scaled(values: Float[np.ndarray, " n"], others: Float[np.ndarray, " n"]) -> kind:
         return kind(factor * (values + others).sum())
 
     return scaled
