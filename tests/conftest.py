@@ -8,6 +8,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch comes: its threads
 # Copies of the workflow run the same kernels as the tests themselves: those that the set-up compiled.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drivesplat/__pycache__"))
 
+import hypothesis
 import pytest
 import torch
 from helpers.checked_types import check_types_of
@@ -16,6 +17,12 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # asked for before Triton comes: its own library is kernels, too
 
 check_types_of("drivesplat")
+
+# The same examples in every run; no test measures time, and fixtures are read only or renewed by the test itself.
+hypothesis.settings.register_profile(
+    "repeatable", derandomize=True, deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck)
+)
+hypothesis.settings.load_profile("repeatable")
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -87,13 +94,21 @@ def demo_job():
 
 
 @pytest.fixture(scope="session")
+def finished_run(tmp_path_factory):
+    """The workflow run to its end on the tiny drive, with two methods and two edits: read only."""
+    from helpers.shared_runs import finished_run
+
+    return finished_run(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
 def demo_root(demo_job, tmp_path_factory) -> Path:
     """A small synthetic drive in nuScenes format with its truth: scene demo, read only."""
+    from helpers.shared_runs import made_once
+
     from drivesplat.demo.world import make_world
 
-    root = tmp_path_factory.mktemp("demo")
-    make_world(root, demo_job, {"stages": {}}, workers=2)
-    return root
+    return made_once(tmp_path_factory, "demo", lambda root: make_world(root, demo_job, {"stages": {}}, workers=2))
 
 
 @pytest.fixture(scope="session")

@@ -15,11 +15,12 @@ import numpy as np
 import pyarrow
 import pytest
 from helpers import REPOSITORY
-from helpers.mutations import mutate_file
+from helpers.mutations import CHANCE, fresh, mutate_file
 from helpers.patience import PATIENCE_S
 from helpers.shown_drives import assert_shows, origin_of, require_refused_or_sound, world_points
 from helpers.table_files import time_limit
 from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
+from hypothesis import given, settings
 from PIL import Image
 from pyarrow import feather
 from scipy.spatial.transform import Rotation
@@ -512,10 +513,6 @@ def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, c
     assert "egovehicle_SE3_sensor.feather cannot be read" in capsys.readouterr().err
 
 
-SEEDS = [range(first, first + 20) for first in range(0, 200, 20)]
-"""200 damaged recordings, each determined by its seed."""
-
-
 def damaged(random: Random, folder: Path) -> str:
     """Damages a file of a recording; each kind of file is as likely as another."""
     kinds: dict[tuple[str, str], list[Path]] = {}
@@ -525,24 +522,24 @@ def damaged(random: Random, folder: Path) -> str:
     return mutate_file(random, random.choice(kinds[random.choice(list(kinds))]))
 
 
-@pytest.mark.parametrize("seeds", SEEDS, ids=str)
-def test_damaged_days_of_kitti_are_refused_in_one_line_or_sound(seeds, kitti, tmp_path, capsys):
-    for seed in seeds:
-        random, day = Random(seed), tmp_path / str(seed) / "2011_09_26"
+@settings(max_examples=200)
+@given(random=CHANCE)
+def test_damaged_days_of_kitti_are_refused_in_one_line_or_sound(kitti, tmp_path, capsys, random):
+    with fresh(tmp_path) as folder:
+        day, out = folder / "2011_09_26", folder / "out"
         shutil.copytree(kitti[0], day, ignore=shutil.ignore_patterns("*[2-5].png", "*[2-5].bin"))
-        done = f"seed {seed}: {damaged(random, day)}"
-        out = day.with_name("out")
-        require_refused_or_sound(lambda day=day, out=out: kitti_raw.main([str(day), "5", str(out)]), out, capsys, done)
+        done = damaged(random, day)
+        require_refused_or_sound(lambda: kitti_raw.main([str(day), "5", str(out)]), out, capsys, done)
 
 
-@pytest.mark.parametrize("seeds", SEEDS, ids=str)
-def test_damaged_logs_of_argoverse2_are_refused_in_one_line_or_sound(seeds, argoverse, tmp_path, capsys):
-    for seed in seeds:
-        random, log = Random(seed), tmp_path / str(seed) / "log"
+@settings(max_examples=200)
+@given(random=CHANCE)
+def test_damaged_logs_of_argoverse2_are_refused_in_one_line_or_sound(argoverse, tmp_path, capsys, random):
+    with fresh(tmp_path) as folder:
+        log, out = folder / "log", folder / "out"
         shutil.copytree(argoverse[0], log, ignore=lambda _, names: sorted(n for n in names if n[0].isdigit())[2:])
-        done = f"seed {seed}: {damaged(random, log)}"
-        out = log.with_name("out")
-        require_refused_or_sound(lambda log=log, out=out: argoverse2.main([str(log), str(out)]), out, capsys, done)
+        done = damaged(random, log)
+        require_refused_or_sound(lambda: argoverse2.main([str(log), str(out)]), out, capsys, done)
 
 
 @pytest.mark.parametrize("name", ["kitti_raw", "argoverse2", "pandaset"])
