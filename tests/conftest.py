@@ -56,7 +56,7 @@ def one_thread():
 @pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory) -> Path:
     """A tiny drive in nuScenes format: scene 0001, read only."""
-    from helpers.tiny_world import World, write_world
+    from helpers.drives import World, write_world
 
     return write_world(tmp_path_factory.mktemp("tiny"), World())
 
@@ -64,16 +64,9 @@ def tiny_root(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def tiny_scene(tiny_root):
     """The tiny drive as a Scene, with the images between key frames."""
-    from drivesplat.preprocess.extract import extract_scene
-    from drivesplat.settings.extract import SceneSource
+    from helpers.drives import scene_at
 
-    return extract_scene(
-        SceneSource(
-            dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None,
-            cameras=("CAM_FRONT",), sweeps=True, on_missing="stop",
-        ),
-        tiny_root,
-    )  # fmt: skip
+    return scene_at(tiny_root)
 
 
 @pytest.fixture(scope="session")

@@ -12,9 +12,9 @@ import numpy as np
 import pandas
 import pytest
 from helpers import REPOSITORY
+from helpers.drives import TILTED_CAMERA, TIMES, World, rays_at, seconds_of, seen_from, turning_world
 from helpers.mutations import CHANCE, fresh, likely, mutate_file
 from helpers.shown_drives import assert_shows, require_refused_or_sound, world_points
-from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
 from hypothesis import given, settings
 from pandas.core.internals.managers import BlockManager
 from PIL import Image
@@ -56,7 +56,7 @@ def write_json(path: Path, value: object) -> None:
     path.write_text(json.dumps(value))
 
 
-def seen_box(drive: TurningDrive, thing, time: int) -> np.ndarray:
+def seen_box(drive: World, thing, time: int) -> np.ndarray:
     """Where an object is when the LiDAR, clockwise from behind, faces it in the revolution around `time`."""
     box = drive.box(thing, time)
     for _ in range(5):
@@ -65,10 +65,10 @@ def seen_box(drive: TurningDrive, thing, time: int) -> np.ndarray:
     return box
 
 
-def cuboids(drive: TurningDrive, time: int) -> pandas.DataFrame:
+def cuboids(drive: World, time: int) -> pandas.DataFrame:
     """The boxes of a frame; the car has a second one by the forward LiDAR, 3 m beside it."""
     rows = []
-    for thing in drive.world.things:
+    for thing in drive.things:
         is_car, box = thing.category == "car", seen_box(drive, thing, time)
         if not thing.velocity or not np.any(thing.velocity):
             box = drive.box(thing, time)
@@ -92,7 +92,7 @@ def cuboids(drive: TurningDrive, time: int) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def scan(drive: TurningDrive, time: int) -> tuple[pandas.DataFrame, np.ndarray]:
+def scan(drive: World, time: int) -> tuple[pandas.DataFrame, np.ndarray]:
     """The table of a revolution, with a return of the forward LiDAR, and the spinning LiDAR's hits (n, 3)."""
     parts, seconds = [], []
     for azimuth in np.radians(np.arange(179.0, -180.0, -6.0)):
@@ -105,16 +105,18 @@ def scan(drive: TurningDrive, time: int) -> tuple[pandas.DataFrame, np.ndarray]:
     return table.astype({"d": int}), hits
 
 
-def write_sequence(folder: Path, drive: TurningDrive, times: np.ndarray) -> Path:
+def write_sequence(folder: Path, drive: World, times: np.ndarray) -> Path:
     """A sequence with two cameras, of which the left one shows the drive."""
-    for name, mount, delay in (("front_camera", FRONT, 0), ("left_camera", CAMERA, DELAY)):
+    for name, mount, delay in (("front_camera", FRONT, 0), ("left_camera", TILTED_CAMERA, DELAY)):
         camera = folder / "camera" / name
         write_json(camera / "poses.json", [pose_json(drive.ego(time + delay) @ mount) for time in times])
         write_json(camera / "timestamps.json", [(time + delay) * 1e-6 for time in times.tolist()])
-        (fx, _, cx), (_, fy, cy), _ = drive.world.intrinsics.tolist()
+        (fx, _, cx), (_, fy, cy), _ = drive.intrinsics.tolist()
         write_json(camera / "intrinsics.json", {"fx": fx, "fy": fy, "cx": cx, "cy": cy})
         for i, time in enumerate(times):
-            Image.fromarray(drive.image(time + delay)).save(camera / f"{i:02}.jpg", quality=97)
+            Image.fromarray(drive.image(seconds_of(time + delay), TILTED_CAMERA)).save(
+                camera / f"{i:02}.jpg", quality=97
+            )
     for name in ("lidar", "annotations/cuboids"):
         (folder / name).mkdir(parents=True)
     for i, time in enumerate(times.tolist()):
@@ -124,8 +126,8 @@ def write_sequence(folder: Path, drive: TurningDrive, times: np.ndarray) -> Path
 
 
 @pytest.fixture(scope="module")
-def drive() -> TurningDrive:
-    return TurningDrive(rigid(Rotation.from_euler("z", 0.65).as_matrix(), np.array([3.0, -7.0, 1.0])))
+def drive() -> World:
+    return turning_world(rigid(Rotation.from_euler("z", 0.65).as_matrix(), np.array([3.0, -7.0, 1.0])))
 
 
 @pytest.fixture(scope="module")

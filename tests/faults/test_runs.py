@@ -13,10 +13,10 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
+from helpers.drives import World
 from helpers.killed_runs import only_complaint, training_process
 from helpers.patience import PATIENCE_S, wait_until
 from helpers.shared_runs import EDITS, TWO_METHODS, VANILLA
-from helpers.tiny_world import World
 from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from helpers.demo_worlds import job_of as world_job_of
 from helpers.demo_worlds import world_of
-from helpers.records import write_invalid
-from helpers.small_drives import (
+from helpers.drives import (
+    CAMERA_AT,
     HELD_OUT,
+    LIDAR_AT,
     NOTHING_HELD_OUT,
-    Speeding,
+    Thing,
+    World,
+    cast_lidar,
     depths_at,
     drive,
     scene_at,
@@ -21,7 +24,7 @@ from helpers.small_drives import (
     shows,
     true_depths,
 )
-from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
+from helpers.records import write_invalid
 from PIL import Image
 
 from drivesplat.demo.world import make_world
@@ -45,7 +48,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
 CAR, TRUCK = World().things[:2]
 AHEAD = Thing("vehicle.truck", (4.0, 2.0, 2.6), (8.5, 0.0, 1.3), (4.2, 0.0))
 """A leading truck with its rear initially 4.8 m from the camera, too tall for LiDAR and camera to see its roof."""
-SPEEDING = Speeding("vehicle.truck", (4.0, 2.0, 2.6), (9.0, 0.5, 1.3), (1.0, 0.0), gain=(3.0, 0.0))
+SPEEDING = Thing("vehicle.truck", (4.0, 2.0, 2.6), (9.0, 0.5, 1.3), (1.0, 0.0), gain=(3.0, 0.0))
 CROSSING = Thing("vehicle.truck", (4.0, 2.0, 2.6), (24.0, -9.0, 1.3), (0.0, 4.0), heading=np.pi / 2)
 """It crosses the road in front of the ego vehicle from right to left."""
 

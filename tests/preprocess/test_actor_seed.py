@@ -8,18 +8,21 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from helpers.records import write_invalid
-from helpers.small_drives import (
+from helpers.drives import (
+    CAMERA_AT,
     HELD_OUT,
+    LIDAR_AT,
     NOTHING_HELD_OUT,
     TRAINING,
-    Speeding,
+    Thing,
+    World,
+    cast_lidar,
     drive,
     scene_at,
     seconds_of,
     shows,
 )
-from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
+from helpers.records import write_invalid
 from PIL import Image
 from pydantic import ValidationError
 
@@ -348,7 +351,7 @@ def test_colours_match_the_surface_of_the_car(tmp_path):
     assert (off < 25).mean() > 0.85
 
 
-SPEEDING = Speeding("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0), gain=(1.0, 0.0))
+SPEEDING = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0), gain=(1.0, 0.0))
 
 
 def test_occluders_do_not_colour_an_actor(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.classed import classed
-from helpers.tiny_world import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar
+from helpers.drives import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar
 from PIL import Image
 from plyfile import PlyData, PlyElement
 

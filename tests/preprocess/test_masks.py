@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import REPOSITORY
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 from PIL import Image
 
 from drivesplat.errors import ConfigError, DatasetError, ResultError

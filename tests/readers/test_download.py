@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from helpers import REPOSITORY
 from helpers.archive_server import Site, packed, served
+from helpers.drives import World, write_world
 from helpers.patience import wait_until
-from helpers.tiny_world import World, write_world
 
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.preprocess.extract import extract_scene

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import REPOSITORY
+from helpers.drives import scene_at
 from helpers.mutations import CHANCE, mutate_json
 from helpers.patience import PATIENCE_S
-from helpers.small_drives import scene_at
 from hypothesis import given, settings
 from PIL import Image
 from plyfile import PlyData, PlyElement

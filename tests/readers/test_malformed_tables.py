@@ -6,8 +6,8 @@ import logging
 from pathlib import Path
 
 import pytest
+from helpers.drives import KEY_FRAME_US, START_US, World, write_world
 from helpers.table_files import copy_of, edit, extracted, row
-from helpers.tiny_world import KEY_FRAME_US, START_US, World, write_world
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive_checks import jumps

@@ -8,9 +8,9 @@ from random import Random
 
 import numpy as np
 import pytest
+from helpers.drives import World, write_world
 from helpers.mutations import CHANCE, fresh, likely, mutate_bytes, mutate_table, some_bytes
 from helpers.table_files import VERSION, copy_of, extracted, time_limit
-from helpers.tiny_world import World, write_world
 from hypothesis import given, settings
 from PIL import Image
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, KEY_FRAME_US, LIDAR_AT, ORIGIN, START_US, World, write_world
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, KEY_FRAME_US, LIDAR_AT, ORIGIN, START_US, World, write_world
 from pyquaternion import Quaternion
 
 from drivesplat.errors import DatasetError

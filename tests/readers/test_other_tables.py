@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import REPOSITORY
+from helpers.drives import World, write_world
 from helpers.table_files import VERSION, copy_of, edit, extracted
-from helpers.tiny_world import World, write_world
 from PIL import Image
 
 from drivesplat.errors import DatasetError

@@ -7,7 +7,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
-from helpers.tiny_world import World, write_world
+from helpers.drives import World, write_world
 from nuscenes.nuscenes import NuScenes
 
 from drivesplat.errors import DatasetError, ResultError

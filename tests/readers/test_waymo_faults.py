@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers.drives import World, write_world
 from helpers.table_files import time_limit
-from helpers.tiny_world import World, write_world
 from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
 from helpers.waymo_files import tfrecord, write_v1, write_v2
 

@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers.drives import World, write_world
 from helpers.mutations import CHANCE, flip_bytes, fresh, mutate_bytes
 from helpers.table_files import time_limit
-from helpers.tiny_world import World, write_world
 from helpers.waymo_drive import NAME, Drive, tiny_drive
 from helpers.waymo_files import components, frame_message, tfrecord, write_v1, write_v2
 from hypothesis import assume, given, settings

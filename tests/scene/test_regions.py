@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.classed import classed
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World, cast, write_world
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World, cast, write_world
 from scipy.spatial import ConvexHull
 
 from drivesplat.preprocess.extract import extract_scene
