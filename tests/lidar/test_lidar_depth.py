@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.demo_worlds import job_of as world_job_of
 from helpers.demo_worlds import world_of
 from helpers.drives import (
@@ -35,14 +36,12 @@ from drivesplat.lidar.depth import split_sweep
 from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.occlusion import patches, unoccluded
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
 
 CAR, TRUCK = World().things[:2]
@@ -361,11 +360,7 @@ def test_an_invalid_file_is_refused_with_its_name_and_rule(tmp_path, content):
 
 
 def demo_scene(root: Path) -> Scene:
-    source = SceneSource(
-        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None, cameras=("CAM_FRONT",),
-        sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    return extract_scene(source, root)
+    return drives.scene_at(root, dataset="demo", scene="demo", sweeps=False)
 
 
 @pytest.fixture(scope="module")

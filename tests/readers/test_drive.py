@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import REPOSITORY
+from helpers import REPOSITORY, drives
 from helpers.drives import scene_at
 from helpers.mutations import CHANCE, mutate_json
 from helpers.patience import PATIENCE_S
@@ -37,11 +37,7 @@ from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 
 
 def source(**changes: Any) -> SceneSource:
-    given = {
-        "dataset": "mine", "reader": "drive", "version": "", "scene": "0001", "frames": None, "cameras": ("CAM_FRONT",),
-        "sweeps": True, "lidar_sweeps": True, "on_missing": "stop",
-    }  # fmt: skip
-    return SceneSource(**{**given, **changes})
+    return drives.source(**{"dataset": "mine", "reader": "drive", "version": "", "lidar_sweeps": True, **changes})
 
 
 @pytest.fixture(scope="module")

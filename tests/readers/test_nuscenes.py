@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, KEY_FRAME_US, LIDAR_AT, ORIGIN, START_US, World, write_world
 from pyquaternion import Quaternion
 
@@ -24,11 +25,7 @@ from drivesplat.settings.lidar_seed import SeedJob
 
 
 def source(**changes) -> SceneSource:
-    plain = {
-        "dataset": "tiny", "reader": "nuscenes", "version": "v1.0-mini", "scene": "0001", "frames": None,
-        "cameras": ("CAM_FRONT",), "sweeps": False, "on_missing": "stop",
-    }  # fmt: skip
-    return SceneSource(**{**plain, **changes})
+    return drives.source(**{"sweeps": False, **changes})
 
 
 @pytest.fixture

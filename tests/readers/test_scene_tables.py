@@ -7,6 +7,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from helpers import drives
 from helpers.drives import World, write_world
 from nuscenes.nuscenes import NuScenes
 
@@ -14,7 +15,6 @@ from drivesplat.errors import DatasetError, ResultError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.nuscenes import scene_tables
 from drivesplat.readers.nuscenes.scene_tables import index_tables, read_scene_tables, rows, scene_file
-from drivesplat.settings.extract import SceneSource
 
 VERSION, SCENES = "v1.0-mini", ("0001", "0002", "0003")
 
@@ -89,10 +89,7 @@ def test_rows_keep_the_content_and_order_of_the_tables(root, tmp_path):
 def test_a_scene_read_from_its_rows_equals_the_one_read_from_the_tables(root, tmp_path):
     index_tables(root, VERSION, SCENES, tmp_path)
     for name in SCENES:
-        source = SceneSource(
-            dataset="tiny", reader="nuscenes", version=VERSION, scene=name, frames=None, cameras=("CAM_FRONT",),
-            sweeps=True, lidar_sweeps=True, on_missing="stop",
-        )  # fmt: skip
+        source = drives.source(scene=name, lidar_sweeps=True)
         assert repr(extract_scene(source, root, scene_file(tmp_path, name))) == repr(extract_scene(source, root))
 
 

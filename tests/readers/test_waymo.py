@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.waymo_drive import GLOBAL, NAME, READOUT_S, Drive, panoptic, tiny_drive
 from helpers.waymo_files import write_v1, write_v2
 from PIL import Image
@@ -29,11 +30,8 @@ WRITERS = {"v2": write_v2, "v1": write_v1}
 
 
 def source(**changes: Any) -> SceneSource:
-    given = {
-        "dataset": "mine", "reader": "waymo", "version": "", "scene": NAME, "frames": None,
-        "cameras": ("FRONT", "SIDE_LEFT"), "sweeps": True, "lidar_sweeps": True, "on_missing": "stop",
-    }  # fmt: skip
-    return SceneSource(**{**given, **changes})
+    given = {"dataset": "mine", "reader": "waymo", "version": "", "scene": NAME, "lidar_sweeps": True}
+    return drives.source(**{**given, "cameras": ("FRONT", "SIDE_LEFT"), **changes})
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers import drives
 from helpers.drives import World, write_world
 from helpers.table_files import time_limit
 from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
@@ -23,7 +24,6 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.waymo.layout import camera_names, find_root, segment_files, table_files
 from drivesplat.readers.waymo.tfrecord import masked_crc
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.extract import SceneSource
 
 WRITERS = {"v2": write_v2, "v1": write_v1}
 V1_FILE = f"segment-{NAME}_with_camera_labels.tfrecord"
@@ -48,11 +48,8 @@ def written(tmp_path) -> Callable[..., Path]:
 
 
 def extracted(root: Path, folder: Path, **changes: Any) -> Scene:
-    given = {
-        "dataset": "mine", "reader": "waymo", "version": "v1.0-mini", "scene": NAME, "frames": None,
-        "cameras": ("FRONT",), "sweeps": False, "on_missing": "stop",
-    }  # fmt: skip
-    return extract_scene(SceneSource(**{**given, **changes}), root, None, folder)
+    given = {"dataset": "mine", "reader": "waymo", "scene": NAME, "cameras": ("FRONT",), "sweeps": False}
+    return extract_scene(drives.source(**{**given, **changes}), root, None, folder)
 
 
 def refusal(root: Path, folder: Path, **changes: Any) -> str:

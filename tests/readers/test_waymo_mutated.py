@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers import drives
 from helpers.drives import World, write_world
 from helpers.mutations import CHANCE, flip_bytes, fresh, mutate_bytes
 from helpers.table_files import time_limit
@@ -25,7 +26,6 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.readers.waymo.names import COMPONENTS
 from drivesplat.scene.scene import Scene, read_scene, write_scene
-from drivesplat.settings.extract import SceneSource
 
 V1_FILE = f"segment-{NAME}_with_camera_labels.tfrecord"
 NUMBERS = [0.0, -1.0, 1e-30, 1e9, 1e30, 1e300, math.nan, math.inf, -math.inf]
@@ -48,9 +48,9 @@ def roots(drive, tmp_path_factory) -> dict[str, Path]:
 
 def require_sound_or_one_line(root: Path, folder: Path, random: Random, done: object) -> bool:
     """Reads a drive and its sweeps; whether it was refused."""
-    source = SceneSource(
-        dataset="mine", reader="waymo", version="", scene=NAME, frames=None, cameras=("FRONT",), sweeps=True,
-        lidar_sweeps=True, on_missing=random.choice(["stop", "warn"]),
+    source = drives.source(
+        dataset="mine", reader="waymo", version="", scene=NAME, cameras=("FRONT",), lidar_sweeps=True,
+        on_missing=random.choice(["stop", "warn"]),
     )  # fmt: skip
     try:
         with time_limit():
