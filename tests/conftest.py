@@ -61,6 +61,23 @@ def tiny_root(tmp_path_factory) -> Path:
     return write_world(tmp_path_factory.mktemp("tiny"), World())
 
 
+@pytest.fixture(scope="module")
+def uncompared():
+    """Extractions and checks do not compare recordings with each other."""
+    from helpers.drives import uncompared
+
+    with uncompared():
+        yield
+
+
+@pytest.fixture(scope="session")
+def small_root(tmp_path_factory) -> Path:
+    """A tiny drive of three key frames with smaller images, read only."""
+    from helpers.drives import SMALL, write_world
+
+    return write_world(tmp_path_factory.mktemp("small"), SMALL)
+
+
 @pytest.fixture(scope="session")
 def tiny_scene(tiny_root):
     """The tiny drive as a Scene, with the images between key frames."""

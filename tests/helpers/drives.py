@@ -7,9 +7,12 @@ tests of converters record the same world in other formats.
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from PIL import Image
@@ -142,6 +145,9 @@ class World:
         return points @ self.place[:3, :3].T + self.place[:3, 3]
 
 
+SMALL = World(key_frames=3, width=48, height=27)
+
+
 def turning_world(place: np.ndarray) -> World:
     """A vehicle that turns, past things with headings, in a world that is turned and tilted against the street."""
     car = Thing("car", (4.0, 2.0, 1.6), (10.0, 1.0, 0.8), velocity=(4.2, 0.5), heading=0.12, color=(230, 230, 235))
@@ -165,9 +171,19 @@ def source(**changes: Any) -> SceneSource:
     return SceneSource(**{**plain, **changes})
 
 
+@contextmanager
+def uncompared() -> Iterator[None]:
+    """Drives are read without comparing their recordings with each other, which takes most of the time and only warns;
+    tests/readers/test_drive_warnings.py has that."""
+    module = "drivesplat.readers.drive_warnings"
+    with patch(f"{module}.image_warnings", return_value=[]), patch(f"{module}.track_warnings", return_value=[]):
+        yield
+
+
 def scene_at(root: Path, sweeps: bool = True, **changes: Any) -> Scene:
-    """The scene of that source below `root`."""
-    return extract_scene(source(sweeps=sweeps, **changes), root)
+    """The scene of that source below `root`, uncompared."""
+    with uncompared():
+        return extract_scene(source(sweeps=sweeps, **changes), root)
 
 
 def drive(root: Path, *things: Thing, **world: Any) -> Scene:

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.scene import Scene
-from helpers.drives import VERSION, scene_at
+from helpers.drives import VERSION, source
 from helpers.patience import PATIENCE_S
 
 
@@ -57,4 +58,4 @@ def row(rows: list[dict], token: str) -> dict:
 def extracted(root: Path, **changes) -> Scene:
     """Scene 0001 with its images and sweeps between key frames. Raises Hang where it does not end."""
     with time_limit():
-        return scene_at(root, **{"lidar_sweeps": True, **changes})
+        return extract_scene(source(**{"lidar_sweeps": True, **changes}), root)

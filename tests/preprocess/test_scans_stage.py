@@ -35,6 +35,8 @@ from drivesplat.scene.scan_record import NO_OBJECT, read_scans
 from drivesplat.scene.sensors import Lidar, LidarReturns
 from drivesplat.settings.config import load
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 
 def test_key_frames_are_resolved_and_all_sweeps_on_request_each_in_its_group(tmp_path):
     times = [(i * KEY_FRAME_US // 2, i % 2 == 0) for i in range(9)]

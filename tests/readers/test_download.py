@@ -25,6 +25,8 @@ from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_fo
 from drivesplat.settings.config import load
 from drivesplat.workflow.plan import Plan
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 CONTENT = bytes(range(256)) * 4000
 
 

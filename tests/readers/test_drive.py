@@ -35,6 +35,8 @@ from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 
 def source(**changes: Any) -> SceneSource:
     return drives.source(**{"dataset": "mine", "reader": "drive", "version": "", "lidar_sweeps": True, **changes})

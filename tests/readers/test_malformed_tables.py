@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 import pytest
-from helpers.drives import KEY_FRAME_US, START_US, World, write_world
+from helpers.drives import KEY_FRAME_US, START_US
 from helpers.table_files import copy_of, edit, extracted, row
 
 from drivesplat.errors import DatasetError
@@ -18,11 +18,6 @@ SAMPLE, IMAGE, SWEEP = "0001 sample 1", "0001 CAM_FRONT 2", "0001 LIDAR_TOP 1"
 BETWEEN = "0001 CAM_FRONT 3"
 BOX = "0001 annotation 1 1"
 CAMERA, LIDAR = "calibrated CAM_FRONT", "calibrated LIDAR_TOP"
-
-
-@pytest.fixture(scope="module")
-def small_root(tmp_path_factory) -> Path:
-    return write_world(tmp_path_factory.mktemp("small"), World(key_frames=3, width=48, height=27))
 
 
 @pytest.fixture
@@ -46,11 +41,12 @@ DEEP = [[[[[[[[1.0]]]]]]]]
 NOT_A_POSITION = [
     None, "1, 2, 3", ["1", "2", "3"], [[1.0, 2.0, 3.0]], [1.0, 2.0, [3.0]], [1.0, 2.0], [1.0, 2.0, 3.0, 4.0], {}, 7,
     DEEP, [True, 0.0, 0.0], [1e300, 0.0, 0.0], [0.0, -1.1e8, 0.0], [10**400, 0, 0], [float("nan"), 0.0, 0.0],
-    [None, 0.0, 0.0],
+    [None, 0.0, 0.0], [0.0, float("inf"), 0.0],
 ]  # fmt: skip
 NOT_A_ROTATION = [
     None, "1000", ["1", "0", "0", "0"], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0], [[1.0, 0.0, 0.0, 0.0]], {},
     [1e300, 0.0, 0.0, 0.0], [10**400, 0, 0, 0], [float("nan"), 0.0, 0.0, 0.0], [True, False, False, False],
+    [0.9, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [1.0, 0.1, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0],
 ]  # fmt: skip
 
 
@@ -94,6 +90,16 @@ K = [[30.0, 0.0, 24.0], [0.0, 30.0, 13.0], [0.0, 0.0, 1.0]]
         ([[30.0, 0.0, 49.0], [0.0, 30.0, 13.0], [0.0, 0.0, 1.0]], "principal point .49, 13. is outside"),
         ([[30.0, 0.0, 24.0], [0.0, 30.0, -1.0], [0.0, 0.0, 1.0]], "principal point .24, -1. is outside"),
         ([[30.0, 0.0, 800.0], [0.0, 30.0, 450.0], [0.0, 0.0, 1.0]], "outside its images of 48x27"),
+        ([], "pinhole"),
+        ([[30.0, 0.0], [0.0, 30.0]], "pinhole"),
+        ([[30.0, 0.0, 24.0], [0.0, 30.0], [0.0, 0.0, 1.0]], "pinhole"),
+        ([[30.0, 0.0, float("nan")], [0.0, 30.0, 13.0], [0.0, 0.0, 1.0]], ""),
+        ([[0.0, 0.0, 0.0], [0.0, 30.0, 13.0], [0.0, 0.0, 1.0]], ""),
+        ([[30.0, 0.0, 24.0], [0.0, 0.0, 13.0], [0.0, 0.0, 1.0]], ""),
+        ([[30.0, 0.0, 24.0], [0.0, -30.0, 13.0], [0.0, 0.0, 1.0]], ""),
+        ([[30.0, 0.0, 24.0], [0.0, 30.0, 13.0], [0.0, 0.0, 0.0]], ""),
+        ([[30.0, 0.0, 24.0], [30.0, 0.0, 13.0], [0.0, 0.0, 1.0]], ""),
+        ([[30.0, 30.0, 24.0], [30.0, 30.0, 13.0], [0.0, 0.0, 1.0]], ""),
     ],
     ids=str,
 )
@@ -155,14 +161,14 @@ def test_a_recording_far_from_its_key_frame_is_refused_naming_it(root):
 
 @pytest.mark.parametrize(
     "size", [[1.0, 2.0], [1.0, 2.0, 3.0, 4.0], None, "big", ["1", "2", "3"], [1.0, None, 1.0], {}, [1e300, 1.0, 1.0],
-             [2000.0, 1.0, 1.0], [0.0, 1.0, 1.0], DEEP], ids=str,
+             [2000.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, float("nan")], DEEP], ids=str,
 )  # fmt: skip
 def test_a_malformed_box_size_is_refused_naming_its_box(root, size):
     edit(root, "sample_annotation", lambda rows: row(rows, BOX).update(size=size))
     assert refusal(root).startswith(f"sample_annotation {BOX} (instance 0001 instance 1): its size is")
 
 
-@pytest.mark.parametrize("value", [None, "48", 48.5, float("nan"), [48], True, 10**30, -48], ids=str)
+@pytest.mark.parametrize("value", [None, "48", 48.5, float("nan"), [48], True, 10**30, -48, 0], ids=str)
 @pytest.mark.parametrize("column", ["width", "height"])
 def test_a_malformed_image_size_is_refused_naming_it(root, column, value):
     edit(root, "sample_data", lambda rows: row(rows, IMAGE).update({column: value}))
@@ -304,6 +310,34 @@ def test_a_circle_of_samples_is_refused_naming_where_it_closes(root, back_to):
 def test_a_circle_of_images_is_refused_naming_a_record_of_it(root, back_to):
     edit(root, "sample_data", lambda rows: row(rows, BETWEEN).update(next=back_to))
     assert refusal(root).startswith(f"sample_data {back_to}")
+
+
+@pytest.mark.parametrize("delay", [-KEY_FRAME_US, -2 * KEY_FRAME_US, -START_US])
+def test_key_frames_out_of_order_are_refused_naming_the_sample(root, delay):
+    edit(root, "sample", lambda rows: row(rows, "0001 sample 2").update(timestamp=START_US + 2 * KEY_FRAME_US + delay))
+    assert "sample 0001 sample 2" in refusal(root)
+
+
+@pytest.mark.parametrize("sweeps", [False, True])
+@pytest.mark.parametrize("token", [IMAGE, SWEEP])
+def test_a_sensors_records_out_of_order_are_refused_naming_one(root, token, sweeps):
+    edit(root, "sample_data", lambda rows: row(rows, token).update(timestamp=START_US - 10 * KEY_FRAME_US))
+    assert f"sample_data {token}" in refusal(root, sweeps=sweeps)
+
+
+@pytest.mark.parametrize("change", [{"timestamp": START_US}, {"next": ""}])
+def test_an_image_between_key_frames_out_of_order_or_at_the_end_of_a_chain_is_refused_naming_it(root, change):
+    edit(root, "sample_data", lambda rows: row(rows, BETWEEN).update(change))
+    assert f"sample_data {BETWEEN}" in refusal(root)
+
+
+@pytest.mark.parametrize(
+    ("table", "token", "key"),
+    [("sample_data", IMAGE, "ego_pose_token"), ("sample_data", IMAGE, "next"), ("sample", SAMPLE, "next")],
+)
+def test_a_token_without_a_row_is_refused_naming_it(root, table, token, key):
+    edit(root, table, lambda rows: row(rows, token).update({key: "nowhere"}))
+    assert "nowhere" in refusal(root)
 
 
 def test_samples_outside_of_the_chain_are_refused_naming_one(root):

@@ -8,7 +8,6 @@ from random import Random
 
 import numpy as np
 import pytest
-from helpers.drives import World, write_world
 from helpers.mutations import CHANCE, fresh, likely, mutate_bytes, mutate_table, some_bytes
 from helpers.table_files import VERSION, copy_of, extracted, time_limit
 from hypothesis import given, settings
@@ -23,11 +22,6 @@ from drivesplat.settings.masks import MaskJob
 
 USED = [table for table in TABLES if table not in ("attribute", "visibility")]
 LARGE = ["sample", "sample_data", "ego_pose", "calibrated_sensor", "sample_annotation"]
-
-
-@pytest.fixture(scope="module")
-def small_root(tmp_path_factory) -> Path:
-    return write_world(tmp_path_factory.mktemp("small"), World(key_frames=3, width=48, height=27))
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,8 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.nuscenes import scene_tables
 from drivesplat.readers.nuscenes.scene_tables import index_tables, read_scene_tables, rows, scene_file
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 VERSION, SCENES = "v1.0-mini", ("0001", "0002", "0003")
 
 

@@ -25,6 +25,8 @@ from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.masks import MaskJob
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 VERSIONS = ("v2", "v1")
 WRITERS = {"v2": write_v2, "v1": write_v1}
 

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers import drives
-from helpers.drives import World, write_world
 from helpers.table_files import time_limit
 from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
 from helpers.waymo_files import tfrecord, write_v1, write_v2
@@ -25,15 +24,16 @@ from drivesplat.readers.waymo.layout import camera_names, find_root, segment_fil
 from drivesplat.readers.waymo.tfrecord import masked_crc
 from drivesplat.scene.scene import Scene
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 WRITERS = {"v2": write_v2, "v1": write_v1}
 V1_FILE = f"segment-{NAME}_with_camera_labels.tfrecord"
 OTHER = "1234567890123456789_900_000_920_000"
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory) -> Drive:
-    world = World(key_frames=3, width=48, height=27)
-    return tiny_drive(write_world(tmp_path_factory.mktemp("small"), world), world, lasers=(1, 2))[0]
+def drive(small_root) -> Drive:
+    return tiny_drive(small_root, drives.SMALL, lasers=(1, 2))[0]
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers import drives
-from helpers.drives import World, write_world
 from helpers.mutations import CHANCE, flip_bytes, fresh, mutate_bytes
 from helpers.table_files import time_limit
 from helpers.waymo_drive import NAME, Drive, tiny_drive
@@ -32,9 +31,8 @@ NUMBERS = [0.0, -1.0, 1e-30, 1e9, 1e30, 1e300, math.nan, math.inf, -math.inf]
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory) -> Drive:
-    world = World(key_frames=3, width=48, height=27)
-    whole = tiny_drive(write_world(tmp_path_factory.mktemp("small"), world), world, lasers=(1, 2))[0]
+def drive(small_root) -> Drive:
+    whole = tiny_drive(small_root, drives.SMALL, lasers=(1, 2))[0]
     return replace(whole, images=[image for image in whole.images if image.camera == 1])
 
 
