@@ -11,7 +11,7 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drives
 import hypothesis
 import pytest
 import torch
-from helpers.checked_types import check_types_of
+from helpers.checked_types import begin_test, check_types_of
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # asked for before Triton comes: its own library is kernels, too
@@ -42,6 +42,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         share += others[:room]
         others = others[room:]
     items[:] = [item for share in shares for item in share] + others
+
+
+def pytest_runtest_setup() -> None:
+    begin_test()
 
 
 @pytest.fixture(scope="module")

@@ -1,17 +1,61 @@
-"""The checks of types and shapes that the tests switch on, made once for each nested function."""
+"""The checks of types and shapes that the tests switch on: of the first calls of a function in each test, and made once
+for each nested function."""
 
 from collections.abc import Callable
+from functools import wraps
+from types import FunctionType
 from typing import Any
 
+import jaxtyping
 from beartype import beartype
-from jaxtyping import install_import_hook
 
+CHECKED_CALLS = 25
+"""Of each function in each test. Further calls, which are those of loops, would take a third of the suite's time."""
 _CHECKED: dict[tuple, Callable[..., Any]] = {}
+_calls: dict[int, int] = {}
+"""The calls in this test, by the id of the function's code, which nested functions share."""
 
 
 def check_types_of(package: str) -> None:
     """Checks arguments and results of all functions of a package that is not imported yet."""
-    install_import_hook(package, f"{__name__}.{checked.__name__}")
+    jaxtyping.install_import_hook(package, f"{__name__}.{checked.__name__}")
+    jaxtyping.jaxtyped = _in_first_calls(jaxtyping.jaxtyped)
+
+
+def begin_test() -> None:
+    """Calls count from here."""
+    _calls.clear()
+
+
+def _in_first_calls(jaxtyped: Callable) -> Callable:
+    """jaxtyping's decorator, whose functions check their first calls."""
+
+    def decorator(function: Any = None, *, typechecker: Any = None) -> Any:
+        if function is not None:  # used without arguments, as tests do
+            return jaxtyped(function, typechecker=typechecker)
+
+        def decorate(function: Any) -> Any:
+            if not isinstance(function, FunctionType):
+                return jaxtyped(function, typechecker=typechecker)
+            code = id(function.__code__)
+            if "<locals>" in function.__qualname__ and _calls.get(code, 0) >= CHECKED_CALLS:
+                return function
+            whole = jaxtyped(function, typechecker=typechecker)
+
+            @wraps(function)
+            def called(*args: Any, **kwargs: Any) -> Any:
+                __tracebackhide__ = True
+                count = _calls.get(code, 0)
+                if count >= CHECKED_CALLS:
+                    return function(*args, **kwargs)
+                _calls[code] = count + 1
+                return whole(*args, **kwargs)
+
+            return called
+
+        return decorate
+
+    return decorator
 
 
 def checked(signature: Callable[..., Any]) -> Callable[..., Any]:
