@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.classed import classed
-from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, Thing, World, cast, write_world
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, Thing, World, cast, scene_at, seconds_of, write_world
 from scipy.spatial import ConvexHull
 
 from drivesplat.scene.object_class import ObjectClass
