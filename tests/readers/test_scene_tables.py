@@ -2,13 +2,13 @@
 
 import json
 import os
-import shutil
 import tracemalloc
 from pathlib import Path
 
 import pytest
 from helpers import drives
 from helpers.drives import World, write_world
+from helpers.table_files import copy_of
 from nuscenes.nuscenes import NuScenes
 
 from drivesplat.errors import DatasetError, ResultError
@@ -24,13 +24,13 @@ VERSION, SCENES = "v1.0-mini", ("0001", "0002", "0003")
 @pytest.fixture(scope="module")
 def three_scenes(tmp_path_factory) -> Path:
     """A tiny dataset of three scenes, read only."""
-    return write_world(tmp_path_factory.mktemp("three"), World(scenes=SCENES))
+    return write_world(tmp_path_factory.mktemp("three"), World(scenes=SCENES, key_frames=5, width=48, height=27))
 
 
 @pytest.fixture
 def root(three_scenes, tmp_path) -> Path:
     """A copy of it that a test may change."""
-    return Path(shutil.copytree(three_scenes, tmp_path / "nuscenes"))
+    return copy_of(three_scenes, tmp_path / "nuscenes")
 
 
 def edit(root: Path, table: str, token: str, **changes) -> None:
