@@ -8,6 +8,7 @@ from random import Random
 
 import numpy as np
 import pytest
+from helpers.drives import uncompared
 from helpers.mutations import CHANCE, fresh, likely, mutate_bytes, mutate_table, some_bytes
 from helpers.table_files import VERSION, copy_of, extracted, time_limit
 from hypothesis import given, settings
@@ -77,7 +78,8 @@ def test_damaged_tables_are_refused_in_one_line_or_give_a_sound_scene(small_root
         root = copy_of(small_root, folder / "data")
         done = [mutate_table(random, root / VERSION / f"{random.choice(USED + 2 * LARGE)}.json")]
         try:
-            scene = extracted(root, on_missing=random.choice(["stop", "warn"]))
+            with uncompared(unless=likely(random, 3)):
+                scene = extracted(root, on_missing=random.choice(["stop", "warn"]))
         except DatasetError as error:
             one_line(error, done)
         else:

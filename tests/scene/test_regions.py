@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from helpers.classed import classed
 from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, Thing, World, cast, scene_at, seconds_of, write_world
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from drivesplat.scene.object_class import ObjectClass
@@ -30,10 +32,9 @@ def inside_by_crossing_number(polygon: np.ndarray, size: tuple[int, int]) -> np.
     return inside
 
 
-@pytest.mark.parametrize("seed", range(20))
-@pytest.mark.parametrize(("middle", "spread"), [((24, 16), 10), ((0, 0), 15), ((48, 30), 20), ((24, 16), 200)])
-def test_fill_selects_the_pixels_with_centres_in_the_polygon(seed, middle, spread):
-    points = np.random.default_rng(seed).normal(middle, spread, (8, 2))
+@given(st.integers(0, 2**32), st.sampled_from([((24, 16), 10), ((0, 0), 15), ((48, 30), 20), ((24, 16), 200)]))
+def test_fill_selects_the_pixels_with_centres_in_the_polygon(seed, place):
+    points = np.random.default_rng(seed).normal(*place, (8, 2))
     polygon = points[ConvexHull(points).vertices]
     for outline in (polygon, polygon[::-1]):
         np.testing.assert_array_equal(fill(outline, (48, 32)), inside_by_crossing_number(polygon, (48, 32)))
