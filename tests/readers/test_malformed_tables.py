@@ -118,9 +118,8 @@ def test_a_malformed_value_is_refused_naming_its_record(root, table, token, colu
     for value in values:
         edit(root, table, lambda rows, value=value: row(rows, token).update({column: value}))
         message = refusal(root)
-        assert re.search(
-            f"^.*{table} {token}.*{said}" if "token" in column else f"^{table} {token}.*{said}", message
-        ), value
+        assert re.search(f"{table} {token}.*{said}", message), value
+        assert "token" in column or message.startswith(f"{table} {token}"), value
         edit(root, table, lambda _: original)
 
 
@@ -245,7 +244,7 @@ def test_a_circle_of_images_is_refused_naming_a_record_of_it(root, back_to):
     assert refusal(root).startswith(f"sample_data {back_to}")
 
 
-@pytest.mark.parametrize("delay", [-KEY_FRAME_US, -2 * KEY_FRAME_US, -START_US])
+@pytest.mark.parametrize("delay", [-KEY_FRAME_US, -2 * KEY_FRAME_US])
 def test_key_frames_out_of_order_are_refused_naming_the_sample(root, delay):
     edit(root, "sample", lambda rows: row(rows, SAMPLE).update(timestamp=START_US + KEY_FRAME_US + delay))
     assert f"sample {SAMPLE}" in refusal(root)
