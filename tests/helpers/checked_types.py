@@ -28,32 +28,33 @@ def begin_test() -> None:
 
 
 def _in_first_calls(jaxtyped: Callable) -> Callable:
-    """jaxtyping's decorator, whose functions check their first calls."""
+    """jaxtyping's decorator, whose functions check their first calls. Others have letters of their own for lengths:
+    the library compares fields of records with such types, too."""
+    own_letters = jaxtyped("context")
 
     def decorator(function: Any = None, *, typechecker: Any = None) -> Any:
-        if function is not None:  # used without arguments, as tests do
+        if function is not None:
             return jaxtyped(function, typechecker=typechecker)
+        return lambda found: decorate(found, typechecker)
 
-        def decorate(function: Any) -> Any:
-            if not isinstance(function, FunctionType):
-                return jaxtyped(function, typechecker=typechecker)
-            code = id(function.__code__)
-            if "<locals>" in function.__qualname__ and _calls.get(code, 0) >= CHECKED_CALLS:
-                return function
-            whole = jaxtyped(function, typechecker=typechecker)
+    def decorate(function: Any, typechecker: Any) -> Any:
+        if not isinstance(function, FunctionType):
+            return jaxtyped(function, typechecker=typechecker)
+        code, whole = id(function.__code__), None
 
-            @wraps(function)
-            def called(*args: Any, **kwargs: Any) -> Any:
-                __tracebackhide__ = True
-                count = _calls.get(code, 0)
-                if count >= CHECKED_CALLS:
+        @wraps(function)
+        def called(*args: Any, **kwargs: Any) -> Any:
+            nonlocal whole
+            __tracebackhide__ = True
+            count = _calls.get(code, 0)
+            if count >= CHECKED_CALLS:
+                with own_letters:
                     return function(*args, **kwargs)
-                _calls[code] = count + 1
-                return whole(*args, **kwargs)
+            _calls[code] = count + 1
+            whole = whole or jaxtyped(function, typechecker=typechecker)
+            return whole(*args, **kwargs)
 
-            return called
-
-        return decorate
+        return called
 
     return decorator
 
