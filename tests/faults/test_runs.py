@@ -152,7 +152,7 @@ def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, targ
 @pytest.mark.parametrize(
     ("broken", "target", "words"),
     [
-        (EDITS.replace("at: 2", "at: soon"), (), ["edit 'stop', step 1 (stop)", "'at' is 'soon'"]),
+        (EDITS.replace("at: 2", "at: soon"), (), ["edit 'stop', step 2 (stop)", "'at' is 'soon'"]),
         (EDITS.replace("- remove", "- vanish"), ("edits/stop.mp4",), ["edit 'gone', step 1", "no step 'vanish'"]),
         (EDITS.replace("edits:", "edits"), ("train.json",), ["not YAML"]),
         (None, ("edits/stop.mp4",), ["cannot be read"]),
