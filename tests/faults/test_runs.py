@@ -299,6 +299,7 @@ def trained(finished_run, tmp_path_factory) -> WorkflowCopy:
         for path in (copy.folder / "results/0001" / method / ".digests").iterdir():
             if path.stem not in ("train.json", "checkpoint.npz"):
                 path.unlink()
+    assert copy.planned(*(f"results/0001/{method}/train.json" for method in TWO_METHODS)) == {}
     return copy
 
 
