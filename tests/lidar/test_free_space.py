@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.drives import CAMERA_AT, HELD_OUT, NOTHING_HELD_OUT, Thing, World, drive, scene_at, seconds_of, true_depths
 from helpers.records import write_invalid
-from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, drive, scene_at, seconds_of, true_depths
-from helpers.tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.array_file import write_arrays
