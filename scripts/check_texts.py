@@ -37,9 +37,8 @@ SECTIONS = "train|images|masks|lidar_seed|device|datasets|actors|extract"
 def forbidden_terms(root: Path) -> Iterator[str]:
     """Names and phrases of tests/forbidden_terms.txt that are used, each with its place."""
     lines = (root / "tests/forbidden_terms.txt").read_text(encoding="utf-8").splitlines()
-    listed = {
-        kind: [line.removeprefix(kind) for line in lines if line.startswith(kind)] for kind in ("name ", "phrase ")
-    }
+    name_patterns = [line.removeprefix("name ") for line in lines if line.startswith("name ")]
+    phrases = "|".join(re.escape(line.removeprefix("phrase ")) for line in lines if line.startswith("phrase "))
     unknown = [line for line in lines if line and not line.startswith(("#", "name ", "phrase "))]
     yield from (f"tests/forbidden_terms.txt: {line!r} is neither a name nor a phrase" for line in unknown)
     forbidden_name = re.compile("|".join(fnmatch.translate(name) for name in name_patterns))

@@ -6,6 +6,7 @@ shapes and textures, and coarse images that are compared with a tolerance.
 
 import hashlib
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -135,6 +136,6 @@ def present() -> dict:
 
 
 if __name__ == "__main__":
-    lists = json.dumps(present(), indent=1)
-    DIGESTS.write_text(lists + "\n")
-    print(lists)
+    text = re.sub(r"\n +(?=-?\d|\])", " ", json.dumps(present(), indent=1))  # a list of numbers on one line
+    DIGESTS.write_text(text + "\n")
+    print(text)
