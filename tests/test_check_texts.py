@@ -8,7 +8,7 @@ FILES = {
     "tests/forbidden_terms.txt": "# Terms\nname sheet*\nphrase held to\nname two_*\nsheet\n",
     "README.md": "# A title, here\n[here](#a-title-here) [absent](docs/absent.md) [far](https://x.y) [no](#titles)\n",
     "docs/troubleshooting.md": "### `no usable GPU: torch …; …`\n### `no usable abacus`\n### `masks.json`\n"
-    "`train.cap_max` `train.no_such` `train: {cap_max: 5}` `train: {cap_max: none}` `images.json`\n",
+    "`train.cap_max` `train.no_such` `train: {cap_max: 500}` `train: {cap_max: none}` `images.json`\n",
     "drivesplat/pages.py": 'sheets = f"no usable GPU: torch {1}; so on"\n\n\ndef f(x):\n    """Held\n    to it."""\n'
     "    x.two_sided = 1  # not  held\n",
 }  # fmt: skip
