@@ -85,6 +85,15 @@ def test_rays_without_a_hit_show_the_sky(elevation):
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
 
 
+def test_by_day_clouds_whiten_some_of_the_sky():
+    camera = camera_of(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), np.eye(4), 41, 41)
+    snapshot = at_rest([floor(-100.0)])
+    clear, cloudy = (render(snapshot, DARK._replace(clouds=c), camera, 1).radiance for c in (0.0, 0.8))
+    changed = np.abs(clear - cloudy).max(axis=2) > 0.01
+    assert 0.05 < changed.mean() < 0.95
+    assert (cloudy[changed].std(axis=1) < clear[changed].std(axis=1)).all()
+
+
 def test_a_street_lamp_follows_the_inverse_square_law():
     lamps = np.array([[0.0, 0.0, 6.0]])
     night = lamplight(lamps, np.eye(4))._replace(headlight=0.0)
