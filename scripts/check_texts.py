@@ -4,7 +4,7 @@ documentation. `make lint` runs it:
     python -m scripts.check_texts
 
 - Names and phrases of tests/forbidden_terms.txt, in code, comments, docstrings, strings and pages.
-- Links of README.md and docs/*.md to files and headings of the repository.
+- Links of the pages, docs/*.md among them, to files and headings of the repository.
 - In docs/troubleshooting.md: messages quoted in headings, which one string of drivesplat/ has to contain; settings to
   copy, which have to be valid; settings named in the text, which have to exist.
 """
@@ -29,6 +29,7 @@ PYTHON = ("drivesplat", "benchmarks", "examples", "workflow_scripts", "scripts")
 TEXTS = (
     "README.md", "Makefile", "config.yaml", "docs/*.md", "report/*.rst", "Snakefile", "rules/*.smk", "scripts/*.sh",
 )  # fmt: skip
+LINKING = ("README.md", "CHANGELOG.md", "THIRD_PARTY_NOTICES.md", "docs/*.md", "archive/*.md")
 FIELDS = ("id", "attr", "name", "arg", "asname")
 """Of a syntax tree's node: where it holds a name."""
 SECTIONS = "train|images|masks|lidar_seed|device|datasets|actors|extract"
@@ -75,8 +76,8 @@ def prose(source: str, tree: ast.AST) -> Iterator[str]:
 
 
 def broken_links(root: Path) -> Iterator[str]:
-    """Links of README.md and docs/ to files or headings that do not exist."""
-    for page in [root / "README.md", *sorted((root / "docs").glob("*.md"))]:
+    """Links of the pages to files or headings that do not exist."""
+    for page in [page for pattern in LINKING for page in sorted(root.glob(pattern))]:
         for link in sorted(set(re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")))):
             file, _, heading = link.partition("#")
             target = page.parent / file if file else page
