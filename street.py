@@ -2,31 +2,29 @@
 
     snakemake --cores 2 --configfile presets/demo.yaml -- results/demo/metrics.json  # makes the files read here
     python street.py results/demo --iterations 800 --cap-max 40000 --max-scale 0.1  # the demo's settings; minutes
-    python street.py results/0061 --json street.json  # a recorded drive, on a GPU
 
 After Street Gaussians (Yan et al. 2024, arXiv 2401.01339). What a camera sees at a time consists of
     background  static Gaussians in the world, at first one for each coloured LiDAR point (`Part`);
-    actors      for each moving vehicle Gaussians in the frame of its box, which its track places in the world (`Actors`);
+    actors      Gaussians of moving vehicles in the frames of their boxes, which tracks place in the world (`Actors`);
     sky         a cube map behind both (`Sky`).
-`Street.render` shows them, `losses` compares that with a recorded image and its LiDAR depth, `train` learns by Adam and
-densifies by MCMC (`Part.densify`), `evaluate` measures static and moving pixels of held-out images. World: metres, z up.
-Cameras: OpenCV axes. Quaternions: w, x, y, z. Shapes: n Gaussians, a actors with m annotations in all.
+`Street.render` shows them, `losses` compares that with an image and its LiDAR depth, `train` learns by Adam and MCMC
+(`Part.densify`), `evaluate` measures static and moving pixels of held-out images. World: metres, z up. Cameras: OpenCV
+axes. Quaternions: w, x, y, z. Shapes: n Gaussians, a actors with m annotations in all.
 
 The rest of the repository makes this fast, exact and measured; a test compares its rule `train` with this file. It adds
 reduced images at first, rolling shutters, exposures of several cameras, the ground that LiDAR shows, colours where no
 image looks, further parts (people who walk, drives without boxes), LiDAR scans, and resuming.
 """
 
-import argparse
 import json
 import math
 import pickle
 import time
+from argparse import ArgumentParser, Namespace
 from collections import namedtuple
-from dataclasses import dataclass, fields
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -44,79 +42,46 @@ from drivesplat.scene.images import read_image
 from drivesplat.scene.masks import read_labels, read_sky_mask
 from drivesplat.scene.regions import LABELS, REGIONS
 
-REFINED = (0.0167, 0.833)  # fractions of the iterations between which Gaussians are relocated and added
-DEAD = 0.005  # opacity up to which a Gaussian is relocated
-FADED = math.log(1e-4)  # logit of the opacity of what shall be relocated
-LEARNING_RATES = {  # that of means is in units of the extent of their part, and decays to a hundredth
+LEARNING_RATES = {  # of means in units of the extent of their part; it decays to a hundredth
     "means": 1.6e-4, "scales": 1e-2, "quats": 2e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4,
     "translation": 1e-3, "yaw": 5e-4, "texels": 1e-2,
 }  # fmt: skip
-SH_C0 = 0.28209479177387814  # the spherical harmonic of degree 0; those of degree 1 are multiples of -y, z, -x
-MOVING, STATIC, EGO = REGIONS["moving_vehicle"], REGIONS["static"], LABELS["own_car"]
+Adam = partial(torch.optim.Adam, eps=1e-15, fused=True)
+DEAD, FADED = 0.005, math.log(1e-4 / (1.0 - 1e-4))  # opacity up to which Gaussians are relocated; a logit below it
+Gaussians = namedtuple("Gaussians", "means quats scales opacities sh")
+"""In the world: (n, 3) metres, (n, 4), (n, 3) standard deviations in metres, (n,) in [0, 1], and spherical harmonics of
+RGB (n, 4, 3): one of degree 0 and three of degree 1, which are multiples of -y, z and -x."""
+Picture = namedtuple("Picture", "image alpha depth actors_alpha gaussians")
+"""(h, w, 3) with the sky, (h, w) of all Gaussians, (h, w) metres, (h, w) of actors alone or None, and `Gaussians`."""
+View = namedtuple("View", "K camera_to_world pixels sky ego static moving dynamic lidar_pixels lidar_depth time")
+"""An image: (3, 3), with the centre of the first pixel at (0.5, 0.5); (4, 4); (h, w, 3) uint8; masks (h, w) of the sky,
+the ego vehicle, what is static, moving vehicles, these and moving people; of k pixels that LiDAR measured row-major
+indices (k,) and depth (k,) in metres along the optical axis; seconds since the first image."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    iterations: int = 7_000
-    seed: int = 0
-    cap_max: int = 1_500_000  # static Gaussians, at most
-    pixels_per_gaussian: float = 20.0  # training pixels, at least: more Gaussians overfit single images
-    dropout: float = 0.2  # share of static Gaussians that an iteration leaves out: no surface may depend on one alone
-    max_scale: float = 0.0  # of Gaussians in an image, as a fraction of their distance; 0: no limit
-
-
-class View(NamedTuple):
-    """An image: its camera, its time in seconds since the first one, and what supervises a rendering of it."""
-
-    K: Tensor  # (3, 3), the centre of the first pixel at (0.5, 0.5)
-    camera_to_world: Tensor  # (4, 4)
-    world_to_camera: Tensor  # (4, 4)
-    pixels: Tensor  # (h, w, 3) uint8
-    labels: Tensor  # (h, w) uint8: what a pixel shows by the annotated boxes, a value of LABELS
-    sky: Tensor  # (h, w) bool
-    lidar_pixels: Tensor  # (k,) row-major indices of pixels that LiDAR measured; none in held-out images
-    lidar_depth: Tensor  # (k,) metres along the optical axis
-    time: float
-
-    def rays(self) -> Tensor:
-        """The directions (h, w, 3) in the world, of any length, in which the pixels look."""
-        x, y = (torch.arange(count, device=self.K.device) + 0.5 for count in reversed(self.labels.shape))
-        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-        in_camera = F.pad((pixels - self.K[:2, 2]) / self.K.diagonal()[:2], (0, 1), value=1.0)
-        return in_camera @ self.camera_to_world[:3, :3].T
-
-
-def read_views(folder: Path, record: dict[str, Any], images: list[int], device: torch.device) -> list[View]:
-    """Images of parser.pkl by number, with their masks and LiDAR depth. Pixels of the ego vehicle have no depth."""
-    depths, views = read_lidar_depth(folder / "lidar_depth.npz").images, []
+def read_views(folder: Path, record: dict, images: np.ndarray, device: torch.device) -> list[View]:
+    """Images of parser.pkl by number. Held-out ones have no LiDAR depth."""
+    depths, moving, views = read_lidar_depth(folder / "lidar_depth.npz").images, REGIONS["moving_vehicle"], []
     for i in images:
         camera, size = record["camera_names"][record["camera_indices"][i]], tuple(record["image_sizes"][i].tolist())
         of_image = folder / "masks", camera, int(record["timestamps"][i]), size
-        labels, pose, lidar = read_labels(*of_image), record["camtoworlds"][i], depths[i]
-        seen = labels[lidar.rows, lidar.columns] != EGO
-        cameras = [np.float32(matrix) for matrix in (record["Ks"][i], pose, np.linalg.inv(pose))]
-        shown = [read_image(record["image_paths"][i], size), labels, read_sky_mask(*of_image)]
-        measured = [lidar.rows[seen].astype(np.int64) * size[0] + lidar.columns[seen], np.float32(lidar.depth[seen])]
-        tensors = (torch.tensor(values, device=device) for values in (*cameras, *shown, *measured))
+        labels, lidar = read_labels(*of_image), depths[i]
+        regions = ("own_car",), REGIONS["static"], moving, moving + REGIONS["moving_human"]
+        masks = [np.isin(labels, [LABELS[name] for name in names]) for names in regions]
+        seen = ~masks[0][lidar.rows, lidar.columns]
+        measured = (lidar.rows.astype(np.int64) * size[0] + lidar.columns)[seen], np.float32(lidar.depth[seen])
+        cameras = np.float32(record["Ks"][i]), np.float32(record["camtoworlds"][i])
+        shown = read_image(record["image_paths"][i], size), read_sky_mask(*of_image)
+        tensors = (torch.tensor(values, device=device) for values in (*cameras, *shown, *masks, *measured))
         views.append(View(*tensors, time=float(record["timestamps"][i] - record["timestamps"].min()) * 1e-6))
     return views
 
 
-class Gaussians(NamedTuple):
-    """Gaussians in the world, as the rasterizer takes them."""
-
-    means: Tensor  # (n, 3) metres
-    quats: Tensor  # (n, 4)
-    scales: Tensor  # (n, 3) standard deviations in metres
-    opacities: Tensor  # (n,) in [0, 1]
-    sh: Tensor  # (n, 4, 3) spherical harmonics of red, green and blue
-
-
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
     """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
-    w, axis = quats[..., :1], quats[..., 1:].expand(vectors.shape)
+    axis = quats[..., 1:].expand(vectors.shape)
     twice = 2.0 * torch.linalg.cross(axis, vectors)
-    return vectors + w * twice + torch.linalg.cross(axis, twice)
+    return vectors + quats[..., :1] * twice + torch.linalg.cross(axis, twice)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
@@ -126,35 +91,31 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def seeded(points: np.ndarray, colors: np.ndarray, limit: int) -> dict[str, Tensor]:
-    """Parameters of a Gaussian at each of the points (k, 3), of at most `limit`, with its colour (uint8): smaller than
-    the distance to its neighbours, and faint."""
-    if len(points) > limit:
-        kept = np.sort(np.random.default_rng(0).choice(len(points), limit, replace=False))
-        points, colors = points[kept], colors[kept]
-    to_neighbours, count = cKDTree(points).query(points, k=4, workers=-1)[0][:, 1:], len(points)
+    """Parameters of a faint Gaussian at each of the points (k, 3), of at most `limit`, with its colour (k, 3) uint8."""
+    kept = np.sort(np.random.default_rng(0).choice(len(points), min(limit, len(points)), replace=False))
+    points, colors, count = points[kept], colors[kept], len(kept)
+    to_neighbours = cKDTree(points).query(points, k=4, workers=-1)[0][:, 1:]
     scales = np.log((0.4 * np.sqrt((to_neighbours**2).mean(axis=1))).clip(1e-4))
     return {
         "means": torch.from_numpy(points).float(),
         "scales": torch.from_numpy(scales).float()[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         "opacities": torch.full((count,), math.log(0.1 / 0.9)),
-        "sh0": (torch.from_numpy(colors / 255.0).float()[:, None] - 0.5) / SH_C0,
+        "sh0": (torch.from_numpy(colors / 255.0).float()[:, None] - 0.5) / 0.28209479177387814,
         "shN": torch.zeros(count, 3, 3),
     }
 
 
 class Part:
-    """Gaussians that are learned and densified together, spread over `extent` metres, at most `cap` of them. As it is:
-    the background.
+    """Gaussians that are learned and densified together, at most `cap` of them over `extent` metres: the background.
+    `params` have gsplat's names: `scales` are logarithms, `opacities` logits, `owner` is the index of an actor."""
 
-    `params` has a row for each, under gsplat's names: `scales` are logarithms, `opacities` logits, and `owner` is the
-    index of an actor. Each has an Adam of its own.
-    """
-
-    def __init__(self, params: dict[str, Tensor], extent: float, cap: int, s: Settings, device: torch.device):
+    def __init__(self, params: dict[str, Tensor], extent: float, cap: int, args: Namespace, device: torch.device):
         self.params = {name: nn.Parameter(v.to(device), v.is_floating_point()) for name, v in params.items()}
-        self.cap, self.s, self.lr_means = cap, s, extent * LEARNING_RATES["means"]
-        self.adam = {name: adam(values, name) for name, values in self.params.items() if name != "owner"}
+        self.cap, self.args, self.lr_means = cap, args, extent * LEARNING_RATES["means"]
+        self.adam = {
+            name: Adam([values], LEARNING_RATES[name]) for name, values in self.params.items() if name != "owner"
+        }
 
     def at(self, time: float) -> Gaussians:
         """The Gaussians in the world at a time in seconds."""
@@ -162,7 +123,6 @@ class Part:
         sh = torch.cat([p["sh0"], p["shN"]], dim=1)
         return Gaussians(p["means"], p["quats"], torch.exp(p["scales"]), torch.sigmoid(p["opacities"]), sh)
 
-    @torch.no_grad()
     def fade(self, rows: Tensor) -> None:
         """Makes Gaussians transparent. Densification then relocates them."""
         self.params["opacities"].masked_fill_(rows & (self.params["opacities"] > FADED), FADED)
@@ -171,7 +131,7 @@ class Part:
     def densify(self, step: int) -> None:
         """3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024, arXiv 2404.09591): now and then
         dead Gaussians are relocated to others, drawn by opacity, and copies of others are added; always all explore."""
-        p, (start, stop) = self.params, (int(fraction * self.s.iterations) for fraction in REFINED)
+        p, (start, stop) = self.params, (int(fraction * self.args.iterations) for fraction in (0.0167, 0.833))
         if start < step < stop and step % 100 == 0:
             opacities = torch.sigmoid(p["opacities"])
             dead, alive = (rows.nonzero()[:, 0] for rows in (opacities <= DEAD, opacities > DEAD))
@@ -180,9 +140,8 @@ class Part:
             if more := max(0, min(self.cap, int(1.05 * len(opacities))) - len(opacities)):
                 self.copy(torch.multinomial(torch.sigmoid(p["opacities"]), more, replacement=True))
         # equation 8: noise in the shape of a Gaussian, Σ @ noise, for those that are nearly transparent
-        strength = self.adam["means"].param_groups[0]["lr"] * 5e5
-        noise = strength * torch.sigmoid(100.0 * (0.005 - torch.sigmoid(p["opacities"])))[:, None]
-        quats = F.normalize(p["quats"], dim=1)
+        rate, quats = self.adam["means"].param_groups[0]["lr"], F.normalize(p["quats"], dim=1)
+        noise = 5e5 * rate * torch.sigmoid(100.0 * (0.005 - torch.sigmoid(p["opacities"])))[:, None]
         along_axes = rotate(quats * quats.new_tensor([1, -1, -1, -1]), noise * torch.randn_like(p["means"]))
         p["means"] += rotate(quats, along_axes * torch.exp(2.0 * p["scales"]))
 
@@ -190,7 +149,10 @@ class Part:
         """Copies Gaussians over those in the rows `target`, or adds the copies. N coincident ones look as one did
         before by equation 9; its sum of binomial coefficients over i is a binomial coefficient, too."""
         p, copies = self.params, (torch.bincount(source)[source] + 1).clamp(max=51)[:, None].double()
-        before, k = torch.sigmoid(p["opacities"][source]).double()[:, None], torch.arange(1, 52, device=source.device)
+        before, k = (
+            torch.sigmoid(p["opacities"][source]).double()[:, None],
+            torch.arange(1.0, 52.0, device=source.device).double(),
+        )
         after = 1.0 - (1.0 - before) ** (1.0 / copies)
         of_n = torch.lgamma(copies + 1) - torch.lgamma(k + 1) - torch.lgamma((copies - k).clamp(min=0) + 1)
         series = (-1.0) ** (k - 1) * after**k / torch.sqrt(k) * torch.exp(of_n) * (k <= copies)
@@ -208,19 +170,14 @@ class Part:
                 self.adam[name].state[p[name]], self.adam[name].param_groups[0]["params"] = state, [p[name]]
 
 
-def adam(parameter: Tensor, name: str) -> torch.optim.Adam:
-    return torch.optim.Adam([parameter], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
-
-
 class Actors(Part):
     """Moving vehicles, their Gaussians in the frames of their boxes: x forward, y left, z up, origin at the centre.
 
     A spline through the annotated poses of its track places a vehicle. Corrections of the annotations are learned,
-    `translation` (m, 3) in metres and `yaw` (m,) in radians, and interpolated by the same spline.
-    """
+    `translation` (m, 3) in metres and `yaw` (m,) in radians, and interpolated by the same spline."""
 
-    def __init__(self, actors: list[ActorRecord], s: Settings, device: torch.device):
-        limits = [max(500, int(actor.pixels / s.pixels_per_gaussian)) for actor in actors]
+    def __init__(self, actors: list[ActorRecord], args: Namespace, device: torch.device):
+        limits = [max(500, int(actor.pixels / 20.0)) for actor in actors]
         cap = min(200_000, sum(limits))
         shares = [max(4, limit * cap // sum(limits)) for limit in limits]
         sets = [seeded(actor.points, actor.points_rgb, n) for actor, n in zip(actors, shares, strict=True)]
@@ -229,16 +186,13 @@ class Actors(Part):
             params[name] = F.pad(params[name][:, None], (0, 0, 0, 0, 0, 4))
         params["owner"] = torch.repeat_interleave(torch.tensor([len(own["means"]) for own in sets]))
         sizes = np.stack([actor.size for actor in actors])
-        super().__init__(params, float(np.median(np.linalg.norm(sizes, axis=1))), cap, s, device)
-        self.reach = torch.from_numpy(0.5 * sizes + 0.1).float().to(device)  # (a, 3) metres from the centre
+        super().__init__(params, float(np.median(np.linalg.norm(sizes, axis=1))), cap, args, device)
+        self.reach = torch.from_numpy(0.5 * sizes + 0.1).float().to(device)  # (a, 3) metres: Gaussians lie within
         self.motions, self.states = [actor.motion for actor in actors], {}
-        starts = np.cumsum([0, *(len(motion.times) for motion in self.motions)])
-        self.translation = nn.Parameter(torch.zeros(starts[-1], 3, device=device))
-        self.yaw = nn.Parameter(torch.zeros(starts[-1], device=device))
-        self.adam |= {name: adam(getattr(self, name), name) for name in ("translation", "yaw")}
-        runs = [(start, *run) for start, motion in zip(starts, self.motions, strict=False) for run in motion.runs]
-        inner = [start + i for start, first, last in runs for i in range(first + 1, last)]
-        self.inner = torch.tensor(inner, dtype=torch.long, device=device)  # annotations between two others
+        self.runs = [last + 1 - first for motion in self.motions for first, last in motion.runs]  # without gaps
+        zeros = (torch.zeros(sum(self.runs), *row, device=device) for row in ((3,), ()))
+        self.translation, self.yaw = map(nn.Parameter, zeros)
+        self.adam |= {name: Adam([getattr(self, name)], LEARNING_RATES[name]) for name in ("translation", "yaw")}
 
     def annotated(self, time: float) -> list[Tensor]:
         """Of each actor: its pose by annotations as quaternion (a, 4) and translation (a, 3), their weights in it
@@ -270,32 +224,33 @@ class Actors(Part):
         return Gaussians(means, quats, torch.exp(p["scales"]), opacities, sh)
 
     def penalty(self) -> Tensor:
-        """Corrections shall be small, in units of the expected errors of annotations, and smooth along a track: they
-        then hold for held-out times, too."""
+        """Corrections shall be small for the expected errors of annotations, and smooth: they hold between images."""
         off = torch.cat([self.translation / 0.1, self.yaw[:, None] / 0.03], dim=1)
-        bend = off[self.inner - 1] - 2.0 * off[self.inner] + off[self.inner + 1]
+        bend = torch.cat([run[:-2] - 2.0 * run[1:-1] + run[2:] for run in off.split(self.runs)])
         return sum(0.001 * values.square().sum() / max(1, len(values)) for values in (off, bend))
 
-    @torch.no_grad()
     def confine(self) -> None:
         """Fades Gaussians with centres outside their box, and shrinks those that are longer than it."""
         p, reach = self.params, self.reach[self.params["owner"]]
         self.fade((p["means"].abs() > reach).any(dim=1))
-        axes = torch.diag_embed(torch.exp(p["scales"]))
-        spread = rotate(F.normalize(p["quats"], dim=1)[:, None], axes).norm(dim=1)  # along the axes of the box
-        p["scales"] -= (spread / (0.6 * reach)).amax(dim=1, keepdim=True).clamp(min=1.0).log()
+        in_box = rotate(F.normalize(p["quats"], dim=1)[:, None], torch.diag_embed(torch.exp(p["scales"])))
+        p["scales"] -= (in_box.norm(dim=1) / (0.6 * reach)).amax(dim=1, keepdim=True).clamp(min=1.0).log()
 
 
 class Sky:
-    """A cube map of colours (as logits)."""
+    """A cube map of colours, as logits; its faces are +x, -x, +y, -y, +z and -z."""
 
     def __init__(self, color: Tensor):
-        logits = torch.logit(color.clamp(0.02, 0.98)).reshape(1, 3, 1, 1, 1)
-        self.texels = nn.Parameter(logits.repeat(1, 1, 6, 128, 128))  # faces +x, -x, +y, -y, +z, -z
-        self.adam = {"texels": adam(self.texels, "texels")}
+        logits = torch.logit(color.clamp(0.02, 0.98))
+        self.texels = nn.Parameter(logits.reshape(1, 3, 1, 1, 1).repeat(1, 1, 6, 128, 128))
+        self.adam = {"texels": Adam([self.texels], LEARNING_RATES["texels"])}
 
-    def colors(self, rays: Tensor) -> Tensor:
-        """The colours (h, w, 3) along directions (h, w, 3)."""
+    def seen_in(self, view: View) -> Tensor:
+        """The colours (h, w, 3) that a view sees."""
+        x, y = (torch.arange(count, device=view.K.device) + 0.5 for count in reversed(view.sky.shape))
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+        in_camera = F.pad((pixels - view.K[:2, 2]) / view.K.diagonal()[:2], (0, 1), value=1.0)
+        rays = in_camera @ view.camera_to_world[:3, :3].T
         axis = rays.abs().argmax(dim=-1, keepdim=True)
         along = rays.gather(-1, axis)
         u, v = (rays.gather(-1, (axis + i) % 3) / along.abs() for i in (1, 2))
@@ -305,20 +260,18 @@ class Sky:
         return torch.sigmoid(logits[0, :, 0].permute(1, 2, 0))
 
 
-Picture = namedtuple("Picture", "image alpha depth actors_alpha gaussians")
-"""(h, w, 3) with the sky, (h, w) of all Gaussians, (h, w) metres, (h, w) of actors alone or None, and `Gaussians`."""
-
-
 class Street:
     """The model: `parts`, the background and, where anything moves, the actors; `sky`."""
 
-    def __init__(self, record: dict[str, Any], actors: list[ActorRecord], views: list[View], s: Settings):
-        device, pixels = views[0].K.device, sum(view.labels.numel() for view in views)
-        cap = min(s.cap_max, int(pixels / s.pixels_per_gaussian))
+    def __init__(self, record: dict, actors: list[ActorRecord], views: list[View], args: Namespace):
+        device, pixels = views[0].K.device, sum(view.sky.numel() for view in views)
+        cap = min(args.cap_max, int(pixels / 20.0))
         seed = seeded(record["points"], record["points_rgb"], cap)
-        self.s, self.parts = s, [Part(seed, record["scene_scale"], cap, s, device)]
-        self.parts += [Actors(actors, s, device)] if actors else []
-        self.sky = Sky(torch.cat([view.pixels[view.sky] for view in views]).double().mean(dim=0).float() / 255.0)
+        self.args, self.parts = args, [Part(seed, record["scene_scale"], cap, args, device)]
+        self.parts += [Actors(actors, args, device)] if actors else []
+        self.sky = Sky(
+            torch.cat([view.pixels[view.sky] for view in views]).double().mean(dim=0).float().nan_to_num(128.0) / 255.0
+        )
         self.optimizers = [optimizer for it in (*self.parts, self.sky) for optimizer in it.adam.values()]
         self.path = [view.camera_to_world[:3, 3] for view in views]
 
@@ -326,38 +279,37 @@ class Street:
         """What a view shows, by spherical harmonics up to a degree, without a random share of the static Gaussians."""
         sets = [part.at(view.time) for part in self.parts]
         if dropout:
-            kept = torch.rand_like(sets[0].opacities) >= dropout
-            sets[0] = sets[0]._replace(opacities=sets[0].opacities * kept)
+            opacities = sets[0].opacities
+            sets[0] = sets[0]._replace(opacities=opacities * (torch.rand_like(opacities) >= dropout))
         shown = Gaussians(*(torch.cat(values) for values in zip(*sets, strict=True)))
         seen = self.splat(shown, shown.sh, view, sh_degree=sh_degree, with_depth=True)
-        image = seen.image[0] + (1.0 - seen.alpha[0]) * self.sky.colors(view.rays())
+        image = seen.image[0] + (1.0 - seen.alpha[0]) * self.sky.seen_in(view)
         alone = [self.splat(own, own.means[:, :1].detach(), view).alpha[0, ..., 0] for own in sets[1:]]
         return Picture(image, seen.alpha[0, ..., 0], seen.depth[0, ..., 0], alone[0] if alone else None, shown)
 
-    def splat(self, g: Gaussians, colors: Tensor, view: View, **options: Any) -> Rendering:
+    def splat(self, g: Gaussians, colors: Tensor, view: View, **options: int | bool) -> Rendering:
         """EWA splatting. It linearises the projection: what is large for its distance would look wrong."""
         distances = (g.means.detach() - view.camera_to_world[:3, 3]).norm(dim=1, keepdim=True)
-        scales = torch.minimum(g.scales, self.s.max_scale * distances) if self.s.max_scale else g.scales
-        camera = view.world_to_camera[None], view.K[None], view.labels.shape[1], view.labels.shape[0]
+        scales = torch.minimum(g.scales, self.args.max_scale * distances) if self.args.max_scale else g.scales
+        camera = torch.linalg.inv(view.camera_to_world)[None], view.K[None], view.sky.shape[1], view.sky.shape[0]
         return rasterize(g.means, g.quats, scales, g.opacities, colors, *camera, **options)
 
     @torch.no_grad()
-    def tidy(self, actors: bool = True, path: bool = True) -> None:
-        """Fades Gaussians of actors outside their boxes, and static ones less than a metre from the path of the
-        cameras: the vehicle drove there."""
-        if actors and len(self.parts) > 1:
+    def tidy(self) -> None:
+        """Fades actors outside their boxes, and what is static within a metre of the path that the vehicle drove."""
+        if len(self.parts) > 1:
             self.parts[1].confine()
         points = self.parts[0].params["means"]
-        for start, end in pairwise(self.path) if path else ():
-            along = (end - start) * ((end - start).norm() < 15.0)  # beyond, images are missing
+        for start, end in pairwise(self.path):
+            along = (end - start) * ((end - start).norm() < 15.0)  # farther apart, images are missing
             fraction = ((points - start) @ along / along.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0)
             self.parts[0].fade((points - start - fraction[:, None] * along).norm(dim=1) < 1.0)
 
 
 def losses(picture: Picture, view: View, parts: list[Part]) -> dict[str, Tensor]:
     """The weighted terms of the loss. Pixels that show the ego vehicle have no effect."""
-    ego, target, g = view.labels == EGO, view.pixels.float() / 255.0, picture.gaussians
-    image, alpha = torch.where(ego[..., None], target, picture.image), picture.alpha.masked_fill(ego, 1.0)
+    target, g = view.pixels.float() / 255.0, picture.gaussians
+    image, alpha = torch.where(view.ego[..., None], target, picture.image), picture.alpha.masked_fill(view.ego, 1.0)
     difference, opaque = (image - target).abs(), alpha.clamp(1e-4, 1.0 - 1e-4)
     terms = {
         "l1": 0.8 * difference.mean(),
@@ -370,90 +322,77 @@ def losses(picture: Picture, view: View, parts: list[Part]) -> dict[str, Tensor]
         off = (picture.depth.flatten()[view.lidar_pixels] - view.lidar_depth).abs()
         terms["depth"] = 0.01 * off.topk(max(1, len(off) * 95 // 100), largest=False).values.mean()
     if len(parts) > 1:
-        moving = mask_of(
-            view.labels, (*MOVING, *REGIONS["moving_human"])
-        )  # few pixels, to which L1 hardly pays attention
-        terms["dynamic"] = 0.1 * (difference.mean(dim=2) * moving).sum() / moving.sum().clamp(min=1)
-        o = picture.actors_alpha.masked_fill(ego, 1.0).clamp(1e-4, 1.0 - 1e-4)  # actors are opaque, or not there
+        moving = (difference.mean(dim=2) * view.dynamic).sum() / view.dynamic.sum().clamp(min=1)
+        terms["dynamic"] = 0.1 * moving  # these pixels are few: they hardly count in the mean of all
+        o = picture.actors_alpha.masked_fill(view.ego, 1.0).clamp(1e-4, 1.0 - 1e-4)  # actors are opaque, or not there
         terms["entropy"] = -0.005 * (o * o.log() + (1.0 - o) * (1.0 - o).log()).mean()
         terms["tracks"] = parts[1].penalty()
     return terms
 
 
-def mask_of(labels: Tensor, names: tuple[str, ...]) -> Tensor:
-    return torch.isin(labels, torch.tensor([LABELS[name] for name in names], device=labels.device))
-
-
 def train(model: Street, views: list[View], cameras: int) -> None:
     """Fits the model to images of so many cameras, each of which is shown once before any is shown again."""
-    s, parts, averages = model.s, model.parts, []
-    dropout = s.dropout * min(1.0, 20 * cameras / len(views))  # many images overfit less
-    torch.manual_seed(s.seed)
-    for step in range(s.iterations):
+    args, parts, sums, count = model.args, model.parts, [], 0
+    dropout = 0.2 * min(1.0, 20 * cameras / len(views))  # many images overfit less
+    torch.manual_seed(args.seed)
+    for step in range(args.iterations):
         epoch, place = divmod(step, len(views))
-        view = views[np.random.default_rng((s.seed, epoch)).permutation(len(views))[place]]
+        view = views[np.random.default_rng((args.seed, epoch)).permutation(len(views))[place]]
         for part in parts:
-            part.adam["means"].param_groups[0]["lr"] = part.lr_means * 0.01 ** (step / s.iterations)
-        sh_degree = min(step // max(1, int(0.0333 * s.iterations)), 1)  # at first colours are the same from all sides
+            part.adam["means"].param_groups[0]["lr"] = part.lr_means * 0.01 ** (step / args.iterations)
+        sh_degree = min(1, step // max(1, int(0.0333 * args.iterations)))  # 0: colours are the same from all sides
         terms = losses(model.render(view, sh_degree, dropout), view, parts)
         torch.stack(list(terms.values())).sum().backward()
         for optimizer in model.optimizers:
             optimizer.step()
             optimizer.zero_grad()
-        model.tidy(actors=step % 100 == 0, path=False)
         for part in parts:
             part.densify(step)
-        model.tidy(actors=False, path=(step + 1) % 100 == 0)
-        if step % 100 == 0:
-            counts = " + ".join(str(len(part.params["means"])) for part in parts)
-            print(f"{step}/{s.iterations}: loss {sum(map(float, terms.values())):.4f}, {counts} Gaussians", flush=True)
-        learned = [optimizer.param_groups[0]["params"][0].data for optimizer in model.optimizers]
-        if (
-            step >= int(0.9 * s.iterations) and (s.iterations - step - 1) % 5 == 0
-        ):  # the mean of the last tenth is better
-            averages.append([values.clone() for values in learned])  # (Izmailov et al. 2018, arXiv 1803.05407)
-    for values, *seen in zip(learned, *averages, strict=True):
-        values.copy_(torch.stack(seen).mean(dim=0))
-    model.tidy()  # in the mean, what was faded meanwhile is visible again
+        if (step + 1) % 100 == 0:
+            model.tidy()
+            counts, loss = [len(part.params["means"]) for part in parts], sum(term.item() for term in terms.values())
+            print(f"iteration {step + 1}: loss {loss:.4f}, {' + '.join(map(str, counts))} Gaussians", flush=True)
+        if step >= int(0.9 * args.iterations) and (args.iterations - step - 1) % 5 == 0:
+            learned, count = [one.param_groups[0]["params"][0].data for one in model.optimizers], count + 1
+            sums = [total + values for total, values in zip(sums or [0.0] * len(learned), learned, strict=True)]
+    for values, total in zip(learned, sums, strict=True):  # held-out images prefer the mean of the last iterations
+        values.copy_(total / count)  # (Izmailov et al. 2018, arXiv 1803.05407)
+    model.tidy()  # in the mean, what was faded meanwhile is visible
 
 
 @torch.no_grad()
 def evaluate(model: Street, views: list[View]) -> dict[str, float | None]:
-    """The PSNR (dB) over all static and all moving pixels of held-out images; None for fewer than 1000 of them."""
-    errors = {"static": [], "moving": []}
+    """The PSNR (dB) of a region over all its pixels in held-out images; None where these are fewer than 1000."""
+    errors: dict[str, list[Tensor]] = {"static": [], "moving": []}
     for view in views:
-        squared = (model.render(view).image.clamp(0.0, 1.0).double() - view.pixels / 255.0).square().mean(dim=2)
-        for region, names in (("static", STATIC), ("moving", MOVING)):
-            errors[region].append(squared[mask_of(view.labels, names)])
-    pooled = {region: torch.cat(found) for region, found in errors.items() if found}
-    return {region: -10.0 * math.log10(e.mean()) if len(e) >= 1000 else None for region, e in pooled.items()}
+        error = (model.render(view).image.clamp(0.0, 1.0) - view.pixels / 255.0).square().mean(dim=2).double()
+        errors = {region: [*found, error[getattr(view, region)]] for region, found in errors.items()}
+    pooled = {region: torch.cat(found) for region, found in errors.items()}
+    return {region: -10.0 * math.log10(all.mean()) if len(all) >= 1000 else None for region, all in pooled.items()}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Trains the method `street` on a prepared scene and measures it.")
+    parser = ArgumentParser(description="Trains the method `street` on a prepared scene and measures it.")
     parser.add_argument("folder", type=Path, help="a scene's results: results/demo")
+    parser.add_argument("--iterations", type=int, default=7_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cap-max", type=int, default=1_500_000, help="static Gaussians, at most")
+    parser.add_argument("--max-scale", type=float, default=0.0, help="of Gaussians in units of their distance")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--camera", default="CAM_FRONT", help="the camera whose held-out images are measured")
-    parser.add_argument("--json", type=Path, help="file to which the figures are added as a line")
-    for field in fields(Settings):
-        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
-    args, began = parser.parse_args(), time.monotonic()
-    s, folder = Settings(**{field.name: getattr(args, field.name) for field in fields(Settings)}), args.folder
-    record, device = pickle.loads((folder / "parser.pkl").read_bytes()), torch.device(args.device)
-    actors = [actor for actor in read_actors(folder / "actors.npz").actors if actor.part_in(("actors",))]
-    splits, cameras = record["splits"], record["camera_indices"]
-    views = read_views(folder, record, splits["train"], device)
-    model = Street(record, actors, views, s)
+    args = parser.parse_args()
+    record, device = pickle.loads((args.folder / "parser.pkl").read_bytes()), torch.device(args.device)
+    actors = [actor for actor in read_actors(args.folder / "actors.npz").actors if actor.part_in(("actors",))]
+    splits, cameras, began = record["splits"], record["camera_indices"], time.monotonic()
+    views = read_views(args.folder, record, splits["train"], device)
+    model = Street(record, actors, views, args)
     train(model, views, len(np.unique(cameras[splits["train"]])))
-    figures = {"iterations": s.iterations, "seed": s.seed, "seconds": round(time.monotonic() - began, 1)}
-    measured = record["is_key_frame"] & (cameras == record["camera_names"].index(args.camera))
+    figures = {"iterations": args.iterations, "seed": args.seed, "seconds": round(time.monotonic() - began, 1)}
+    measured = np.flatnonzero(record["is_key_frame"] & (cameras == record["camera_names"].index(args.camera)))
     for group in ("interpolation", "extrapolation"):
-        images = [i for i in splits[group] if measured[i]]
-        figures[group] = evaluate(model, read_views(folder, record, images, device))
-    line = json.dumps(figures)
-    print(line)
-    if args.json:
-        args.json.open("a").write(line + "\n")
+        images = np.intersect1d(splits[group], measured)
+        figures |= {group: evaluate(model, read_views(args.folder, record, images, device))}
+    print(json.dumps(figures))
 
 
 if __name__ == "__main__":
