@@ -2,6 +2,7 @@
 
     snakemake --cores 2 --configfile presets/demo.yaml -- results/demo/metrics.json  # makes the files read here
     python street.py results/demo --iterations 800 --cap-max 40000 --max-scale 0.1  # the demo's settings; minutes
+    python street.py results/0061  # a recorded drive with the workflow's defaults, on a GPU
 
 After Street Gaussians (Yan et al. 2024, arXiv 2401.01339). What a camera sees at a time consists of
     background  static Gaussians in the world, at first one for each coloured LiDAR point (`Part`);
@@ -9,10 +10,10 @@ After Street Gaussians (Yan et al. 2024, arXiv 2401.01339). What a camera sees a
     sky         a cube map behind both (`Sky`).
 `Street.render` shows them, `losses` compares that with an image and its LiDAR depth, `train` learns by Adam and MCMC
 (`Part.densify`), `evaluate` measures static and moving pixels of held-out images. World: metres, z up. Cameras: OpenCV
-axes. Quaternions: w, x, y, z. Shapes: n Gaussians, a actors with m annotations in all.
+axes. Quaternions: w, x, y, z. Shapes: n Gaussians, a actors with m annotations in all, images of h rows and w columns.
 
 The rest of the repository makes this fast, exact and measured; a test compares its rule `train` with this file. It adds
-reduced images at first, rolling shutters, exposures of several cameras, the ground that LiDAR shows, colours where no
+reduced images at first, rolling shutters, exposures of several cameras, losses of ground and horizon, colours where no
 image looks, further parts (people who walk, drives without boxes), LiDAR scans, and resuming.
 """
 
@@ -90,7 +91,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     return torch.cat([s * t - (v * w).sum(dim=-1, keepdim=True), s * w + t * v + torch.linalg.cross(v, w)], dim=-1)
 
 
-def seeded(points: np.ndarray, colors: np.ndarray, limit: int) -> dict[str, Tensor]:
+def init_params(points: np.ndarray, colors: np.ndarray, limit: int) -> dict[str, Tensor]:
     """Parameters of a faint Gaussian at each of the points (k, 3), of at most `limit`, with its colour (k, 3) uint8."""
     kept = np.sort(np.random.default_rng(0).choice(len(points), min(limit, len(points)), replace=False))
     points, colors, count = points[kept], colors[kept], len(kept)
@@ -180,7 +181,7 @@ class Actors(Part):
         limits = [max(500, int(actor.pixels / 20.0)) for actor in actors]
         cap = min(200_000, sum(limits))
         shares = [max(4, limit * cap // sum(limits)) for limit in limits]
-        sets = [seeded(actor.points, actor.points_rgb, n) for actor, n in zip(actors, shares, strict=True)]
+        sets = [init_params(actor.points, actor.points_rgb, n) for actor, n in zip(actors, shares, strict=True)]
         params = {name: torch.cat([own[name] for own in sets]) for name in sets[0]}
         for name in ("sh0", "shN"):  # (n, 5, k, 3): a Fourier series over time, at first its constant term alone
             params[name] = F.pad(params[name][:, None], (0, 0, 0, 0, 0, 4))
@@ -194,7 +195,7 @@ class Actors(Part):
         self.translation, self.yaw = map(nn.Parameter, zeros)
         self.adam |= {name: Adam([getattr(self, name)], LEARNING_RATES[name]) for name in ("translation", "yaw")}
 
-    def annotated(self, time: float) -> list[Tensor]:
+    def state_at(self, time: float) -> list[Tensor]:
         """Of each actor: its pose by annotations as quaternion (a, 4) and translation (a, 3), their weights in it
         (a, m), presence (a,), and cos(i π t / T) (a, 5), where t runs from 0 to T over its track."""
         if time not in self.states:
@@ -210,7 +211,7 @@ class Actors(Part):
 
     def at(self, time: float) -> Gaussians:
         """The Gaussians in the world. Those of an actor that is absent have opacity 0."""
-        quats, translations, weights, present, series = self.annotated(time)
+        quats, translations, weights, present, series = self.state_at(time)
         half, p = 0.5 * (weights @ self.yaw), self.params
         quats = product(quats, torch.stack([half.cos(), 0.0 * half, 0.0 * half, half.sin()], dim=1))
         of_actors = quats, translations + weights @ self.translation, present, series
@@ -245,7 +246,7 @@ class Sky:
         self.texels = nn.Parameter(logits.reshape(1, 3, 1, 1, 1).repeat(1, 1, 6, 128, 128))
         self.adam = {"texels": Adam([self.texels], LEARNING_RATES["texels"])}
 
-    def seen_in(self, view: View) -> Tensor:
+    def colors(self, view: View) -> Tensor:
         """The colours (h, w, 3) that a view sees."""
         x, y = (torch.arange(count, device=view.K.device) + 0.5 for count in reversed(view.sky.shape))
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
@@ -266,7 +267,7 @@ class Street:
     def __init__(self, record: dict, actors: list[ActorRecord], views: list[View], args: Namespace):
         device, pixels = views[0].K.device, sum(view.sky.numel() for view in views)
         cap = min(args.cap_max, int(pixels / 20.0))
-        seed = seeded(record["points"], record["points_rgb"], cap)
+        seed = init_params(record["points"], record["points_rgb"], cap)
         self.args, self.parts = args, [Part(seed, record["scene_scale"], cap, args, device)]
         self.parts += [Actors(actors, args, device)] if actors else []
         self.sky = Sky(
@@ -283,8 +284,8 @@ class Street:
             sets[0] = sets[0]._replace(opacities=opacities * (torch.rand_like(opacities) >= dropout))
         shown = Gaussians(*(torch.cat(values) for values in zip(*sets, strict=True)))
         seen = self.splat(shown, shown.sh, view, sh_degree=sh_degree, with_depth=True)
-        image = seen.image[0] + (1.0 - seen.alpha[0]) * self.sky.seen_in(view)
-        alone = [self.splat(own, own.means[:, :1].detach(), view).alpha[0, ..., 0] for own in sets[1:]]
+        image = seen.image[0] + (1.0 - seen.alpha[0]) * self.sky.colors(view)
+        alone = [self.splat(own, own.opacities[:, None].detach(), view).alpha[0, ..., 0] for own in sets[1:]]
         return Picture(image, seen.alpha[0, ..., 0], seen.depth[0, ..., 0], alone[0] if alone else None, shown)
 
     def splat(self, g: Gaussians, colors: Tensor, view: View, **options: int | bool) -> Rendering:
@@ -295,7 +296,7 @@ class Street:
         return rasterize(g.means, g.quats, scales, g.opacities, colors, *camera, **options)
 
     @torch.no_grad()
-    def tidy(self) -> None:
+    def fade_floaters(self) -> None:
         """Fades actors outside their boxes, and what is static within a metre of the path that the vehicle drove."""
         if len(self.parts) > 1:
             self.parts[1].confine()
@@ -349,7 +350,7 @@ def train(model: Street, views: list[View], cameras: int) -> None:
         for part in parts:
             part.densify(step)
         if (step + 1) % 100 == 0:
-            model.tidy()
+            model.fade_floaters()
             counts, loss = [len(part.params["means"]) for part in parts], sum(term.item() for term in terms.values())
             print(f"iteration {step + 1}: loss {loss:.4f}, {' + '.join(map(str, counts))} Gaussians", flush=True)
         if step >= int(0.9 * args.iterations) and (args.iterations - step - 1) % 5 == 0:
@@ -357,7 +358,7 @@ def train(model: Street, views: list[View], cameras: int) -> None:
             sums = [total + values for total, values in zip(sums or [0.0] * len(learned), learned, strict=True)]
     for values, total in zip(learned, sums, strict=True):  # held-out images prefer the mean of the last iterations
         values.copy_(total / count)  # (Izmailov et al. 2018, arXiv 1803.05407)
-    model.tidy()  # in the mean, what was faded meanwhile is visible
+    model.fade_floaters()  # in the mean, what was faded meanwhile is visible
 
 
 @torch.no_grad()

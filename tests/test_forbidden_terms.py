@@ -35,6 +35,7 @@ FIELDS = ("id", "attr", "name", "arg", "asname")
 def python_files() -> dict[Path, Path]:
     """The Python files by their paths in the project."""
     paths = [path for folder in PYTHON for path in sorted((REPOSITORY / folder).rglob("*.py"))]
+    paths.append(REPOSITORY / "street.py")
     return {path.relative_to(REPOSITORY): path for path in paths if "__pycache__" not in path.parts}
 
 
