@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 import torch
+import yaml
 from gsplat import MCMCStrategy
 from helpers import REPOSITORY
 from helpers.small_runs import PROVENANCE
@@ -35,7 +36,7 @@ from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.training_record import read_training_record, write_training_record
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
-from drivesplat.settings.config import Config, load
+from drivesplat.settings.config import Config, load, merged
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import ParserJob
@@ -57,7 +58,6 @@ TINY = {
     "lidar_seed": {"max_points": 500, "far_points": 100},
     "actors": {"random_points": 200},
 }
-DEMO = {"datasets": {"nuscenes": {"batch": False}, "demo": {"batch": True}}}
 ARGUMENTS = {"iterations": 7_000, "seed": 0, "cap_max": 1_500_000, "max_scale": 0.0}
 """The defaults of the command."""
 S = TypeVar("S", bound=Settings)
@@ -286,7 +286,8 @@ def test_its_command_prints_the_figures_of_both_held_out_groups(drive, device, m
 @pytest.mark.slow
 def test_on_the_demo_it_is_as_good_as_the_rule_train(tmp_path):
     """The method with all that street.py leaves out, and the settings of the demo."""
-    config, root = load(DEMO), tmp_path / "data"
+    files = (REPOSITORY / "config.yaml", REPOSITORY / "presets/demo.yaml")
+    config, root = load(merged(*(yaml.safe_load(file.read_text()) for file in files))), tmp_path / "data"
     world = config.datasets["demo"].world
     assert world is not None
     make_world(root, WorldJob(scene="demo", version="v1.0-mini", world=world, edits={}), {"stages": {}}, workers=2)
