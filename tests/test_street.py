@@ -32,7 +32,7 @@ from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.actor_record import ActorRecords
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.training_record import read_training_record, write_training_record
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
@@ -67,7 +67,7 @@ def settings_of(config: Config, scene: str, stage: str, kind: type[S], method: s
     return kind.model_validate_json(stage_settings(config, stage, scene, method, None))
 
 
-def prepared(folder: Path, config: Config, root: Path, name: str) -> PreparedDrive:
+def prepared(folder: Path, config: Config, root: Path, name: str) -> EvaluationData:
     """Writes the files of a scene's results that trainings read."""
     scene = extract_scene(settings_of(config, name, "extract", SceneSource), root)
     masks = make_masks(scene, settings_of(config, name, "masks", MaskJob), folder / "masks")
@@ -80,10 +80,10 @@ def prepared(folder: Path, config: Config, root: Path, name: str) -> PreparedDri
     write_arrays(folder / "actors.npz", ActorRecords(actors, PROVENANCE))
     depths = lidar_depths(scene, settings_of(config, name, "lidar_depth", LidarDepthJob))
     write_arrays(folder / "lidar_depth.npz", LidarDepthRecord(depths, PROVENANCE))
-    return PreparedDrive(scene, read_training_record(folder / "parser.pkl"), folder / "masks")
+    return EvaluationData(scene, read_training_record(folder / "parser.pkl"), folder / "masks")
 
 
-def trained_by_rule(drive: PreparedDrive, job: TrainJob, folder: Path) -> SplatModel:
+def trained_by_rule(drive: EvaluationData, job: TrainJob, folder: Path) -> SplatModel:
     """The model that the function of the rule `train` fits to a prepared drive."""
     assert drive.masks is not None
     parser = drive.masks.parent / "parser.pkl"
@@ -94,7 +94,7 @@ def trained_by_rule(drive: PreparedDrive, job: TrainJob, folder: Path) -> SplatM
     return trained_model(read_checkpoint(files.checkpoint)).requires_grad_(False)
 
 
-def in_one_file(drive: PreparedDrive, **arguments: Any) -> tuple[street.Street, list[street.View]]:
+def in_one_file(drive: EvaluationData, **arguments: Any) -> tuple[street.Street, list[street.View]]:
     """The untrained model of street.py and the training images."""
     assert drive.masks is not None
     folder, record = drive.masks.parent, drive.record.to_plain()
@@ -103,14 +103,14 @@ def in_one_file(drive: PreparedDrive, **arguments: Any) -> tuple[street.Street, 
     return street.Street(record, actors, views, Namespace(**{**ARGUMENTS, **arguments})), views
 
 
-def psnrs(model: street.Street, drive: PreparedDrive, group: str) -> dict[str, float | None]:
+def psnrs(model: street.Street, drive: EvaluationData, group: str) -> dict[str, float | None]:
     assert drive.masks is not None
     record = drive.record.to_plain()
     images = [i for i in record["splits"][group] if record["is_key_frame"][i]]
     return street.evaluate(model, street.read_views(drive.masks.parent, record, np.array(images), CPU))
 
 
-def psnrs_of_rule(model: SplatModel, drive: PreparedDrive, group: str) -> dict[str, float | None]:
+def psnrs_of_rule(model: SplatModel, drive: EvaluationData, group: str) -> dict[str, float | None]:
     """The same figures by the stage `evaluate`."""
     found = evaluate_groups(model, drive, "CAM_FRONT", None, CPU)[group]
     regions = {"static": found["static"], "moving": found["moving_vehicle"]}
@@ -125,7 +125,7 @@ def job_of(iterations: int, **changes: Any) -> TrainJob:
 
 
 @pytest.fixture(scope="module")
-def drive(tiny_root, tmp_path_factory) -> PreparedDrive:
+def drive(tiny_root, tmp_path_factory) -> EvaluationData:
     return prepared(tmp_path_factory.mktemp("street"), load(TINY), tiny_root, "0001")
 
 
