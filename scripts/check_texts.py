@@ -45,7 +45,7 @@ def forbidden_terms(root: Path) -> Iterator[str]:
     forbidden_name = re.compile("|".join(fnmatch.translate(name) for name in name_patterns))
     forbidden_phrase = re.compile(rf"\b(?:{phrases})\b", re.IGNORECASE)
     texts: list[tuple[Path, str]] = []
-    for path in sorted(path for folder in PYTHON for path in (root / folder).rglob("*.py")):
+    for path in [*root.glob("*.py"), *sorted(path for folder in PYTHON for path in (root / folder).rglob("*.py"))]:
         source, place = path.read_text(encoding="utf-8"), path.relative_to(root)
         tree = ast.parse(source)
         used = names(tree) | set(place.with_suffix("").parts)
