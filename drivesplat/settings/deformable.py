@@ -40,7 +40,7 @@ class LatticeSettings(Settings):
     """Nodes along the length, width and height of the box."""
     learning_rate: float = Field(2e-3, gt=0)
     """Learning rate of displacements (metres) and rotations (radians)."""
-    size_weight: float = Field(0.1, ge=0)
+    l2_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean square of an object's displacements and rotations, times the square of the multiple of
     the phase. It is divided by the number of training images: with fewer images objects deform less."""
     smoothness_weight: float = Field(1.0, ge=0)
@@ -49,7 +49,7 @@ class LatticeSettings(Settings):
 
     def for_scene(self, objects: int, views: int) -> "LatticeSettings":
         """The settings with the weights of means over so many `objects`, in a scene of so many training `views`."""
-        weights = {name: getattr(self, name) * objects / max(1, views) for name in ("size_weight", "smoothness_weight")}
+        weights = {name: getattr(self, name) * objects / max(1, views) for name in ("l2_weight", "smoothness_weight")}
         return self.model_copy(update=weights)
 
 
