@@ -263,7 +263,7 @@ class Config(Settings):
         return self.dataset_names[scene]
 
 
-def in_current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def in_current_names(values: Mapping[Any, Any]) -> tuple[dict[Any, Any], list[str]]:
     """The values of a config with the current names of settings, and the old names in it; see `current_names`."""
     return current_names(values, lambda: Config().model_dump())
 

@@ -1,8 +1,9 @@
 """Settings of the deformation of people, animals and cyclists."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.object_classes import ObjectClassName
@@ -27,9 +28,14 @@ class GaitSettings(Settings):
     weight: float = Field(0.01, ge=0)
     """Loss weight of the mean square of both."""
 
+    @field_validator("strides", mode="before")
+    @classmethod
+    def _laid_over_the_defaults(cls, value: Any) -> Any:
+        return {**STRIDES, **value} if isinstance(value, Mapping) else value
+
     def stride_of(self, object_class: str) -> float:
         """The initial length of a cycle of a class, in heights of the box."""
-        known: dict[str, float] = {**STRIDES, **self.strides}
+        known: dict[str, float] = {**self.strides}
         return known.get(object_class, known["pedestrian"])
 
 

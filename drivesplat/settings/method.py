@@ -58,7 +58,7 @@ class MethodSettings(Settings):
         return MethodSettings(parts=own, tracks=self.tracks, overrides=merged(self.overrides, overrides))
 
 
-def built(methods: Mapping[str, Any], shipped: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def built(methods: Mapping[Any, Any], shipped: Mapping[str, Mapping[str, Any]]) -> dict[Any, Any]:
     """The trees of `methods` as YAML has them, with what each method takes from the one that it is `of` written out.
 
     `shipped` are the trees of methods that can be built on even where `methods` drops them. What is no tree of a method
@@ -69,7 +69,7 @@ def built(methods: Mapping[str, Any], shipped: Mapping[str, Mapping[str, Any]]) 
     {'tracks': 'none', 'parts': ['background']}
     """
 
-    def written_out(name: str, derived: tuple[str, ...]) -> Any:
+    def written_out(name: Any, derived: tuple[Any, ...]) -> Any:
         if name in derived:
             circle = " of ".join(map(repr, (*derived[derived.index(name) :], name)))
             raise ValueError(f"methods cannot be of each other in a circle: {circle}")

@@ -24,8 +24,8 @@ RENAMED = {
 
 
 def current_names(
-    values: Mapping[str, Any], defaults: Callable[[], Mapping[str, Any]]
-) -> tuple[dict[str, Any], list[str]]:
+    values: Mapping[Any, Any], defaults: Callable[[], Mapping[str, Any]]
+) -> tuple[dict[Any, Any], list[str]]:
     """The `values` of a config with all settings under their new names, and the old paths that it has, overrides
     included.
 
@@ -57,7 +57,7 @@ def note_of_old_names(old_paths: list[str]) -> str:
     )
 
 
-def settings_trees(values: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+def settings_trees(values: dict[Any, Any]) -> Iterator[tuple[str, dict[Any, Any]]]:
     """The trees of settings in a config, each with the path before its keys: the config itself, and the overrides of
     datasets, methods and variants of the ablation."""
     yield "", values
@@ -67,7 +67,7 @@ def settings_trees(values: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]
                 yield f"{kind}.{name}.overrides.", entry["overrides"]
 
 
-def subtree(tree: Mapping[str, Any], path: str) -> dict[str, Any] | None:
+def subtree(tree: Mapping[Any, Any], path: str) -> dict[Any, Any] | None:
     """The mapping at a `path` of keys with dots; None where there is none."""
     node: Any = tree
     for key in path.split("."):

@@ -86,8 +86,11 @@ def _sections(record: type[BaseModel], path: str) -> Iterator[tuple[str, str]]:
 
 def _row(name: str, field: FieldInfo, inner: type[BaseModel] | None, where: str) -> str:
     key = f"**`{name}`**" if is_printed(field) else f"`{name}`"
-    values = f"[below]({_anchor(where)})" if inner else _values(field.annotation, field.metadata)
-    default = "" if inner and inner is not Config else _default(field)
+    values, default = _values(field.annotation, field.metadata), field.get_default(call_default_factory=True)
+    if inner is not None:
+        values = values.replace("mapping", f"[mapping]({_anchor(where)})")
+    named = inner is None or default is None or isinstance(default, str)
+    default = f"`{in_one_line(default)}`" if named and default is not PydanticUndefined else ""
     cells = (key, values, default, _linked(described(field.description)))
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
@@ -103,9 +106,8 @@ def _record_in(annotation: Any) -> tuple[type[BaseModel] | None, str]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation, ""
     origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin in (Union, UnionType) and Literal not in map(get_origin, arguments):
-        found = [_record_in(argument) for argument in arguments if argument is not NoneType]
-        return found[0] if len(found) == 1 else (None, "")
+    if origin in (Union, UnionType):
+        return next((found for found in map(_record_in, arguments) if found[0]), (None, ""))
     if origin in (dict, tuple) and arguments:
         inner, _ = _record_in(arguments[1 if origin is dict else 0])
         return inner, ".<name>" if origin is dict else "[]"
@@ -136,11 +138,6 @@ def _values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
 def _flat(metadata: Iterable[Any]) -> list[Any]:
     """The limits in the metadata of an annotated type."""
     return [limit for item in metadata for limit in (item.metadata if isinstance(item, FieldInfo) else [item])]
-
-
-def _default(field: FieldInfo) -> str:
-    value = field.get_default(call_default_factory=True)
-    return "" if value is PydanticUndefined else f"`{in_one_line(value)}`"
 
 
 def _linked(text: str) -> str:

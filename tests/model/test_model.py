@@ -391,7 +391,9 @@ def test_actors_are_initialised_from_their_records():
     ],
 )
 def test_an_actors_gaussians_are_capped_by_its_training_pixels(pixels, changes, expected):
-    settings = TrainSettings(**{"pixels_per_gaussian": 20.0, "actors": ActorSettings(min_gaussians=8, cap_max=300), **changes})
+    settings = TrainSettings(
+        **{"pixels_per_gaussian": 20.0, "actors": ActorSettings(min_gaussians=8, cap_max=300), **changes}
+    )
     record = actor_record(a_track(), pixels=pixels)
     assert actor_cap(record, settings.actors, settings.pixels_per_gaussian) == expected
 
