@@ -1,12 +1,14 @@
 """Old names of settings: they hold for one version, wherever a config has them, and planning says what they are now."""
 
 import json
+import os
 from typing import Any
 
 import pytest
 import yaml
 from helpers import REPOSITORY
 from helpers.forked_snakemake import run_snakemake
+from helpers.patience import PATIENCE_S
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, for_scene, in_current_names, load
@@ -89,10 +91,21 @@ def test_a_whole_config_of_the_last_version_gives_the_same_settings():
 def test_planning_says_which_names_are_old(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("train: {checkpoint_apart_s: 5, coarse_to_fine: {least_height: 100}}\n")
-    done = run_snakemake(REPOSITORY, "-n", "--configfile", str(file), "--", "results/demo/metrics.json")
-    said = [line for line in (done.stdout + done.stderr).splitlines() if "old names" in line]
+    command = [
+        "-n",
+        "-s",
+        str(REPOSITORY / "Snakefile"),
+        "-d",
+        str(tmp_path),
+        "--cores",
+        "1",
+        "--configfile",
+        str(file),
+    ]
+    done = run_snakemake([*command, "--", "results/demo/metrics.json"], REPOSITORY, os.environ, PATIENCE_S)
+    said = [line for line in done.stdout.splitlines() if "old names" in line]
     assert said == [
         "drivesplat: old names of settings, which the next version will refuse: train.checkpoint_apart_s (now "
         "min_checkpoint_interval_s), train.coarse_to_fine.least_height (now min_height)"
     ]
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stdout
