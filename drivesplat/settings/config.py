@@ -28,7 +28,7 @@ from drivesplat.settings.inspection import GhostSettings, RemovalSettings, Subje
 from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
-from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, built, merged
+from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, built, default_methods, merged
 from drivesplat.settings.names import require_name, suggestion
 from drivesplat.settings.published import PublishedFigures
 from drivesplat.settings.refine_poses import RefinePosesSettings
@@ -47,21 +47,6 @@ DATASET_OVERRIDES = (
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
 
 
-def _default_methods() -> dict[str, MethodSettings]:
-    overrides = {
-        "train": {
-            "sky_bce_weight": 0.05,
-            "horizon_weight": 0.05,
-            "depth_weight": 0.01,
-            "semantic_weight": 0.1,
-            "road_weight": 1.0,
-            "road": {"surface": "lidar"},
-            "dropout": 0.2,
-        }
-    }
-    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=overrides)}
-
-
 KEPT_NAMES = {"parts": "a method's parts", "lidar": "LiDAR scans", "truth": "views beside the truth"}
 """The names of films that are no trajectories, and what these show."""
 
@@ -73,7 +58,7 @@ class Config(Settings):
     """:printed: Accept nuScenes' terms, https://www.nuscenes.org/terms-of-use (non-commercial use without a licence).
     Until they are accepted, `snakemake download_nuscenes_mini` downloads nothing."""
     nuscenes_mini: NuscenesMiniSettings = NuscenesMiniSettings()
-    methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
+    methods: dict[str, MethodSettings | None] = Field(default_factory=default_methods, min_length=1)
     """:printed: Methods to train and compare, each under a name of your choice, which also names its result folder.
     null drops a method: `methods: {street: null}` in a file laid over this one. vanilla and street stand before all
     others."""
@@ -135,7 +120,7 @@ class Config(Settings):
     def _methods_are_built(cls, values: Any) -> Any:
         if not isinstance(values, Mapping) or not isinstance(values.get("methods"), Mapping):
             return values
-        shipped = {name: method.model_dump(exclude_defaults=True) for name, method in _default_methods().items()}
+        shipped = {name: method.model_dump(exclude_defaults=True) for name, method in default_methods().items()}
         return {**values, "methods": built(values["methods"], shipped)}
 
     @field_validator("published", mode="before")
@@ -151,7 +136,7 @@ class Config(Settings):
         wanted = {name: method for name, method in value.items() if method is not None}
         if not wanted:
             raise ValueError("no method is left; keep one")
-        return {name: wanted[name] for name in (*_default_methods(), *wanted) if name in wanted}
+        return {name: wanted[name] for name in (*default_methods(), *wanted) if name in wanted}
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> "Config":

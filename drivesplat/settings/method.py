@@ -58,6 +58,22 @@ class MethodSettings(Settings):
         return MethodSettings(parts=own, tracks=self.tracks, overrides=merged(self.overrides, overrides))
 
 
+def default_methods() -> dict[str, MethodSettings]:
+    """The methods that the workflow ships with."""
+    overrides = {
+        "train": {
+            "sky_bce_weight": 0.05,
+            "horizon_weight": 0.05,
+            "depth_weight": 0.01,
+            "semantic_weight": 0.1,
+            "road_weight": 1.0,
+            "road": {"surface": "lidar"},
+            "dropout": 0.2,
+        }
+    }
+    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=overrides)}
+
+
 def built(methods: Mapping[Any, Any], shipped: Mapping[str, Mapping[str, Any]]) -> dict[Any, Any]:
     """The trees of `methods` as YAML has them, with what each method takes from the one that it is `of` written out.
 
