@@ -12,7 +12,7 @@
 # make quality      RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
 # make speed        FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
 # make ledger       docs/tried.md from the ledger of experiments docs/tried.csv
-# make config       config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
+# make config       config.yaml, config.schema.json, docs/settings.md from the settings records; FORCE=--force overwrites
 # make help         this list
 .PHONY: help demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch mutants bench quality speed config ledger
 

@@ -9,6 +9,7 @@ import pytest
 from helpers import REPOSITORY
 
 from drivesplat.settings.config_document import config_schema, config_yaml, main
+from drivesplat.settings.settings_page import settings_page
 
 IS_COMMAND = re.compile(r'^if __name__ == "__main__":', re.MULTILINE)
 COMMANDS = sorted(
@@ -59,12 +60,12 @@ def test_force_overwrites_a_changed_config(changed):
 def test_new_settings_come_into_a_config_that_has_no_others(tmp_path):
     whole = config_yaml()
     lines = whole.splitlines(keepends=True)
-    (new,) = (i for i, line in enumerate(lines) if line.startswith("  usd_gaussians:"))
+    (new,) = (i for i, line in enumerate(lines) if line.startswith("  drive_width:"))
     (tmp_path / "config.yaml").write_text("".join(lines[: new - 1] + lines[new + 1 :]))
     assert main([], tmp_path) == 0 and (tmp_path / "config.yaml").read_text() == whole
 
 
-@pytest.mark.parametrize("old", ["  usd_gaussians: 1000000\n", "# Maximum number of Gaussians in viewer.html"])
+@pytest.mark.parametrize("old", ["  drive_width: null\n", "# Compute LPIPS."])
 def test_a_config_of_a_user_with_lines_of_its_own_is_kept_though_it_lacks_settings(tmp_path, old):
     lines = config_yaml().splitlines(keepends=True)
     lacking = "".join(line for line in lines if not line.startswith("results_dir:"))
@@ -78,3 +79,4 @@ def test_absent_files_are_written(tmp_path):
     assert main([], tmp_path) == 0 and main([], tmp_path) == 0
     assert (tmp_path / "config.yaml").read_text() == config_yaml()
     assert (tmp_path / "config.schema.json").read_text() == config_schema()
+    assert (tmp_path / "docs/settings.md").read_text() == settings_page()

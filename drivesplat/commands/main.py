@@ -70,7 +70,8 @@ def _parser() -> argparse.ArgumentParser:
     setup = commands.add_parser("setup", help="compile the kernels for this machine's GPUs and processors, once")
     setup.set_defaults(command=_setup)
 
-    config = commands.add_parser("config", help="print every setting with its default: drivesplat config > config.yaml")
+    config = commands.add_parser("config", help="print common settings with defaults: drivesplat config > config.yaml")
+    config.add_argument("--all", action="store_true", help="print docs/settings.md, a page of all settings, instead")
     config.set_defaults(command=_config)
     return parser
 
@@ -109,6 +110,6 @@ def _setup(_: argparse.Namespace) -> int:
     return compile_gsplat([]) or train_briefly() or make_tiny_world()
 
 
-def _config(_: argparse.Namespace) -> int:
-    print((WORKFLOW / "config.yaml").read_text(encoding="utf-8"), end="")
+def _config(parsed: argparse.Namespace) -> int:
+    print((WORKFLOW / ("docs/settings.md" if parsed.all else "config.yaml")).read_text(encoding="utf-8"), end="")
     return 0

@@ -26,7 +26,7 @@ def in_this_copy(text: str, is_checkout: bool = IS_CHECKOUT) -> str:
     that only its own command knows."""
     if is_checkout:
         return text
-    text = text.replace("`snakemake ", "`drivesplat run ")
+    text = text.replace("`snakemake ", "`drivesplat run ").replace("docs/settings.md", "`drivesplat config --all`")
     text = re.sub(
         r"`?TORCH_CUDA=(\w+) make setup`?",
         r'pip install --force-reinstall "torch==2.11.*" torchvision --index-url https://download.pytorch.org/whl/\1',

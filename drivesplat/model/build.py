@@ -153,7 +153,7 @@ def _init_drifting(init: ModelInit, settings: TrainSettings) -> Part | None:
     times = [record.seconds(i) for i in record.train_images]
     if not times:
         return None
-    count = max(MIN_SEED_POINTS, int(own.seed.share * own.share * settings.cap_max))
+    count = max(MIN_SEED_POINTS, int(own.seed.fraction * own.fraction * settings.cap_max))
     seed = drifting_seed(record, own.seed, count, np.random.default_rng(0))
     seconds = min(times), max(times)
     return Drifting.from_seed(seed, own, settings.gaussians, record.scene_scale, seconds, init.classes, init.echo)
@@ -187,7 +187,7 @@ def actor_cap(actor: ActorRecord, settings: ActorSettings, pixels_per_gaussian: 
     """The maximum number of Gaussians for the training pixels in an actor's box."""
     if not pixels_per_gaussian:
         return settings.cap_max
-    return max(settings.least, int(actor.pixels / pixels_per_gaussian))
+    return max(settings.min_gaussians, int(actor.pixels / pixels_per_gaussian))
 
 
 def split_cap(wanted: Sequence[int], cap: int) -> list[int]:

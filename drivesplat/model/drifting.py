@@ -67,7 +67,7 @@ class Drifting(Part):
         classes: int = 0,
         echo: tuple[float, float] | None = None,
     ) -> "Drifting":
-        """Initialised from a seed of a `settings.seed.share` of its maximum number; see `init_params`."""
+        """Initialised from a seed of a `settings.seed.fraction` of its maximum number; see `init_params`."""
         own, count = settings.seed, len(seed.positions)
         start = gaussians.model_copy(update={"init_opacity": own.opacity})
         span = math.log(max(own.span - settings.min_span, 0.01 * settings.min_span))
@@ -78,7 +78,7 @@ class Drifting(Part):
             "peaks": torch.from_numpy(seed.peaks).float(),
             "spans": torch.full((count,), span),
         }
-        return cls(params, settings, gaussians, extent, seconds, max(count, round(count / own.share)))
+        return cls(params, settings, gaussians, extent, seconds, max(count, round(count / own.fraction)))
 
     def time_state(self, time: float) -> Sequence[Tensor]:
         """The time, and the time that decides on opacities."""

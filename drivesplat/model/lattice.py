@@ -49,7 +49,7 @@ class LatticeField(Field):
         scaled = (nodes.flatten(2) * constant(tuple(self.orders.tolist()), nodes.device)[:, None]).flatten()
         values = max(1, nodes.numel() // len(self.orders))
         return {
-            "lattice_size": own.size_weight / values * scaled.dot(scaled),
+            "lattice_size": own.l2_weight / values * scaled.dot(scaled),
             "lattice_roughness": own.smoothness_weight * roughness(nodes),
         }
 

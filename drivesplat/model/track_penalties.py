@@ -13,7 +13,7 @@ def track_penalties(
     """The penalties of corrections: their mean square, and that of their second differences along the tracks, both in
     units of the expected annotation error. `neighbours` are all triples of consecutive annotations."""
     size, bend = sums_of_squares(translation, yaw, neighbours, settings.sigma_translation, settings.sigma_yaw)
-    penalties = {"track_size": settings.size_weight / max(1, len(yaw)) * size}
+    penalties = {"track_size": settings.l2_weight / max(1, len(yaw)) * size}
     if len(neighbours):
-        penalties["track_bend"] = settings.bend_weight / len(neighbours) * bend
+        penalties["track_bend"] = settings.smoothness_weight / len(neighbours) * bend
     return penalties

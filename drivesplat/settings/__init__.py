@@ -2,7 +2,8 @@
 their base class, and one-line messages for their errors.
 
 Fields are documented by attribute docstrings, so that a reworded comment does not change the code digest (see
-`drivesplat.provenance.code_digest`).
+`drivesplat.provenance.code_digest`). A docstring that begins with `:printed:` puts its field into config.yaml, which
+users read first; docs/settings.md and config.schema.json have all fields.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -40,7 +41,11 @@ class Settings(BaseModel):
 
 
 def validated(
-    model: type[S], values: dict[str, Any], where: str = "", document: str = "config.yaml", keys: Sequence[str] = ()
+    model: type[S],
+    values: dict[str, Any],
+    where: str = "",
+    document: str = "docs/settings.md",
+    keys: Sequence[str] = (),
 ) -> S:
     """Validates `values` as `model`.
 

@@ -14,9 +14,9 @@ class VariantSettings(Settings):
     """A method without one of its components."""
 
     parts: Parts | None = None
-    """Parts of the variant's model. null = the method's parts."""
+    """:printed: Parts of the variant's model. null = the method's parts."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """Settings laid over the method's overrides, as a tree. Only `sky` and `train` may be set."""
+    """:printed: Settings laid over the method's overrides, as a tree. Only `sky` and `train` may be set."""
 
     @model_validator(mode="after")
     def _removes_something(self) -> "VariantSettings":
@@ -45,12 +45,12 @@ def _default_variants() -> dict[str, VariantSettings | None]:
 
 class AblationSettings(Settings):
     of: str = "street"
-    """The method to ablate."""
+    """:printed: The method to ablate."""
     seeds: Seeds = (0, 1, 2)
-    """Random seeds. The method and every variant are trained once with each seed."""
+    """:printed: Random seeds. The method and every variant are trained once with each seed."""
     without: dict[str, VariantSettings | None] = Field(default_factory=_default_variants)
-    """The variants, each named after the component that it lacks. null drops a variant. Each variant is a method named
-    {of}-without-{name}-seed{n}; the complete method is {of}-seed{n}."""
+    """:printed: The variants, each named after the component that it lacks. null drops a variant. Each variant is a
+    method named {of}-without-{name}-seed{n}; the complete method is {of}-seed{n}."""
 
     @property
     def job(self) -> "AblationJob":

@@ -22,11 +22,12 @@ class ActorSeedSettings(Settings):
     a training image; it gets a set of Gaussians in its own frame."""
 
     classes: dict[ObjectClassName, ClassParts] = DEFAULT_CLASSES
-    """The part of a model that represents the moving objects of each class, or several: the first that a method has."""
+    """:printed: The part of a model that represents the moving objects of each class, or several: the first that a
+    method has."""
     cycles: bool = True
     """Make actors of motorcycles, bicycles and riders, too. false overrides `classes`."""
     humans: bool = False
-    """Make actors of pedestrians, too, as rigid as their boxes. true overrides `classes`."""
+    """:printed: Make actors of pedestrians, too, as rigid as their boxes. true overrides `classes`."""
     min_points: int = Field(2_000, ge=0)
     """Minimum number of LiDAR points of an actor over the whole drive. With fewer, random points in its box are added.
     """

@@ -13,8 +13,8 @@ class CoarseToFineSettings(Settings):
     """Fraction of the iterations that use images of a quarter of the width and height."""
     half_until: float = Field(0.7, ge=0, le=1)
     """Fraction of the iterations after which images have full size. Before it they have half the width and height."""
-    least_height: int = Field(225, ge=16)
+    min_height: int = Field(225, ge=16)
     """Minimum number of rows of a reduced image. 900 rows are reduced to 225; images of 640x360 are not reduced."""
-    share: float = Field(0.6, gt=0, le=1)
+    fraction: float = Field(0.6, gt=0, le=1)
     """Fraction of the Gaussian limit that applies while images are reduced, with strategy: mcmc. The full limit
     applies early enough for the number of Gaussians to reach it before densification stops."""

@@ -28,10 +28,11 @@ from drivesplat.settings.inspection import GhostSettings, RemovalSettings, Subje
 from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
-from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, merged
+from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, built, default_methods, merged
 from drivesplat.settings.names import require_name, suggestion
 from drivesplat.settings.published import PublishedFigures
 from drivesplat.settings.refine_poses import RefinePosesSettings
+from drivesplat.settings.renamed import current_names
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.results_folder import ResultsFolder
 from drivesplat.settings.scans import ScanSettings
@@ -46,44 +47,32 @@ DATASET_OVERRIDES = (
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
 
 
-def _default_methods() -> dict[str, MethodSettings]:
-    overrides = {
-        "train": {
-            "sky_bce_weight": 0.05,
-            "horizon_weight": 0.05,
-            "depth_weight": 0.01,
-            "semantic_weight": 0.1,
-            "road_weight": 1.0,
-            "road": {"surface": "lidar"},
-            "dropout": 0.2,
-        }
-    }
-    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=overrides)}
-
-
 KEPT_NAMES = {"parts": "a method's parts", "lidar": "LiDAR scans", "truth": "views beside the truth"}
 """The names of films that are no trajectories, and what these show."""
 
 
 class Config(Settings):
     datasets: dict[str, DatasetSettings] = Field(default_factory=default_datasets, min_length=1)
-    """Datasets, each under a name of your choice."""
+    """:printed: Datasets, each under a name of your choice."""
     accept_nuscenes_terms: bool = False
-    """Accept nuScenes' terms, https://www.nuscenes.org/terms-of-use (non-commercial use without a licence). Until they
-    are accepted, `snakemake download_nuscenes_mini` downloads nothing."""
+    """:printed: Accept nuScenes' terms, https://www.nuscenes.org/terms-of-use (non-commercial use without a licence).
+    Until they are accepted, `snakemake download_nuscenes_mini` downloads nothing."""
     nuscenes_mini: NuscenesMiniSettings = NuscenesMiniSettings()
-    methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
-    """Methods to train and compare, each under a name of your choice, which also names its result folder. null drops a
-    method: `methods: {street: null}` in a file laid over this one. vanilla and street stand before all others."""
+    methods: dict[str, MethodSettings | None] = Field(default_factory=default_methods, min_length=1)
+    """:printed: Methods to train and compare, each under a name of your choice, which also names its result folder.
+    null drops a method: `methods: {street: null}` in a file laid over this one. vanilla and street stand before all
+    others."""
     ablation: AblationSettings = AblationSettings()
-    """Ablation of a method. Only `snakemake results/{scene}/ablation.csv` trains it."""
+    """:printed: Ablation of a method. Only `snakemake results/{scene}/ablation.csv` trains it."""
     cameras: tuple[str, ...] = ("CAM_FRONT",)
-    """Cameras to train on. [] = none: only methods that render LiDAR are trained and measured (docs/lidar.md)."""
+    """:printed: Cameras to train on. [] = none: only methods that render LiDAR are trained and measured
+    (docs/lidar.md)."""
     eval_camera: str | None = "CAM_FRONT"
-    """The camera whose held-out images are evaluated. Must be one of `cameras`; without any, null or left out."""
+    """:printed: The camera whose held-out images are evaluated. Must be one of `cameras`; without any, null or left
+    out."""
     sweeps: bool = False
-    """Train on images between key frames, too, except those within half a key-frame interval of a held-out key frame.
-    For LiDAR between key frames see lidar_seed.sweeps. docs/real_logs.md"""
+    """:printed: Train on images between key frames, too, except those within half a key-frame interval of a held-out
+    key frame. For LiDAR between key frames see lidar_seed.sweeps. docs/real_logs.md"""
     images: ImageSettings = ImageSettings()
     holdout: HoldoutSettings = HoldoutSettings()
     extract: ExtractSettings = ExtractSettings()
@@ -96,27 +85,28 @@ class Config(Settings):
     discover: DiscoverSettings = DiscoverSettings()
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
-    """Sky model behind the Gaussians: 'cubemap' (learned colours by direction), 'mask' (one learned colour, opacity
-    penalised in sky pixels) or 'none' (black). Without a cube map, Gaussians fill the sky."""
+    """:printed: Sky model behind the Gaussians: 'cubemap' (learned colours by direction), 'mask' (one learned colour,
+    opacity penalised in sky pixels) or 'none' (black). Without a cube map, Gaussians fill the sky."""
     train: TrainSettings = TrainSettings()
     render: RenderSettings = RenderSettings()
     subjects: dict[str, SubjectSettings] = Field(default_factory=dict)
-    """Vehicle of the ghost panel and of the removal, by scene: {"0061": {track: 6e5c..., key_frame: 12}}. Other scenes
-    take the moving vehicle that fills most pixels."""
+    """:printed: Vehicle of the ghost panel and of the removal, by scene: {"0061": {track: 6e5c..., key_frame: 12}}.
+    Other scenes take the moving vehicle that fills most pixels."""
     ghosts: GhostSettings = GhostSettings()
     removal: RemovalSettings = RemovalSettings()
     export: ExportSettings = ExportSettings()
     lpips: LpipsSettings = LpipsSettings()
     published: tuple[PublishedFigures, ...] = ()
-    """Published figures that the report shows beside measured ones, a list: {source: name of the publication, url: its
-    address, scene: "0061", method: its name there, psnr: mean over images in dB, ssim, lpips, train_minutes, gpu}. One
-    figure suffices. `scene: mean` is a mean over scenes, `scenes` their number. `group` ('interpolation' unless given)
-    and `region` ('all') are those of metrics.json. presets/protocols/ has such lists (docs/results.md)."""
+    """:printed: Published figures that the report shows beside measured ones, a list: {source: name of the publication,
+    url: its address, scene: "0061", method: its name there, psnr: mean over images in dB, ssim, lpips, train_minutes,
+    gpu}. One figure suffices. `scene: mean` is a mean over scenes, `scenes` their number. `group` ('interpolation'
+    unless given) and `region` ('all') are those of metrics.json. presets/protocols/ has such lists
+    (docs/results.md)."""
     device: DeviceSettings = DeviceSettings()
     random_seed: int = Field(0, ge=0, lt=2**31)
-    """Random seed of all stages."""
+    """:printed: Random seed of all stages."""
     results_dir: ResultsFolder = "results"
-    """Folder of all results, ~ for your home folder. Give each experiment a folder of its own."""
+    """:printed: Folder of all results, ~ for your home folder. Give each experiment a folder of its own."""
 
     @field_validator("accept_nuscenes_terms", mode="before")
     @classmethod
@@ -124,6 +114,14 @@ class Config(Settings):
         if value in ("true", "false"):
             raise ValueError(f"write {value.capitalize()}: Snakemake's --config takes {value} for text")
         return value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _methods_are_built(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping) or not isinstance(values.get("methods"), Mapping):
+            return values
+        shipped = {name: method.model_dump(exclude_defaults=True) for name, method in default_methods().items()}
+        return {**values, "methods": built(values["methods"], shipped)}
 
     @field_validator("published", mode="before")
     @classmethod
@@ -138,7 +136,7 @@ class Config(Settings):
         wanted = {name: method for name, method in value.items() if method is not None}
         if not wanted:
             raise ValueError("no method is left; keep one")
-        return {name: wanted[name] for name in (*_default_methods(), *wanted) if name in wanted}
+        return {name: wanted[name] for name in (*default_methods(), *wanted) if name in wanted}
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> "Config":
@@ -250,6 +248,11 @@ class Config(Settings):
         return self.dataset_names[scene]
 
 
+def in_current_names(values: Mapping[Any, Any]) -> tuple[dict[Any, Any], list[str]]:
+    """The values of a config with the current names of settings, and the old names in it; see `current_names`."""
+    return current_names(values, lambda: Config().model_dump())
+
+
 def load(values: Mapping[str, Any]) -> Config:
     """Validates a config with its overrides. Raises ConfigError: one line with key, value and allowed range."""
     if "provenance" in values:
@@ -257,7 +260,7 @@ def load(values: Mapping[str, Any]) -> Config:
             "a result of this workflow is among the config files, where Snakemake takes what follows --configfile: "
             "put -- before the targets, as in --configfile mine.yaml -- results/0103/metrics.json"
         )
-    config = validated(Config, dict(values))
+    config = validated(Config, in_current_names(values)[0])
     variants = {name: variant for name, variant in config.ablation.without.items() if variant is not None}
     for kind, named, allowed in (
         ("datasets", config.datasets, DATASET_OVERRIDES),

@@ -15,7 +15,7 @@ DEMO_OVERRIDES = {
     "train": {
         "iterations": 800,
         "cap_max": 40_000,
-        "checkpoint_apart_s": 10.0,
+        "min_checkpoint_interval_s": 10.0,
         "image_every": 250,
         "psnr_every": 200,
         "max_scale": 0.1,
@@ -28,24 +28,27 @@ DEMO_OVERRIDES = {
 
 class DatasetSettings(Settings):
     reader: Literal["nuscenes", "drive", "waymo"] = "nuscenes"
-    """Dataset format: 'nuscenes', 'waymo' (docs/waymo.md), or 'drive', a folder that you write (docs/own_data.md)."""
+    """:printed: Dataset format: 'nuscenes', 'waymo' (docs/waymo.md), or 'drive', a folder that you write
+    (docs/own_data.md)."""
     dataroot: str = "~/data/nuscenes/v1.0-mini"
-    """Folder that contains the folder of tables (or that folder itself, or its grandparent)."""
+    """:printed: Folder that contains the folder of tables (or that folder itself, or its grandparent)."""
     version: str = "v1.0-mini"
-    """Name of the folder of tables: v1.0-mini, v1.0-trainval, ... Waymo: v1 or v2, needed only where both are there."""
+    """:printed: Name of the folder of tables: v1.0-mini, v1.0-trainval, ... Waymo: v1 or v2, needed only where both are
+    there."""
     scenes: tuple[str, ...] = MINI_SCENES
-    """Scene numbers in quotes. YAML reads a bare 0061 as an octal number. Waymo: names of segments."""
+    """:printed: Scene numbers in quotes. YAML reads a bare 0061 as an octal number. Waymo: names of segments."""
     frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
-    """Range of key frames to use, by scene: [first, last + 1). They are then counted from 0. Other scenes are used
-    completely."""
+    """:printed: Range of key frames to use, by scene: [first, last + 1). They are then counted from 0. Other scenes are
+    used completely."""
     edits: dict[str, str] = Field(default_factory=dict)
-    """Edits file, by scene (docs/editing.md)."""
+    """:printed: Edits file, by scene (docs/editing.md)."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """Settings that differ for this dataset, as a tree: {images: {width: 800}}."""
+    """:printed: Settings that differ for this dataset, as a tree: {images: {width: 800}}."""
     batch: bool = True
-    """Include its scenes in a bare `snakemake` and in the report."""
+    """:printed: Include its scenes in a bare `snakemake` and in the report."""
     world: WorldSettings | None = None
-    """Synthetic street with one scene, generated at dataroot. null = a recorded dataset that is already there."""
+    """:printed: Synthetic street with one scene, generated at dataroot. null = a recorded dataset that is already
+    there."""
 
     @property
     def world_root(self) -> str:

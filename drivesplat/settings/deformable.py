@@ -1,8 +1,9 @@
 """Settings of the deformation of people, animals and cyclists."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.object_classes import ObjectClassName
@@ -27,9 +28,14 @@ class GaitSettings(Settings):
     weight: float = Field(0.01, ge=0)
     """Loss weight of the mean square of both."""
 
+    @field_validator("strides", mode="before")
+    @classmethod
+    def _laid_over_the_defaults(cls, value: Any) -> Any:
+        return {**STRIDES, **value} if isinstance(value, Mapping) else value
+
     def stride_of(self, object_class: str) -> float:
         """The initial length of a cycle of a class, in heights of the box."""
-        known: dict[str, float] = {**STRIDES, **self.strides}
+        known: dict[str, float] = {**self.strides}
         return known.get(object_class, known["pedestrian"])
 
 
@@ -40,7 +46,7 @@ class LatticeSettings(Settings):
     """Nodes along the length, width and height of the box."""
     learning_rate: float = Field(2e-3, gt=0)
     """Learning rate of displacements (metres) and rotations (radians)."""
-    size_weight: float = Field(0.1, ge=0)
+    l2_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean square of an object's displacements and rotations, times the square of the multiple of
     the phase. It is divided by the number of training images: with fewer images objects deform less."""
     smoothness_weight: float = Field(1.0, ge=0)
@@ -49,7 +55,7 @@ class LatticeSettings(Settings):
 
     def for_scene(self, objects: int, views: int) -> "LatticeSettings":
         """The settings with the weights of means over so many `objects`, in a scene of so many training `views`."""
-        weights = {name: getattr(self, name) * objects / max(1, views) for name in ("size_weight", "smoothness_weight")}
+        weights = {name: getattr(self, name) * objects / max(1, views) for name in ("l2_weight", "smoothness_weight")}
         return self.model_copy(update=weights)
 
 

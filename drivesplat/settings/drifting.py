@@ -20,7 +20,7 @@ Factors = Annotated[tuple[float, float], AfterValidator(_increasing)]
 class DriftingSeedSettings(Settings):
     """Initial Gaussians, at random places before the training cameras."""
 
-    share: float = Field(0.5, gt=0, le=1)
+    fraction: float = Field(0.5, gt=0, le=1)
     """Number of initial Gaussians, as a fraction of the maximum."""
     depths: Depths = (4.0, 60.0)
     """Range of their distances from the camera (metres), log-uniform."""
@@ -40,7 +40,7 @@ class DriftingSettings(Settings):
     """The part `drifting`: Gaussians with a velocity, a life peak and a life span, which need no boxes
     (docs/without_boxes.md)."""
 
-    share: float = Field(0.25, gt=0, le=1)
+    fraction: float = Field(0.25, gt=0, le=1)
     """Maximum number of its Gaussians, as a fraction of the maximum of the background's."""
     seed: DriftingSeedSettings = DriftingSeedSettings()
     min_span: float = Field(0.3, gt=0)

@@ -16,7 +16,7 @@ BACKBONE_RECORD = "resources/lpips/backbone.json"
 
 class LpipsSettings(Settings):
     enabled: bool = True
-    """Compute LPIPS. Downloads the AlexNet backbone once. false: LPIPS is null and nothing is downloaded."""
+    """:printed: Compute LPIPS. Downloads the AlexNet backbone once. false: LPIPS is null and nothing is downloaded."""
     url: str = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
     """URL of the backbone. Without a network, put the file into resources/lpips."""
     sha256: str = Field("7be5be79", pattern="^[0-9a-f]{8,64}$")

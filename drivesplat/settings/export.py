@@ -18,9 +18,10 @@ MAX_DISTANCE = 1000.0
 
 class ExportSettings(Settings):
     formats: tuple[ExportFormat, ...] = ("ply", "usd", "viewer", "colmap")
-    """What `snakemake` and `snakemake exports` make: 'ply' (splat.ply, parts, cameras.json, transforms.json), 'usd'
-    (scene.usdz), 'viewer' (viewer.html), 'colmap' (text model of cameras and seed points), 'spz' (compressed splat.spz)
-    and 'sog' (splat.sog; needs Node and @playcanvas/splat-transform). The other files are made on request."""
+    """:printed: What `snakemake` and `snakemake exports` make: 'ply' (splat.ply, parts, cameras.json, transforms.json),
+    'usd' (scene.usdz), 'viewer' (viewer.html), 'colmap' (text model of cameras and seed points), 'spz' (compressed
+    splat.spz) and 'sog' (splat.sog; needs Node and @playcanvas/splat-transform). The other files are made on
+    request."""
     max_distance: float = Field(MAX_DISTANCE, gt=0, le=MAX_DISTANCE)
     """Distance in metres from the world's origin within which all exported Gaussians lie. Those beyond are left out
     where no training image shows it, and moved nearer along the line of sight otherwise. docs/exports.md"""
@@ -35,14 +36,14 @@ class ExportSettings(Settings):
     viewer_gaussians: int = Field(300_000, ge=1)
     """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
     drive_width: int | None = Field(None, ge=16, le=7680)
-    """Width in pixels of the images in rendered drive folders. null: that of the training images."""
+    """:printed: Width in pixels of the images in rendered drive folders. null: that of the training images."""
     viewer_images: int = Field(640, ge=0, le=3840)
     """Width in pixels of the recorded images in viewer.html, one JPEG per key frame, about 30 KB each at 640. 0 = none.
     """
 
     scan_formats: tuple[ScanFormat, ...] = Field(("npz", "ply"), min_length=1)
-    """Files of rendered LiDAR scans: 'npz' (all rays), 'ply' (returns in world coordinates) and 'pcd.bin' (returns as
-    nuScenes has them). They are made on request. docs/lidar.md"""
+    """:printed: Files of rendered LiDAR scans: 'npz' (all rays), 'ply' (returns in world coordinates) and 'pcd.bin'
+    (returns as nuScenes has them). They are made on request. docs/lidar.md"""
 
     @field_validator("formats", "scan_formats")
     @classmethod

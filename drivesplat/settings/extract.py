@@ -9,7 +9,8 @@ OnMissing = Literal["stop", "warn"]
 
 class ExtractSettings(Settings):
     on_missing: OnMissing = "stop"
-    """Action for a missing or corrupt image: 'stop' fails and names it; 'warn' leaves it out and counts it."""
+    """:printed: Action for a missing or corrupt image: 'stop' fails and names it; 'warn' leaves it out and counts
+    it."""
 
 
 class SceneSource(Settings):

@@ -10,23 +10,23 @@ NEIGHBOURHOOD_HZ = 5.0
 
 class ImageSettings(Settings):
     width: int | None = Field(None, ge=16, le=10_000)
-    """Width (pixels) to which images are resized for training and evaluation (INTER_AREA, aspect ratio kept). null =
-    recorded size."""
+    """:printed: Width (pixels) to which images are resized for training and evaluation (INTER_AREA, aspect ratio kept).
+    null = recorded size."""
 
 
 class HoldoutSettings(Settings):
     every_nth: int = Field(8, ge=0)
-    """Hold out every so many key frames, from key frame `offset` on: group 'interpolation'. 0 = none."""
+    """:printed: Hold out every so many key frames, from key frame `offset` on: group 'interpolation'. 0 = none."""
     offset: int = Field(4, ge=0)
-    """The first of these key frames, at most every_nth: every_nth: 10 and offset: 10 hold out 10, 20, 30, ... 0 would
-    hold out the first key frame, which has no predecessor."""
+    """:printed: The first of these key frames, at most every_nth: every_nth: 10 and offset: 10 hold out 10, 20, 30, ...
+    0 would hold out the first key frame, which has no predecessor."""
     last_block: int = Field(4, ge=0)
-    """Number of key frames held out at the end of the drive: group 'extrapolation'. 0 = none."""
+    """:printed: Number of key frames held out at the end of the drive: group 'extrapolation'. 0 = none."""
     neighbourhood_s: float = Field(0.25, ge=0, le=5)
-    """Time in seconds around a held-out key frame in which nothing is trained on, for datasets with 5 key frames a
-    second or more. Below that rate it is half the interval between key frames."""
+    """:printed: Time in seconds around a held-out key frame in which nothing is trained on, for datasets with 5 key
+    frames a second or more. Below that rate it is half the interval between key frames."""
     cameras: tuple[str, ...] = ()
-    """Cameras of which no image is trained on: views from elsewhere at the times of training images, group
+    """:printed: Cameras of which no image is trained on: views from elsewhere at the times of training images, group
     'side_camera'. Any of `cameras` but eval_camera."""
 
     @model_validator(mode="after")

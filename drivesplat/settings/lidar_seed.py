@@ -11,18 +11,20 @@ from drivesplat.settings.images import HoldoutSettings, ImageSettings
 
 class LidarSeedSettings(Settings):
     on_missing: OnMissing = "stop"
-    """Action for a missing or corrupt LiDAR file: 'stop' fails and names it; 'warn' skips it and counts it."""
+    """:printed: Action for a missing or corrupt LiDAR file: 'stop' fails and names it; 'warn' skips it and counts
+    it."""
     sweeps: bool = False
-    """Use LiDAR sweeps between key frames, too (nuScenes: 20 Hz, ten times the returns): for this seed, for the seeds
-    of actors, and for the LiDAR depth of training images, which then comes from the sweep nearest in time. Sweeps
-    within half a key-frame interval of a held-out key frame are excluded. docs/real_logs.md"""
+    """:printed: Use LiDAR sweeps between key frames, too (nuScenes: 20 Hz, ten times the returns): for this seed, for
+    the seeds of actors, and for the LiDAR depth of training images, which then comes from the sweep nearest in time.
+    Sweeps within half a key-frame interval of a held-out key frame are excluded. docs/real_logs.md"""
     points_file: str | None = None
-    """PLY file with additional seed points in the dataset's global frame (metres), coloured from training images. null
-    = none."""
+    """:printed: PLY file with additional seed points in the dataset's global frame (metres), coloured from training
+    images. null = none."""
     triangulated: bool = True
     """Add points that refine_poses triangulated and at least two training images see."""
     max_points: int = Field(400_000, ge=100, le=10_000_000)
-    """Maximum number of points from LiDAR, triangulation and the points file. Further points are dropped at random."""
+    """:printed: Maximum number of points from LiDAR, triangulation and the points file. Further points are dropped at
+    random."""
     voxel_size: float = Field(0.1, ge=0, le=10)
     """Edge length (metres) of the voxels that keep one LiDAR point each. 0 = no thinning."""
     own_car_radius: float = Field(2.5, ge=0, le=10)

@@ -12,19 +12,21 @@ EgoMaskKind = Literal["none", "polygons", "auto", "auto_measured"]
 
 class MaskSettings(Settings):
     regions_folder: str | None = None
-    """Folder of your own label images, {camera}/{image name}.png or {camera}/{timestamp}.png. null = regions from the
-    annotated boxes. docs/masks.md"""
+    """:printed: Folder of your own label images, {camera}/{image name}.png or {camera}/{timestamp}.png. null = regions
+    from the annotated boxes. docs/masks.md"""
     sky_folder: str | None = None
-    """Folder of your own sky masks (255 = sky), with files of the same names. null = a heuristic."""
+    """:printed: Folder of your own sky masks (255 = sky), with files of the same names. null = a heuristic."""
     semantic_folder: str | None = None
-    """Folder of your own class maps (0, 1, 2, ...; 255 = unlabelled), with files of the same names, for
+    """:printed: Folder of your own class maps (0, 1, 2, ...; 255 = unlabelled), with files of the same names, for
     train.semantic_weight. null = none."""
     own_car: EgoMaskKind = "auto"
-    """Mask of the ego vehicle's body, which is excluded from training and from all regions. 'polygons': the outlines of
-    own_car_polygons. 'auto': these, and for cameras without an outline, except eval_camera, the image area that does
-    not change while the vehicle drives. 'auto_measured': the same with eval_camera. 'none': no mask. docs/cameras.md"""
+    """:printed: Mask of the ego vehicle's body, which is excluded from training and from all regions. 'polygons': the
+    outlines of own_car_polygons. 'auto': these, and for cameras without an outline, except eval_camera, the image area
+    that does not change while the vehicle drives. 'auto_measured': the same with eval_camera. 'none': no mask.
+    docs/cameras.md"""
     own_car_polygons: dict[str, tuple[tuple[float, float], ...]] = Field(default_factory=dict)
-    """Outline of the ego vehicle's body, by camera: points x, y in fractions of the image's width and height."""
+    """:printed: Outline of the ego vehicle's body, by camera: points x, y in fractions of the image's width and
+    height."""
 
 
 class MaskJob(Settings):

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.names import suggestion
 from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import MOVING_PARTS, STAGE_OF_PART, PartName, Parts
 
@@ -20,14 +21,17 @@ def merged(base: Mapping[str, Any], overrides: Mapping[Any, Any]) -> dict[str, A
 
 
 class MethodSettings(Settings):
+    of: str | None = None
+    """:printed: Method to build on: `parts` and `tracks` that are not given are its, and `overrides` are laid over its
+    own. vanilla and street can be built on even where they are dropped."""
     parts: Parts = ("background",)
-    """Parts of the model. Must contain 'background'."""
+    """:printed: Parts of the model. Must contain 'background'."""
     tracks: Tracks = "annotated"
-    """Tracks to train with: 'annotated', 'discovered' (moving objects found in LiDAR scans) or 'none'. Metrics use
-    annotated tracks whatever a method trains with. docs/without_boxes.md"""
+    """:printed: Tracks to train with: 'annotated', 'discovered' (moving objects found in LiDAR scans) or 'none'.
+    Metrics use annotated tracks whatever a method trains with. docs/without_boxes.md"""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """Settings that differ for this method, as a tree. Only `sky`, `train` and `random_seed` (of its training) may be
-    set."""
+    """:printed: Settings that differ for this method, as a tree. Only `sky`, `train` and `random_seed` (of its
+    training) may be set."""
 
     @model_validator(mode="after")
     def _actors_need_tracks(self) -> "MethodSettings":
@@ -52,6 +56,54 @@ class MethodSettings(Settings):
         """This method with other `parts`, unless None, and with `overrides` laid over its own."""
         own = parts or self.parts
         return MethodSettings(parts=own, tracks=self.tracks, overrides=merged(self.overrides, overrides))
+
+
+def default_methods() -> dict[str, MethodSettings]:
+    """The methods that the workflow ships with."""
+    overrides = {
+        "train": {
+            "sky_bce_weight": 0.05,
+            "horizon_weight": 0.05,
+            "depth_weight": 0.01,
+            "semantic_weight": 0.1,
+            "road_weight": 1.0,
+            "road": {"surface": "lidar"},
+            "dropout": 0.2,
+        }
+    }
+    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=overrides)}
+
+
+def built(methods: Mapping[Any, Any], shipped: Mapping[str, Mapping[str, Any]]) -> dict[Any, Any]:
+    """The trees of `methods` as YAML has them, with what each method takes from the one that it is `of` written out.
+
+    `shipped` are the trees of methods that can be built on even where `methods` drops them. What is no tree of a method
+    stays as it is, to be refused by the validation. Raises ValueError for a method of one that does not exist, and
+    where methods are of each other in a circle.
+
+    >>> built({"street": {"tracks": "none"}, "mine": {"of": "street", "parts": ["background"]}}, {})["mine"]
+    {'tracks': 'none', 'parts': ['background']}
+    """
+
+    def written_out(name: Any, derived: tuple[Any, ...]) -> Any:
+        if name in derived:
+            circle = " of ".join(map(repr, (*derived[derived.index(name) :], name)))
+            raise ValueError(f"methods cannot be of each other in a circle: {circle}")
+        tree = methods.get(name)
+        tree = shipped.get(name) if tree is None and derived else tree
+        if derived and tree is None:
+            known = [other for other in {**shipped, **methods} if other in shipped or methods[other] is not None]
+            raise ValueError(
+                f"method {derived[-1]!r} is of {name!r}, which is no method of the config; "
+                f"{suggestion(name, known)}there are: {', '.join(known)}"
+            )
+        if not isinstance(tree, Mapping) or not isinstance(tree.get("of"), str):
+            return tree
+        base = written_out(tree["of"], (*derived, name))
+        own = {key: value for key, value in tree.items() if key != "of"}
+        return merged(base, own) if isinstance(base, Mapping) else own
+
+    return {name: written_out(name, ()) for name in methods}
 
 
 VARIATION_OVERRIDES = ("sky", "train")

@@ -64,11 +64,12 @@ class RefinePosesSettings(Settings):
     """
 
     enabled: Literal["auto", True, False] = "auto"
-    """Use refined poses in all later stages. 'auto': for recorded drives and for synthetic worlds with pose_noise;
-    where refinement is impossible or rejected, the given poses are kept with a warning. true: fail without pycolmap."""
+    """:printed: Use refined poses in all later stages. 'auto': for recorded drives and for synthetic worlds with
+    pose_noise; where refinement is impossible or rejected, the given poses are kept with a warning. true: fail without
+    pycolmap."""
     start: Literal["recorded", "images"] = "recorded"
-    """Initial poses: 'recorded' corrects the dataset's poses; 'images' estimates poses from the images alone, for
-    drives without poses, and fails where the drive does not allow it. docs/poses.md"""
+    """:printed: Initial poses: 'recorded' corrects the dataset's poses; 'images' estimates poses from the images alone,
+    for drives without poses, and fails where the drive does not allow it. docs/poses.md"""
     features: FeatureSettings = FeatureSettings()
     priors: PriorSettings = PriorSettings()
     limits: LimitSettings = LimitSettings()

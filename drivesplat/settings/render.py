@@ -15,14 +15,14 @@ class TrajectorySettings(Settings):
     """A camera path parallel to the recorded one. All zero = the recorded path."""
 
     lateral: float = Field(0.0, ge=-50, le=50)
-    """Offset to the vehicle's left (metres). Negative = to its right."""
+    """:printed: Offset to the vehicle's left (metres). Negative = to its right."""
     vertical: float = Field(0.0, ge=-10, le=100)
-    """Offset upwards (metres)."""
+    """:printed: Offset upwards (metres)."""
     yaw: float = Field(0.0, ge=-180, le=180)
-    """Rotation of the camera to the left (degrees), about its own centre."""
+    """:printed: Rotation of the camera to the left (degrees), about its own centre."""
     parts: ShownParts = "all"
-    """Parts of the model to show: 'all', 'moving' (objects alone, on grey) or 'static' (the background without them).
-    Methods without moving parts have only films of 'all'."""
+    """:printed: Parts of the model to show: 'all', 'moving' (objects alone, on grey) or 'static' (the background
+    without them). Methods without moving parts have only films of 'all'."""
 
 
 def _default_trajectories() -> dict[str, TrajectorySettings]:
@@ -33,28 +33,29 @@ class RenderSettings(Settings):
     """Films along trajectories, at the recorded speed."""
 
     fps: int = Field(30, ge=1, le=240)
-    """Frames per second."""
+    """:printed: Frames per second."""
     width: int | None = Field(None, ge=16, le=7680, multiple_of=2)
-    """Width in pixels. Even, since H.264 requires it. null = that of the training images, at most 1920, or where
-    `height` is set as their aspect ratio gives it."""
+    """:printed: Width in pixels. Even, since H.264 requires it. null = that of the training images, at most 1920, or
+    where `height` is set as their aspect ratio gives it."""
     height: int | None = Field(None, ge=16, le=4320, multiple_of=2)
-    """Height in pixels. Even. null = as the aspect ratio of the training images gives it."""
+    """:printed: Height in pixels. Even. null = as the aspect ratio of the training images gives it."""
     horizontal_fov: float | None = Field(None, gt=1, lt=170)
-    """Horizontal field of view in degrees. null = that of the evaluated camera."""
+    """:printed: Horizontal field of view in degrees. null = that of the evaluated camera."""
     crf: int = Field(18, ge=1, le=51)
     """H.264 constant rate factor. Lower values give better quality and larger files; 18 is visually lossless."""
     captions: bool = True
-    """Write into films what is shown, the seconds of the drive, and where they go beyond the last training image."""
+    """:printed: Write into films what is shown, the seconds of the drive, and where they go beyond the last training
+    image."""
     compare: bool = True
-    """Make compare.mp4 with the films of a scene: its recorded images beside the renderings of all methods. It can
-    always be asked for by its name."""
+    """:printed: Make compare.mp4 with the films of a scene: its recorded images beside the renderings of all methods.
+    It can always be asked for by its name."""
     lidar: bool = True
-    """Make lidar.mp4 with the films of methods that render LiDAR: recorded scans beside rendered ones. It can always be
-    asked for by its name."""
+    """:printed: Make lidar.mp4 with the films of methods that render LiDAR: recorded scans beside rendered ones. It can
+    always be asked for by its name."""
     edited_frames: bool = False
-    """Also write the frames of edited drives as PNG, at full size, with labels in the JSON file."""
+    """:printed: Also write the frames of edited drives as PNG, at full size, with labels in the JSON file."""
     trajectories: dict[str, TrajectorySettings] = Field(default_factory=_default_trajectories)
-    """Films to render, each under a name of your choice."""
+    """:printed: Films to render, each under a name of your choice."""
 
 
 class FilmEncoding(Settings):

@@ -26,7 +26,7 @@ class ScanSettings(Settings):
     """LiDAR scans as rays, with and without a return. docs/lidar.md"""
 
     sweeps: bool = False
-    """Use LiDAR sweeps between key frames, too. Needs lidar_seed.sweeps: true."""
+    """:printed: Use LiDAR sweeps between key frames, too. Needs lidar_seed.sweeps: true."""
     azimuth_steps: int | None = Field(None, ge=8, le=100_000)
     """Firings of a beam in one revolution. null = as the dataset states, or as the gaps between returns suggest. Has no
     effect where files hold all rays (Waymo)."""

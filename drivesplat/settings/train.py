@@ -99,12 +99,12 @@ class DefaultSettings(Settings):
 
 class TrainSettings(Settings):
     iterations: int = Field(7_000, ge=1, le=1_000_000)
-    """Number of optimisation steps that fit an image each; methods that render LiDAR have further ones for scans
-    (`scans`)."""
+    """:printed: Number of optimisation steps that fit an image each; methods that render LiDAR have further ones for
+    scans (`scans`)."""
     strategy: Literal["mcmc", "default"] = "mcmc"
-    """Densification: 'mcmc', or 'default' (by gradient), which fills the space in front of sparse cameras."""
+    """:printed: Densification: 'mcmc', or 'default' (by gradient), which fills the space in front of sparse cameras."""
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
-    """Maximum number of Gaussians of the background. Those of objects come on top (`actors.cap_max` and
+    """:printed: Maximum number of Gaussians of the background. Those of objects come on top (`actors.cap_max` and
     `deformable.cap_max`). GPU memory: about 0.4 GB per million, and as much again while rendering."""
     pixels_per_gaussian: float = Field(20.0, ge=0)
     """Minimum number of training pixels per Gaussian (0 disables the limit). More Gaussians overfit single views."""
@@ -186,7 +186,7 @@ class TrainSettings(Settings):
     it is at the time of its line. false: as if all lines were recorded at the image's timestamp."""
     checkpoint_every: int = Field(500, ge=1)
     """Iterations between resume checkpoints. Slow iterations are saved every minute as well."""
-    checkpoint_apart_s: float = Field(60.0, ge=0)
+    min_checkpoint_interval_s: float = Field(60.0, ge=0)
     """Minimum time between resume checkpoints (seconds). More frequent ones would slow down short trainings."""
     cuda_graphs: bool = True
     """Capture iterations as CUDA graphs and replay them, on a GPU with strategy: mcmc. Otherwise Python launches each

@@ -15,9 +15,9 @@ class TrackSettings(Settings):
     """Learning rate of the position corrections (metres)."""
     lr_yaw: float = Field(5e-4, gt=0)
     """Learning rate of the heading corrections (radians)."""
-    size_weight: float = Field(0.001, ge=0)
+    l2_weight: float = Field(0.001, ge=0)
     """Loss weight of the mean square of the corrections, in units of `sigma_translation` and `sigma_yaw`."""
-    bend_weight: float = Field(0.001, ge=0)
+    smoothness_weight: float = Field(0.001, ge=0)
     """Loss weight of the mean square of their second differences along a track, in the same units. It keeps corrections
     smooth, so that they hold for the held-out frames in between (docs/street.md)."""
     sigma_translation: float = Field(0.1, gt=0)
@@ -31,7 +31,7 @@ class ActorSettings(Settings):
 
     cap_max: int = Field(200_000, ge=1, le=20_000_000)
     """Maximum number of Gaussians of all actors together. Each actor keeps at least four."""
-    least: int = Field(500, ge=1)
+    min_gaussians: int = Field(500, ge=1)
     """Number of Gaussians that every actor may have. Beyond it, train.pixels_per_gaussian limits an actor by the number
     of training pixels in its box."""
     sh_degree: int = Field(1, ge=0, le=3)

@@ -40,7 +40,7 @@ class TrainingImages:
         """The factor by which width and height are reduced at an iteration."""
         done, coarse = step / self._settings.iterations, self._settings.coarse_to_fine
         wanted = 4 if done < coarse.quarter_until else 2 if done < coarse.half_until else 1
-        return next((factor for factor in (4, 2) if factor <= wanted and self._rows >= factor * coarse.least_height), 1)
+        return next((factor for factor in (4, 2) if factor <= wanted and self._rows >= factor * coarse.min_height), 1)
 
     @cached_property
     def _rows(self) -> int:

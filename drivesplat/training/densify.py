@@ -72,11 +72,11 @@ class Densifier:
 def coarse_cap(cap: int, settings: TrainSettings) -> tuple[int, int]:
     """The cap while images are reduced, and the iteration at which it ends at the latest: early enough to grow to the
     full `cap` before densification stops."""
-    share, mcmc = settings.coarse_to_fine.share, settings.mcmc
-    if settings.strategy != "mcmc" or share == 1.0 or mcmc.growth == 0.0:
+    fraction, mcmc = settings.coarse_to_fine.fraction, settings.mcmc
+    if settings.strategy != "mcmc" or fraction == 1.0 or mcmc.growth == 0.0:
         return cap, 0
-    steps = math.ceil(-math.log(share) / math.log1p(mcmc.growth)) + 1
-    return max(1, int(share * cap)), int(settings.refine_stop * settings.iterations) - steps * mcmc.refine_every
+    steps = math.ceil(-math.log(fraction) / math.log1p(mcmc.growth)) + 1
+    return max(1, int(fraction * cap)), int(settings.refine_stop * settings.iterations) - steps * mcmc.refine_every
 
 
 def _info_of_rows(info: dict[str, Any], rows: slice) -> dict[str, Any]:

@@ -192,7 +192,7 @@ class TrainingRun:
         step, settings = self.trainer.step, self.trainer.settings
         age = time.monotonic() - self.saved
         due = step % settings.checkpoint_every == 0 or age >= MAX_UNSAVED_S
-        return due and step < self.trainer.iterations and age >= settings.checkpoint_apart_s
+        return due and step < self.trainer.iterations and age >= settings.min_checkpoint_interval_s
 
     def summary(self) -> TrainingSummary:
         t, on_gpu = self.trainer, self.trainer.device.type == "cuda"

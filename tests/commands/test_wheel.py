@@ -16,7 +16,7 @@ from helpers.patience import PATIENCE_S
 from drivesplat.provenance.code_digest import code_digest
 
 FOLDERS = ("envs", "presets", "profiles", "report", "rules", "workflow_scripts")
-FILES = ("Snakefile", "config.yaml", "config.schema.json", "docs/ghosts.md")
+FILES = ("Snakefile", "config.yaml", "config.schema.json", "docs/ghosts.md", "docs/settings.md")
 PLACE = "drivesplat/_workflow"
 
 

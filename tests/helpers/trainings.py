@@ -178,7 +178,7 @@ def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:
     """A training of 60 iterations in which everything happens that happens in one of 30,000."""
     common = {
         "iterations": ITERATIONS, "strategy": strategy, "cap_max": 200, "checkpoint_every": CHECKPOINT_AT,
-        "checkpoint_apart_s": 0.0, "log_every": 10, "image_every": 30,
+        "min_checkpoint_interval_s": 0.0, "log_every": 10, "image_every": 30,
         "gaussians": GaussianSettings(sh_degree=1, lr_means=2e-3, lr_sh0=2e-2, lr_scales=1e-2),
         "mcmc": McmcSettings(refine_every=5, noise_lr=1e3),
         "default": DefaultSettings(refine_every=5, grow_grad2d=5e-3),

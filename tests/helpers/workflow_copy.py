@@ -37,7 +37,7 @@ TINY_TRAINING = {
     "iterations": 60,
     "log_every": 10,
     "checkpoint_every": 20,
-    "checkpoint_apart_s": 0.0,
+    "min_checkpoint_interval_s": 0.0,
     "image_every": 30,
     "gaussians": {"sh_degree": 1},
     "sky_resolution": 8,

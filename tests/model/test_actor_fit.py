@@ -149,7 +149,7 @@ def test_a_wrong_annotation_among_right_ones_is_corrected(mistake: Callable[[np.
     views, left = recorded(thing, motion, from_the_kerb()), {}
     for corrected in (True, False):
         tracks = TrackSettings(
-            corrected=corrected, lr_translation=5e-3, lr_yaw=5e-3, size_weight=1e-4, bend_weight=1e-4, sigma_yaw=0.3
+            corrected=corrected, lr_translation=5e-3, lr_yaw=5e-3, l2_weight=1e-4, smoothness_weight=1e-4, sigma_yaw=0.3
         )
         settings = ActorSettings(sh_degree=0, fourier=1, tracks=tracks)
         actors = guessed(thing, dataclasses.replace(motion, object_to_world=wrong), settings, off=0.0)

@@ -397,7 +397,7 @@ def test_penalties_are_mean_squares_in_units_of_the_annotation_error():
     rng = np.random.default_rng(7)
     translation, yaw = rng.normal(size=(5, 3)), rng.normal(size=5)
     found = penalties_of(
-        translation, yaw, van(), sigma_translation=0.2, sigma_yaw=0.05, size_weight=0.3, bend_weight=0.7
+        translation, yaw, van(), sigma_translation=0.2, sigma_yaw=0.05, l2_weight=0.3, smoothness_weight=0.7
     )
     size = np.mean([(np.sum(translation[i] ** 2) / 0.2**2 + yaw[i] ** 2 / 0.05**2) for i in range(5)])
     bends = [(values[:-2] - 2 * values[1:-1] + values[2:]) ** 2 for values in (translation / 0.2, yaw / 0.05)]

@@ -210,7 +210,7 @@ def an_untrained_model(settings: TrainSettings, **more: object) -> SplatModel:
 
 
 def test_the_number_of_drifting_gaussians_is_a_share_of_all_others():
-    own = DriftingSettings(share=0.2, seed=DriftingSeedSettings(share=0.5))
+    own = DriftingSettings(fraction=0.2, seed=DriftingSeedSettings(fraction=0.5))
     model = an_untrained_model(TrainSettings(cap_max=1000, drifting=own))
     assert [part.name for part in model.parts] == ["background", "drifting"]
     assert len(model.parts[1]) == 100 and model.parts[1].cap_max == 200

@@ -391,7 +391,9 @@ def test_actors_are_initialised_from_their_records():
     ],
 )
 def test_an_actors_gaussians_are_capped_by_its_training_pixels(pixels, changes, expected):
-    settings = TrainSettings(**{"pixels_per_gaussian": 20.0, "actors": ActorSettings(least=8, cap_max=300), **changes})
+    settings = TrainSettings(
+        **{"pixels_per_gaussian": 20.0, "actors": ActorSettings(min_gaussians=8, cap_max=300), **changes}
+    )
     record = actor_record(a_track(), pixels=pixels)
     assert actor_cap(record, settings.actors, settings.pixels_per_gaussian) == expected
 
@@ -399,7 +401,7 @@ def test_an_actors_gaussians_are_capped_by_its_training_pixels(pixels, changes, 
 def test_each_actor_is_initialised_with_at_most_its_cap():
     """A twentieth of 400 and of 2000 pixels; together they may never have more than both."""
     records = [actor_record(a_track(), 60, pixels=400), actor_record(a_track("later", 1.0), 60, pixels=2000)]
-    settings = TrainSettings(pixels_per_gaussian=20.0, actors=ActorSettings(least=8))
+    settings = TrainSettings(pixels_per_gaussian=20.0, actors=ActorSettings(min_gaussians=8))
     (actors,) = build_model(model_init(parser_record(20), *records), ("actors",), "none", settings).parts
     assert actors.params["owner"].tolist() == [0] * 20 + [1] * 60 and actors.cap_max == 120
     kept = {tuple(row) for row in actors.params["means"].detach()[:20].numpy()}

@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+from collections.abc import Iterator
 from typing import Any
 
 import jsonschema
@@ -12,6 +14,7 @@ from helpers import REPOSITORY
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, for_scene, load, merged
 from drivesplat.settings.config_document import config_schema, config_yaml
+from drivesplat.settings.settings_page import settings_page
 from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
 
 LOOKS = (
@@ -50,12 +53,47 @@ def test_config_schema_is_what_the_settings_say():
     assert text == config_schema(), "config.schema.json and drivesplat/settings have drifted apart: run `make config`"
 
 
+def test_the_page_of_settings_is_what_the_settings_say():
+    text = (REPOSITORY / "docs/settings.md").read_text(encoding="utf-8")
+    assert text == settings_page(), "docs/settings.md and drivesplat/settings have drifted apart: run `make config`"
+
+
 def test_config_yaml_holds_the_defaults(defaults):
     assert load(defaults) == load({}) == Config()
 
 
-def test_config_yaml_has_lines_that_fit_a_screen():
-    assert max(map(len, config_yaml().splitlines())) <= 120
+def test_config_yaml_fits_two_screens():
+    lines = config_yaml().splitlines()
+    assert max(map(len, lines)) <= 120 and len(lines) <= 350
+    assert len([line for line in lines if re.match(r" *\w+: .", line)]) <= 120
+
+
+def test_the_page_of_settings_has_every_setting_with_its_meaning():
+    page = re.sub(r"\[([\w-]+\.md)\]\(\1\)", r"docs/\1", settings_page())
+    rows = {(row[1], row[2]) for row in re.finditer(r"^\| \W*(\w+)`.* \| (.*) \|$", page, re.MULTILINE)}
+    schema = json.loads(config_schema())
+    records = [schema, *schema["$defs"].values()]
+    fields = [(name, field) for record in records for name, field in record.get("properties", {}).items()]
+    assert len(fields) > 300
+    for name, field in fields:
+        assert "description" not in field or (name, field["description"].replace("|", "\\|")) in rows, name
+
+
+def nodes(tree: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """All values of a tree of settings, mappings included, with their paths."""
+    for key, value in tree.items():
+        yield (*path, key), value
+        if isinstance(value, dict):
+            yield from nodes(value, (*path, key))
+
+
+def test_what_config_yaml_does_not_print_is_laid_over_the_default_as_if_it_did(defaults):
+    """A part of a mapping keeps the rest of it: what YAML would merge, were it printed, the records merge."""
+    whole = json.loads(Config().model_dump_json())
+    for path, value in nodes(whole):
+        if isinstance(value, dict) and len(value) > 1:
+            one = at(".".join(path), dict([next(iter(value.items()))]))
+            assert load(merged(defaults, one)) == load(merged(whole, one)), ".".join(path)
 
 
 STABLE_PATHS = (

@@ -35,7 +35,7 @@ def test_groups_and_regions_are_those_of_metrics_json():
         (ENTRY, "'published' is {'source': 'VAD-GS', .*: it must be a list, each entry of which begins with '- '"),
         (None, "'published' is None: it must be a list"),
         ([22.77], r"'published\.0' is 22.77: it must be a mapping"),
-        ([ENTRY, without("url")], r"'published\.1\.url' is missing: config\.yaml says what it is"),
+        ([ENTRY, without("url")], r"'published\.1\.url' is missing: docs/settings\.md says what it is"),
         (
             [{**ENTRY, "url": "VAD-GS"}],
             r"'published\.0\.url' is 'VAD-GS': it must be the address of a page, as https://",

@@ -14,7 +14,7 @@ from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.views import LidarDepth, TrainingView, view_index
 
 WIDTH, HEIGHT = 14, 9
-MIN_HEIGHT = CoarseToFineSettings().least_height
+MIN_HEIGHT = CoarseToFineSettings().min_height
 
 
 def a_view(width: int = WIDTH, height: int = HEIGHT) -> TrainingView:

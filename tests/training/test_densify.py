@@ -137,10 +137,10 @@ def test_mcmc_grows_by_the_configured_fraction():
 
 def test_there_are_coarse_cap_in_time_to_become_all():
     """A third more needs six times a twentieth, and another for what is rounded away."""
-    coarse = CoarseToFineSettings(share=0.75)
+    coarse = CoarseToFineSettings(fraction=0.75)
     overrides = {"coarse_to_fine": coarse, "refine_stop": 0.8, "mcmc": McmcSettings(refine_every=20)}
     assert coarse_cap(1000, settings_of("mcmc", **overrides)) == (750, 800 - 7 * 20)
-    for left_alone in ({"mcmc": McmcSettings(growth=0.0)}, {"coarse_to_fine": CoarseToFineSettings(share=1.0)}):
+    for left_alone in ({"mcmc": McmcSettings(growth=0.0)}, {"coarse_to_fine": CoarseToFineSettings(fraction=1.0)}):
         assert coarse_cap(1000, settings_of("mcmc", **{**overrides, **left_alone})) == (1000, 0)
     assert coarse_cap(1000, settings_of("default", **overrides)) == (1000, 0)
 

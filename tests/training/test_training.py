@@ -312,14 +312,14 @@ def test_static_methods_have_no_settings_of_dynamic_parts():
 
 
 def test_a_moving_part_knows_no_settings_of_other_moving_parts():
-    moving = {"actors": ActorSettings(fourier=2), "drifting": DriftingSettings(share=0.1)}
+    moving = {"actors": ActorSettings(fourier=2), "drifting": DriftingSettings(fraction=0.1)}
     settings = settings_of(**moving, dynamic_weight=0.9)
     kept = settings.for_parts(("background", "actors"))
     assert kept == settings.model_copy(update={"drifting": DriftingSettings()})
 
 
 def test_parts_that_move_without_objects_know_no_loss_weights_of_objects():
-    kept = {"drifting": DriftingSettings(share=0.1)}
+    kept = {"drifting": DriftingSettings(fraction=0.1)}
     settings = settings_of(**kept, entropy_weight=0.7, dynamic_weight=0.9)
     assert settings.for_parts(("background", "drifting")) == settings_of(**kept)
 
@@ -484,7 +484,7 @@ def test_resume_states_come_no_sooner_than_their_time(apart, kept, tmp_path, mon
     views = TickingViews(recorded_views(), 45)
     monkeypatch.setattr("drivesplat.training.train.time", SimpleNamespace(monotonic=lambda: views.seconds))
     with pytest.raises(EndedError):
-        trained(tmp_path, settings_of(checkpoint_every=10, checkpoint_apart_s=apart), views)
+        trained(tmp_path, settings_of(checkpoint_every=10, min_checkpoint_interval_s=apart), views)
     state = tmp_path / "resume/state.npz"
     assert (checkpoint_file.load(state, "train")["step"] if state.exists() else None) == kept
 
