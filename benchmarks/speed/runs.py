@@ -187,13 +187,13 @@ def _continue(
     settings = begun.settings.model_copy(update={**continued, "coarse_to_fine": WHOLE_IMAGES})
     folders = TrainingFolders(_profile_folder(task) / "resume", _profile_folder(task) / "tensorboard", "", task.label)
     trained = begun.model if model is None else model
-    train(trained, begun.views, settings, task.seed, device, folders, begun.priors, clock, scans=begun.scans)
+    train(trained, begun.views, settings, task.seed, device, folders, begun.road, clock, scans=begun.scans)
     shutil.rmtree(_profile_folder(task))
 
 
 def _inputs(task: Task) -> tuple[TrainingInputs, list[dict[str, Any]]]:
     files = task.files
-    return read_inputs(files.parser, [files.masks], files.actors, files.lidar_depth, files.free_space, files.scans)
+    return read_inputs(files.parser, [files.masks], files.actors, files.lidar_depth, files.scans)
 
 
 def _profile_folder(task: Task) -> Path:

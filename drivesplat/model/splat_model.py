@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from drivesplat.errors import ResultError
 from drivesplat.kernels.colored_projection import SetOnRoad
 from drivesplat.kernels.road_distance import Road
-from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, GaussianSets, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
@@ -25,9 +24,8 @@ from drivesplat.rasterization import Rendering, rasterize, rasterize_projected
 
 
 class SplatModel(nn.Module):
-    """Parts, a sky (None: black), exposures of cameras (None: all alike), pose corrections (None: recorded poses).
-    Without `rolling_shutter`, views are rendered as if they had a global shutter. With `max_scale` above 0, Gaussians
-    in images have `limited_scales`."""
+    """Parts, a sky (None: black) and exposures of cameras (None: all alike). Without `rolling_shutter`, views are
+    rendered as if they had a global shutter. With `max_scale` above 0, Gaussians in images have `limited_scales`."""
 
     def __init__(
         self,
@@ -35,7 +33,6 @@ class SplatModel(nn.Module):
         sky: Sky | None,
         antialiased: bool = False,
         exposure: Exposures | None = None,
-        camera_poses: CameraPoses | None = None,
         rolling_shutter: bool = True,
         max_scale: float = 0.0,
     ):
@@ -43,7 +40,6 @@ class SplatModel(nn.Module):
         self.parts = nn.ModuleList(parts)
         self.sky = sky
         self.exposure = exposure
-        self.camera_poses = camera_poses
         self.antialiased = antialiased
         self.rolling_shutter = rolling_shutter
         self.max_scale = max_scale
@@ -52,9 +48,9 @@ class SplatModel(nn.Module):
         return sum(len(part) for part in self.parts)
 
     @property
-    def beside_parts(self) -> dict[str, Sky | Exposures | CameraPoses]:
+    def beside_parts(self) -> dict[str, Sky | Exposures]:
         """Other learned modules by name, with `params` and `learning_rates()`."""
-        named = {"sky": self.sky, "exposure": self.exposure, "camera_poses": self.camera_poses}
+        named = {"sky": self.sky, "exposure": self.exposure}
         return {name: module for name, module in named.items() if module is not None}
 
     def precompute(self, times: Sequence[float]) -> None:
@@ -239,10 +235,8 @@ class SplatModel(nn.Module):
         return self.sets_at(view.time, with_velocities=self.rolling_shutter and view.shutter is not None)
 
     def seen_from(self, view: View) -> View:
-        """The view from its camera's corrected pose, where this model corrects poses, and without rolling shutter,
-        where it renders none."""
-        shown = view if self.rolling_shutter else view.global_shutter
-        return shown if self.camera_poses is None else self.camera_poses.corrected(shown)
+        """The view, without rolling shutter where this model renders none."""
+        return view if self.rolling_shutter else view.global_shutter
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
         """The alpha of the parts with objects alone, for a picture with a set of each part; None without such parts.

@@ -14,6 +14,7 @@ import torch
 from drivesplat.errors import TrainingError
 from drivesplat.io import checkpoint_file
 from drivesplat.kernels.cuda_graphs import capture_stream
+from drivesplat.kernels.road_distance import Road
 from drivesplat.machine.device import device_name, explain_out_of_memory
 from drivesplat.model.picture import Picture
 from drivesplat.model.reach import bound_positions, reach_of
@@ -23,7 +24,6 @@ from drivesplat.training import resume_state
 from drivesplat.training.averaging import ParameterAverage
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, SensorPath, fade_in_empty_space
-from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor, camera_figures
 from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
 from drivesplat.training.scans import TrainingScan
@@ -62,7 +62,7 @@ class TrainingSummary:
 
     `iterations` are those that `train.iterations` counts, and `scan_iterations` those that fitted a LiDAR scan.
     `peak_gpu_memory_gb` is torch's peak reservation, None on the CPU; `seconds` includes the runs before a resume;
-    `of_cameras` are the learned gains, offsets and pose corrections of each camera, by name.
+    `of_cameras` are the learned gains and offsets of each camera, by name.
     """
 
     iterations: int
@@ -83,20 +83,21 @@ def train(
     seed: int,
     device: torch.device,
     folders: TrainingFolders,
-    priors: GeometryPriors = NO_PRIORS,
+    road: Road | None = None,
     clock: Clock = UNTIMED,
     curves: CurveViews = MappingProxyType({}),
     scans: Sequence[TrainingScan] = (),
     visits: Visits = NO_VISITS,
 ) -> TrainingSummary:
     """Fits `model` in place to `views` and LiDAR `scans`, resuming an interrupted run of the same training; `clock`
-    times its stages. `curves` are the images of PSNR curves in TensorBoard; `visits` see the model during the training.
+    times its stages. `road` is the surface of the road (None: unknown or not wanted). `curves` are the images of PSNR
+    curves in TensorBoard; `visits` see the model during the training.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
-        trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock, scans)
+        trainer = Trainer.begin(model.to(device), views, settings, seed, device, road, clock, scans)
         run = TrainingRun.begin(trainer, folders, curves, visits)
         with Monitor(folders.tensorboard, trainer.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
@@ -215,9 +216,9 @@ class TrainingRun:
 def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     sensors = trainer.sensor_positions
-    below = trainer.priors.road if settings.floaters.below_road else None
+    below = trainer.road if settings.floaters.below_road else None
     driven = SensorPath.of(sensors, settings.floaters.radius) if settings.floaters.radius else None
-    empty = EmptySpace(driven, trainer.priors.free, below)
+    empty = EmptySpace(driven, below)
     reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
     while trainer.step < trainer.iterations:
         with trainer.clock.stage(ITERATION):

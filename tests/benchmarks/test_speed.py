@@ -64,8 +64,8 @@ def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_pa
     assert json.loads(run.plan.settings("train")(at)) == task.train.model_dump(mode="json")
     assert (task.code, task.stage) == (run.plan.code("train"), "street-77-seed5/train")
     files = task.files
-    assert [[*paths] for paths in (files.actors, files.lidar_depth, files.free_space, files.scans)] == [
-        run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "free_space", "scans")
+    assert [[*paths] for paths in (files.actors, files.lidar_depth, files.scans)] == [
+        run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "scans")
     ]
     assert {Path(path).name for path in targets_of(run)} == {
         "scene_refined.json", "parser.pkl", "masks.json", "actors.npz", "lidar_depth.npz"

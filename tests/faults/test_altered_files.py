@@ -27,8 +27,8 @@ class NamedFiles(list):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> WorkflowCopy:
-    """A run that has measured one method with actors, supervised with LiDAR depth and free space."""
-    street = {"train": {"depth_weight": 0.1, "floaters": {"free_space": True}}}
+    """A run that has measured one method with actors, supervised with LiDAR depth."""
+    street = {"train": {"depth_weight": 0.1}}
     copy = WorkflowCopy.make(
         tmp_path_factory.mktemp("altered"),
         methods={"street": {"parts": ["background", "actors"], "overrides": street}},

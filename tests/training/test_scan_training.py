@@ -460,7 +460,7 @@ def test_without_images_iterations_with_scans_flatten_surfaces():
 
     def terms(inputs: TrainingInputs, **changes: float) -> set[str]:
         begun = prepare(inputs, job_of(iterations=10, **changes, scans=scans), CPU)
-        trainer = Trainer.begin(begun.model, begun.views, begun.settings, 0, CPU, begun.priors, scans=begun.scans)
+        trainer = Trainer.begin(begun.model, begun.views, begun.settings, 0, CPU, begun.road, scans=begun.scans)
         return set(trainer.fit_one()[0])
 
     surfaces = {"flatness_weight": 0.1, "road_weight": 0.1}

@@ -52,9 +52,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.io import checkpoint_file
-from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.depth_record import PixelDepths
-from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
@@ -70,7 +68,6 @@ from drivesplat.settings.train import (
 )
 from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.training import resume_state
-from drivesplat.training.geometry_priors import GeometryPriors
 from drivesplat.training.monitor import NEVER, FiniteGuard, Monitor
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.road import driven_road
@@ -229,21 +226,6 @@ def test_actors_are_no_floaters(tmp_path):
     assert (still < 1e-3).any() and not (actors < 1e-3).any()
 
 
-def all_around(lower: float = -10.0, edge: float = 20.0) -> SparseGrid:
-    """A grid of one cell that holds everything."""
-    return SparseGrid.from_numpy(np.full(3, lower), edge, np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64))
-
-
-@pytest.mark.parametrize("free", [None, all_around()], ids=["unknown", "all free"])
-def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
-    settings = settings_of(iterations=7, refine_start=1.0, floaters=FloaterSettings(every=7, radius=0))
-    model = untrained_street(settings)
-    folders = folders_of(tmp_path, "of this training")
-    train(model, recorded_views(), settings, 0, CPU, folders, GeometryPriors(free=free))
-    still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
-    assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
-
-
 @pytest.mark.parametrize("fades", [False, True])
 def test_gaussians_below_the_road_fade_where_wanted(tmp_path, fades):
     """The road lies above all Gaussians."""
@@ -251,10 +233,10 @@ def test_gaussians_below_the_road_fade_where_wanted(tmp_path, fades):
     poses[0, 2, 3] = 4.5
     floaters = FloaterSettings(every=7, radius=0, below_road=fades)
     settings = settings_of(iterations=7, refine_start=1.0, floaters=floaters, road_weight=0.1)
-    model, priors = untrained_street(settings), GeometryPriors(road=driven_road(poses, wide))
-    low = priors.road.is_above(model.parts[0].params["means"].detach())
+    model, road = untrained_street(settings), driven_road(poses, wide)
+    low = road.is_above(model.parts[0].params["means"].detach())
     assert low.any()
-    train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "of this training"), priors)
+    train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "of this training"), road)
     still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
     assert bool((still[low] < 1e-3).all()) == fades and not (actors < 1e-3).any()
 
@@ -291,8 +273,8 @@ def test_a_training_applies_the_flatness_and_road_losses():
     settings = settings_of(flatness_weight=0.2, road_weight=0.3)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, 2, 3], poses[:, 0, 3] = 4.5, [-1.0, 1.0]
-    priors = GeometryPriors(road=driven_road(poses, settings.road))
-    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, priors)
+    road = driven_road(poses, settings.road)
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, road)
     before = trainer.model.gaussians_at(0.0)
     terms, *_ = trainer.fit_one()
     torch.testing.assert_close(terms["flatness"], 0.2 * before.scales.amin(dim=1).mean())
@@ -755,24 +737,6 @@ def test_views_that_show_no_gaussian_are_no_error(tmp_path):
     assert summary.iterations == 10
 
 
-@pytest.mark.parametrize(
-    ("strategy", "absgrad", "asked"), [("mcmc", True, False), ("default", True, True), ("default", False, False)]
-)
-def test_absolute_gradients_are_asked_for_by_the_default_strategy_alone(monkeypatch, strategy, absgrad, asked):
-    settings = settings_of(strategy, default=DefaultSettings(absgrad=absgrad))
-    trainer = Trainer.begin(untrained(settings), recorded_views(1), settings, 0, CPU)
-    render, rendered = trainer.model.render, []
-    monkeypatch.setattr(trainer.model, "render", lambda *a, **k: rendered.append(k["absgrad"]) or render(*a, **k))
-    trainer.fit_one()
-    assert rendered == [asked]
-
-
-def test_absolute_gradients_grow_gaussians_on_the_cpu(tmp_path):
-    settings = settings_of("default", default=DefaultSettings(absgrad=True, grow_grad2d=1e-3, refine_every=5))
-    _, summary = trained(tmp_path, settings)
-    assert summary.gaussians > len(untrained(settings))
-
-
 # ---- what it tells
 
 
@@ -830,18 +794,6 @@ def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
     assert summary["peak_gpu_memory_gb"] is None and summary["resumed_at"] == []
     views = recorded_views()
     assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
-
-
-EVERYWHERE = FreeSpace(np.full(3, -10.0), np.ones(3, np.int64), 20.0, np.zeros(1, np.int64))
-"""Free space that holds all there is."""
-
-
-def test_a_training_keeps_gaussians_out_of_the_free_space_that_it_is_given(tmp_path):
-    """Where that is everywhere, none is left."""
-    inputs = dataclasses.replace(inputs_in(tmp_path), free_space=EVERYWHERE)
-    job = job_of(floaters=FloaterSettings(every=7, radius=0, free_space=True))
-    with pytest.raises(TrainingError, match="no Gaussian is left"):
-        run_training(inputs, job, DeviceSettings(kind="cpu"), files_in(tmp_path / "vanilla"), PROVENANCE, "train")
 
 
 def test_the_terms_about_surfaces_are_logged(tmp_path):
