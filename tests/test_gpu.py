@@ -528,7 +528,7 @@ def steps_of(trainer: Trainer) -> dict[str, int]:
 def continued(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
     """The loss terms of the last of so many iterations."""
     for _ in range(iterations):
-        terms, picture, _ = trainer.fit_one(with_picture=False)
+        terms, picture, _ = trainer.training_step(with_picture=False)
         trainer.densify(picture)
     return terms
 

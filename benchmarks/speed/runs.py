@@ -50,9 +50,9 @@ from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import CoarseToFineSettings
 from drivesplat.training.clock import UNTIMED, Clock
+from drivesplat.training.probes import Probes
 from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
 from drivesplat.training.train import TrainingFolders, train
-from drivesplat.training.visits import Visits
 from drivesplat.workflow.gpus import hold_gpu
 
 Times = dict[str, Any]
@@ -75,7 +75,7 @@ def run(task: Task) -> dict[str, Any]:
         recording, _ = read_prepared_drive(task.files.scene, task.files.parser, task.files.masks)
         masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
         curve = QualityCurve(held_out_frames(recording, camera, device) if task.visits else [])
-        visits, before = Visits(task.visits, curve.see), CpuSample.now()
+        visits, before = Probes(task.visits, curve.see), CpuSample.now()
         if task.recipe == OURS:
             times, model = ours(task, device, visits)
         else:
@@ -99,7 +99,7 @@ def run(task: Task) -> dict[str, Any]:
         }
 
 
-def plain(task: Task, device: torch.device, paths: list[str], visits: Visits) -> tuple[Times, SplatModel]:
+def plain(task: Task, device: torch.device, paths: list[str], visits: Probes) -> tuple[Times, SplatModel]:
     """Times of a training by a variant of the plain recipe, and its model. Raises DeviceError for a packed one without
     a GPU."""
     variant = _variant(task)
@@ -128,7 +128,7 @@ def _sky(task: Task, device: torch.device) -> CubemapSky | None:
     return None if sky is None else sky.to(device)
 
 
-def ours(task: Task, device: torch.device, visits: Visits) -> tuple[Times, SplatModel]:
+def ours(task: Task, device: torch.device, visits: Probes) -> tuple[Times, SplatModel]:
     """Times of a training by the function of the rule `train`, and its model. Two iterations before it load its
     kernels."""
     _continue(task, device, 2)

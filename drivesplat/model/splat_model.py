@@ -166,7 +166,6 @@ class SplatModel(nn.Module):
         sh_degree: int | None = None,
         *,
         gaussians: Gaussians | Sequence[Gaussians] | None = None,
-        absgrad: bool = False,
         with_depth: bool = False,
         with_objects: bool = False,
         with_surface_depth: bool = False,
@@ -184,15 +183,15 @@ class SplatModel(nn.Module):
         plain = not (with_surface_depth or self.antialiased or self.max_scale)
         on_road = self._on_road(road, sets)
         projected = projected_sets(sets, seen_from, sh_degree, with_depth, on_road) if plain else None
-        options = {"absgrad": absgrad, "objects": self._rows_of_objects() if with_objects else None}
+        objects = self._rows_of_objects() if with_objects else None
         if projected is not None:
             size = seen_from.width, seen_from.height
-            rendering = rasterize_projected(projected, *size, with_depth=with_depth, **options)
+            rendering = rasterize_projected(projected, *size, with_depth=with_depth, objects=objects)
         else:
             colors, degree = rasterizer_colors(sets, seen_from, sh_degree)
             rendering = rasterize(
                 **self._placed(sets.shapes, seen_from), colors=colors, sh_degree=degree, with_depth=with_depth,
-                with_surface_depth=with_surface_depth, **options,
+                with_surface_depth=with_surface_depth, objects=objects,
             )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
         image = splats

@@ -34,13 +34,13 @@ from drivesplat.training import resume_state
 from drivesplat.training.dropout import dropout_share
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.mirroring import choose_mirrored
+from drivesplat.training.probes import NO_PROBES, Probes
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
 from drivesplat.training.road import road_of
 from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.unseen import fill_unseen
-from drivesplat.training.views import Guides, TrainingView, load_views
-from drivesplat.training.visits import NO_VISITS, Visits
+from drivesplat.training.views import Supervision, TrainingView, load_views
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ class TrainingInputs:
     sky_known: bool = True
     scans: list[RecordedScan] = dataclasses.field(default_factory=list)
 
-    def guides(self, job: TrainJob) -> Guides:
-        """The guides of the training images that `job` uses."""
+    def supervision(self, job: TrainJob) -> Supervision:
+        """The supervision of the training images that `job` uses."""
         images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         not_sky_wanted = self.masks is not None and not self.sky_known and job.train.horizon_weight
         moving_wanted = self.actors and (job.train.dynamic_weight or job.sky == "cubemap")
-        return Guides(
+        return Supervision(
             sky=_of_each(images, lambda i: read_sky_mask(*self._image(i))) if sky_wanted else {},
             moving=_of_each(images, self._moving) if moving_wanted else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
@@ -166,7 +166,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     """Loads the training images onto the device, builds an untrained model, and resolves in the settings what
     depends on the scene."""
     with explain_out_of_memory(lambda: 0):
-        views = load_views(inputs.record, inputs.guides(job), device)
+        views = load_views(inputs.record, inputs.supervision(job), device)
     rays = sum(int(scan.measured.sum()) for scan in inputs.scans)
     record, cap = inputs.record, gaussian_cap(inputs.record, job.train, rays)
     if job.train.scans.per_image:
@@ -207,7 +207,7 @@ def curve_views(
         return {}
     record = inputs.record
     held_out = evenly_spaced([int(i) for group in HELD_OUT_GROUPS for i in record.splits.get(group, ())])
-    masks = Guides(sky={}, moving={}, lidar={}, ego_mask=_of_each(inputs.with_ego(held_out), inputs.ego_mask))
+    masks = Supervision(sky={}, moving={}, lidar={}, ego_mask=_of_each(inputs.with_ego(held_out), inputs.ego_mask))
     return {
         "psnr/train": [views[i] for i in evenly_spaced(range(len(views)))],
         "psnr/held_out": load_views(record, masks, device, held_out),
@@ -221,7 +221,7 @@ def run_training(
     files: TrainingFiles,
     provenance: Provenance,
     label: str,
-    visits: Visits = NO_VISITS,
+    probes: Probes = NO_PROBES,
 ) -> None:
     """Trains and writes both files, or raises and writes neither. The resume state is kept after a failure, and where
     the parent process was killed meanwhile: Snakemake did not see this training end and will run it again."""
@@ -239,7 +239,7 @@ def run_training(
         model, seed = begun.model, job.random_seed
         summary = train(
             model, begun.views, begun.settings, seed, device, folders, begun.road,
-            curves=begun.curves, scans=begun.scans, visits=visits,
+            curves=begun.curves, scans=begun.scans, probes=probes,
         )  # fmt: skip
         with explain_out_of_memory(lambda: len(model)):
             fill_unseen(model, begun.views)

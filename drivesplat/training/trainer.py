@@ -114,7 +114,7 @@ class Trainer:
         """Whether the next iteration fine-tunes what only the LiDAR sees: it fits a scan and changes no image."""
         return self.scan_schedule.fine_tunes(self.step)
 
-    def fit_one(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView | None]:
+    def training_step(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView | None]:
         """The first half of an iteration: render a view or a scan, compare, step. Returns its loss terms, the picture
         and the view, both None after a scan. Without `with_picture` the iteration may be that of a scan or a replayed
         CUDA graph, and the picture is None; without images, and where it fine-tunes, it is that of a scan."""
@@ -124,9 +124,9 @@ class Trainer:
         if self.fits_scan and (self.fine_tunes or not (with_picture and self.images.views)):
             return self._fit_scan(step, rates), None, None
         with self.clock.stage("data"):
-            number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
+            number, view = self.images.number(self._images_done), self.images.at(self.step, self._images_done)
         if with_picture or not self.graphs.enabled:
-            return *self.graphs.retry_without_graphs(lambda: self._learn(view, step, rates)), view
+            return *self.graphs.retry_without_graphs(lambda: self._image_step(view, step, rates)), view
         return self._replay_image(number, view, step, rates), None, view
 
     def _replay_image(
@@ -138,10 +138,10 @@ class Trainer:
         states = self.model.time_states(view.view.time) if shared else None
         if states is None:
             alone = Recording("image", (factor, number))
-            return self._captured(alone, lambda: self._learn(view, step, rates)[0], layout)
+            return self._captured(alone, lambda: self._image_step(view, step, rates)[0], layout)
         inputs = self.graphs.retry_without_graphs(lambda: self.image_inputs.load(view, states))
         image = Recording("image", inputs.number, self.image_inputs.measured)
-        return self._captured(image, lambda: self._learn(inputs.view, step, rates, inputs.states)[0], layout)
+        return self._captured(image, lambda: self._image_step(inputs.view, step, rates, inputs.states)[0], layout)
 
     def _fit_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
         """An iteration with the scan whose turn it is, by its CUDA graph where there is one."""
@@ -149,11 +149,11 @@ class Trainer:
         scan = self.scans[number]
         states = self.model.scan_states(scan.view.time) if self.graphs.enabled else None
         if states is None:
-            return self.graphs.retry_without_graphs(lambda: self._learn_scan(scan, None, step, rates))
+            return self.graphs.retry_without_graphs(lambda: self._scan_step(scan, None, step, rates))
         inputs = self.graphs.retry_without_graphs(lambda: self.scan_inputs.load(scan, states))
         recording = Recording("scan", inputs.number, MEASURED_SCANS)
         layout = self.fine_tunes, *self._addresses()
-        return self._captured(recording, lambda: self._learn_scan(inputs.scan, inputs.states, step, rates), layout)
+        return self._captured(recording, lambda: self._scan_step(inputs.scan, inputs.states, step, rates), layout)
 
     def _set_learning_rates(self) -> None:
         if self.fine_tunes:
@@ -169,7 +169,7 @@ class Trainer:
         gaussians = GaussianCount(len(self.model), headroom)
         return self.graphs.run(recording, layout, gaussians, iteration)
 
-    def _learn(
+    def _image_step(
         self,
         view: TrainingView,
         step: int | Tensor,
@@ -197,16 +197,16 @@ class Trainer:
             terms |= surface_terms(picture.sets, self.model, self.road, self.settings, picture.road_distance)
         if by_gradient:
             picture.info["means2d"].retain_grad()
-        return self._follow(terms, step, rates), picture
+        return self._backward_and_update(terms, step, rates), picture
 
-    def _learn_scan(
+    def _scan_step(
         self,
         scan: TrainingScan,
         states: ScanTimeStates | None,
         step: int | Tensor,
         rates: Mapping[str, Tensor] | None,
     ) -> Terms:
-        """An iteration with a scan, as `_learn`; `states` are those of its time (None: to be looked up)."""
+        """An iteration with a scan, as `_image_step`; `states` are those of its time (None: to be looked up)."""
         stage, settings = self.clock.stage, self.settings.scans
         self.model.zero_grad()
         with stage("render"):
@@ -217,9 +217,9 @@ class Trainer:
             terms = scan_terms(picture, scan, self.model, self.settings)
             if not self.images.views:
                 terms |= surface_terms(picture.sets, self.model, self.road, self.settings)
-        return self._follow(terms, step, rates, self._limit_gradients)
+        return self._backward_and_update(terms, step, rates, self._limit_gradients)
 
-    def _follow(
+    def _backward_and_update(
         self,
         terms: Terms,
         step: int | Tensor,
@@ -248,7 +248,7 @@ class Trainer:
             _scale_gradients(geometry, self.settings.scans.geometry)
 
     @property
-    def _image_step(self) -> int:
+    def _images_done(self) -> int:
         """The number of iterations so far that fitted an image."""
         return self.scan_schedule.images_before(self.step)
 

@@ -29,8 +29,8 @@ from benchmarks.speed.table import markdown
 from drivesplat.errors import ConfigError, DeviceError, TrainingError
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.settings.config import load, merged
+from drivesplat.training.probes import NO_PROBES
 from drivesplat.training.run import TrainingFiles, read_inputs, run_training
-from drivesplat.training.visits import NO_VISITS
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -427,7 +427,7 @@ def test_stops_do_not_count(monkeypatch):
 def test_the_packed_recipe_is_refused_on_a_cpu(tmp_path):
     _, tasks = planned(tmp_path, scene="demo", seeds=[0], iterations=[3], baselines=["plain", "plain_packed"])
     with pytest.raises(DeviceError, match=r"plain_packed: .* needs a GPU; drop it from baselines"):
-        runs.plain(tasks[1], torch.device("cpu"), [], NO_VISITS)
+        runs.plain(tasks[1], torch.device("cpu"), [], NO_PROBES)
 
 
 def test_nothing_is_trained_if_snakemake_fails_or_only_plans(tmp_path, monkeypatch):

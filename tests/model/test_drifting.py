@@ -312,7 +312,7 @@ def test_what_moves_is_learned_with_its_velocity_and_shown_between_the_images():
         settings = TrainSettings(iterations=200, opacity_reg=0, scale_reg=0, entropy_weight=0, sh_every=0)
         trainer = Trainer.begin(model, recorded(looking_on(train)), settings, 0, torch.device("cpu"))
         for _ in range(200):
-            trainer.fit_one()
+            trainer.training_step()
             trainer.step += 1
         with torch.no_grad():
             shown = [

@@ -150,7 +150,7 @@ def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
         captured = replayed(monkeypatch, trainer) if replays else []
         losses.append([])
         for _ in range(settings.iterations):
-            terms = trainer.fit_one(with_picture=False)[0]
+            terms = trainer.training_step(with_picture=False)[0]
             losses[-1].append({name: float(value) for name, value in terms.items()})
             trainer.step += 1
     sizes, cameras = 2, 1 + exposed

@@ -80,7 +80,7 @@ def test_a_rolling_shutter_has_the_velocities_of_what_is_shown(mirrored):
 def test_an_iteration_leaves_out_static_gaussians_and_mirrors_objects():
     model, views = street(1.0), recorded_views()
     trainer = Trainer.begin(model, views, settings_of(dropout=0.5), 0, torch.device("cpu"))
-    _, picture, view = trainer.fit_one()
+    _, picture, view = trainer.training_step()
     recorded = street(0.0).sets_in(view.view)[1]
     static, objects = picture.sets
     assert 0.2 < float((static.opacities == 0.0).float().mean()) < 0.8
