@@ -56,6 +56,7 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainSettings
 from drivesplat.settings.train_objects import DeformableSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training import strategies
 from drivesplat.training import trainer as trainer_module
 from drivesplat.training.dropout import with_dropout
 from drivesplat.training.mirroring import sets_with_mirrored_objects

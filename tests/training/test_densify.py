@@ -20,6 +20,7 @@ from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import CoarseToFineSettings, DefaultSettings, McmcSettings
 from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier, coarse_cap
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.trainer import Trainer

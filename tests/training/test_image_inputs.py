@@ -17,6 +17,7 @@ from helpers.trainings import (
 
 from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.model.exposure import Exposures
+from drivesplat.model.view import RollingShutter
 from drivesplat.settings.train import McmcSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.cuda_graph.image_inputs import SharedImageInputs, can_share
