@@ -7,12 +7,14 @@
 # make test-gpu     tests that need a GPU: the rasterizers agree, trainings resume
 # make test-slurm   one scene through a real SLURM, started on this machine for the test (root on Debian; docs/cluster.md)
 # make test-batch   ten synthetic drives, one of them broken, as a batch (two cores: a quarter of an hour)
+# make mutants      30 deliberate faults, each of which the tests must find (two cores: an hour)
 # make bench        the measurements of benchmarks/ against their bounds (two idle cores)
 # make quality      RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
 # make speed        FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
+# make ledger       docs/tried.md from the ledger of experiments docs/tried.csv
 # make config       config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
 # make help         this list
-.PHONY: help demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch bench quality speed config
+.PHONY: help demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch mutants bench quality speed config ledger
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -59,6 +61,9 @@ test-slurm: setup
 test-batch: setup
 	DRIVESPLAT_BATCH=1 $(BIN)/python -m pytest -m batch -rs -v tests/workflow/test_batch.py
 
+mutants: setup
+	$(BIN)/python -m benchmarks.mutants
+
 bench: setup
 	$(BIN)/python -m pytest benchmarks -q
 
@@ -73,3 +78,6 @@ speed: setup
 
 config: setup
 	$(BIN)/python -m drivesplat.settings.config_document $(FORCE)
+
+ledger: setup
+	$(BIN)/python -m benchmarks.tried

@@ -1,1 +1,2 @@
-"""Measurements of the workflow: quality of recipes, training speed, and rendering speed."""
+"""Measurements of the workflow: quality of recipes, speed of training and rendering, and faults that the tests find.
+The library does not import it."""

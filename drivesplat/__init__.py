@@ -1,6 +1,7 @@
 """drivesplat: turns recorded drives into 3D Gaussian splats and measures them.
 
-Importing the package is fast: modules that need torch, gsplat or nuscenes-devkit are imported by name.
+Its packages are listed in docs/developing.md. Importing it is fast: modules that need torch, gsplat or nuscenes-devkit
+are imported by name.
 """
 
 from pathlib import Path

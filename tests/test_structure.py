@@ -1,78 +1,35 @@
 """The structure of the library: few places at its top, no import circles, bounded chains of imports."""
 
 import ast
-import functools
-from graphlib import TopologicalSorter
-from pathlib import Path
+import re
+from collections import defaultdict
+from graphlib import CycleError
 
+import pytest
 from helpers import REPOSITORY
+from helpers.structure import (
+    LIBRARY,
+    classes,
+    imported,
+    longest_chain,
+    module_graph,
+    modules,
+    package_graph,
+    packages,
+    sibling_graph,
+    top,
+)
 from helpers.syntax_trees import source_of, tree_of
 
-LIBRARY = "drivesplat"
 MAX_PLACES, MAX_LOOSE_MODULES = 26, 2
 MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 8, 18
 MAX_LINES = 300
 
-Graph = dict[str, set[str]]
-"""What each module or package imports."""
-
-
-@functools.cache
-def modules() -> dict[str, Path]:
-    """The library's modules by dotted name; a package is named without `__init__`."""
-    files = (path for path in (REPOSITORY / LIBRARY).rglob("*.py") if "__pycache__" not in path.parts)
-    paths = {path.relative_to(REPOSITORY).with_suffix(""): path for path in files}
-    return {".".join(name.parts).removesuffix(".__init__"): path for name, path in paths.items()}
-
-
-def imported(tree: ast.AST, known: set[str]) -> set[str]:
-    """Modules of `known` that a syntax tree imports anywhere, also inside functions."""
-    names: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            paths = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
-            names |= {path if path in known else node.module for path in paths.values()}
-    return names & known
-
-
-@functools.cache
-def module_graph() -> Graph:
-    files = modules()
-    return {name: imported(tree_of(path), set(files)) - {name} for name, path in files.items()}
-
-
-def package_graph(graph: Graph) -> Graph:
-    """The same between the places directly in the library. `__main__` is a command that nothing imports: it may use
-    packages above its own."""
-    packages: Graph = {}
-    for module, others in graph.items():
-        if module.endswith(".__main__"):
-            continue
-        place = top(module)
-        packages.setdefault(place, set()).update(top(other) for other in others if top(other) != place)
-    return packages
-
-
-def top(module: str) -> str:
-    """The place directly in the library that holds a module."""
-    return [*module.split("."), "__init__"][1]
-
-
-def longest_chain(graph: Graph) -> list[str]:
-    """The longest path of imports, from the top down. Raises CycleError, with the circle, where there is one."""
-    chains: dict[str, list[str]] = {}
-    for module in TopologicalSorter(graph).static_order():
-        below = max((chains[other] for other in graph[module]), key=len, default=[])
-        chains[module] = [module, *below]
-    return max(chains.values(), key=len)
-
 
 def test_few_places_are_directly_in_the_library():
-    packages = {path.parent.name for path in (REPOSITORY / LIBRARY).glob("*/*.py")}
+    holding = {path.parent.name for path in (REPOSITORY / LIBRARY).glob("*/*.py")}
     loose = {path.name for path in (REPOSITORY / LIBRARY).glob("*.py")}
-    assert len(packages) + len(loose) <= MAX_PLACES
+    assert len(holding) + len(loose) <= MAX_PLACES
     assert len(loose) <= MAX_LOOSE_MODULES, loose
 
 
@@ -86,9 +43,43 @@ def test_modules_import_in_no_circle_and_in_short_chains():
     assert len(chain) <= MAX_MODULE_CHAIN, " > ".join(chain)
 
 
-def test_packages_import_in_no_circle_and_in_short_chains():
-    chain = longest_chain(package_graph(module_graph()))
+SIGNED = packages(LIBRARY, "benchmarks")
+
+
+@pytest.mark.parametrize("package", SIGNED)
+def test_a_package_says_what_it_holds(package):
+    assert ast.get_docstring(tree_of(SIGNED[package]))
+
+
+def test_the_page_for_contributors_lists_every_package():
+    page = (REPOSITORY / "docs/developing.md").read_text(encoding="utf-8")
+    table = page[page.index("\n| package |") : page.index("\nRules, held by")]
+    listed = re.findall(r"^\| `([\w/]+)` \|", table, re.MULTILINE)
+    names = [name.replace(".", "/").removeprefix(f"{LIBRARY}/") for name in SIGNED if name != LIBRARY]
+    assert sorted(listed) == sorted([*names, "errors"])
+
+
+@pytest.mark.parametrize("package", packages(LIBRARY))
+def test_places_of_a_package_import_in_no_circle(package):
+    longest_chain(sibling_graph(module_graph(), package))  # raises CycleError with the circle
+
+
+def test_packages_at_any_depth_import_in_no_circle_and_in_short_chains():
+    chain = longest_chain(package_graph(module_graph(), packages(LIBRARY)))
     assert len(chain) <= MAX_PACKAGE_CHAIN, " > ".join(chain)
+
+
+def test_circles_at_any_depth_are_found():
+    """A package may stand between modules of the package around it, but not import a sibling that imports it."""
+    between = {"a.k.do": {"a.k.gpu.sum"}, "a.k.gpu.sum": {"a.k.sizes"}, "a.k.sizes": set(), "a.k.gpu": set()}
+    assert longest_chain(sibling_graph(between, "a.k")) == ["a.k.do", "a.k.gpu", "a.k.sizes"]
+    known = {"a", "a.k", "a.k.gpu", "a.k.cpu"}
+    assert package_graph(between, known) == {"a.k": set(), "a.k.gpu": set()}
+    circle = {**between, "a.k.gpu.sum": {"a.k.cpu.sum"}, "a.k.cpu.sum": {"a.k.gpu.add"}, "a.k.gpu.add": set()}
+    for graph in (sibling_graph(circle, "a.k"), package_graph(circle, known)):
+        with pytest.raises(CycleError):
+            longest_chain(graph)
+    assert longest_chain(sibling_graph(circle, "a")) == ["a.k"]
 
 
 def test_kernels_import_nothing_above_them():
@@ -132,3 +123,10 @@ def test_readers_of_intermediates_return_typed_records():
         if "dict[str, Any]" in ast.unparse(node.returns)
     }
     assert untyped == JSON_DOCUMENTS | {"read_arrays"}, "a reader returns a dict; io/typed_record.py makes records"
+
+
+def test_no_class_name_is_used_twice():
+    places = defaultdict(set)
+    for module, node in classes():
+        places[node.name].add(module)
+    assert not {name: sorted(found) for name, found in places.items() if len(found) > 1}

@@ -54,8 +54,9 @@ def anchor(heading: str) -> str:
 
 
 def links() -> list[tuple[str, str]]:
-    """Every link of README and docs/ that does not leave the repository, with the page that has it."""
-    pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+    """Every link of the pages that does not leave the repository, with the page that has it."""
+    pages = [REPOSITORY / name for name in ("README.md", "CHANGELOG.md", "THIRD_PARTY_NOTICES.md")]
+    pages += [page for folder in ("docs", "archive") for page in sorted((REPOSITORY / folder).glob("*.md"))]
     found = {(str(page.relative_to(REPOSITORY)), link) for page in pages for link in _links(page)}
     return sorted((page, link) for page, link in found if "://" not in link)
 

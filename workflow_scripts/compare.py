@@ -6,12 +6,12 @@ from drivesplat.workflow.job import job
 from drivesplat.inspection.compare import render_comparison
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
-from drivesplat.scene.prepared_drive import read_prepared_drive
+from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.settings.render import CompareJob
 
 with job(snakemake, dataset=("images",)) as current:
     files = current.input
-    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
+    recording, upstream = read_evaluation_data(files.scene, files.parser, files.masks)
     checkpoints = {Path(file).parent.name: read_checkpoint(file) for file in files.checkpoints}
     provenance = current.provenance(*upstream, *(one.provenance for one in checkpoints.values()))
     record = render_comparison(

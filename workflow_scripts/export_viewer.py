@@ -1,7 +1,7 @@
 """checkpoint.npz as viewer.html: one page that shows the splat under a mouse."""
 
 from drivesplat.workflow.job import job
-from drivesplat.editing.drives import edited_drives
+from drivesplat.editing.sampled_edits import sampled_edits
 from drivesplat.export.far_gaussians import read_far, within_reach
 from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND
 from drivesplat.export.viewer import export_viewer
@@ -16,5 +16,5 @@ with job(snakemake, dataset=("images",)) as current:
     checkpoint = read_checkpoint(files.checkpoint)
     provenance = current.provenance(*(made.provenance for made in (scene, record, checkpoint, far)))
     shown = within_reach(checkpoint, far)
-    edits = edited_drives(shown, scene, settings.eval_camera, settings.edits, SAMPLES_PER_SECOND)
+    edits = sampled_edits(shown, scene, settings.eval_camera, settings.edits, SAMPLES_PER_SECOND)
     export_viewer(current.output.viewer, shown, scene, record, settings, method, edits, provenance)

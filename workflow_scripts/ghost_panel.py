@@ -4,18 +4,18 @@ from drivesplat.workflow.job import job
 from drivesplat.inspection.drawing import draw_panel
 from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.ghost_panel import ghost_panel
-from drivesplat.inspection.rendered_view import open_trained_drive
+from drivesplat.inspection.rendered_view import open_model_with_recording
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
-from drivesplat.scene.prepared_drive import read_prepared_drive
+from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.settings.inspection import PanelJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)
-    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
+    recording, upstream = read_evaluation_data(files.scene, files.parser, files.masks)
     provenance = current.provenance(*upstream, checkpoint.provenance)
     panel, figures = ghost_panel(
-        open_trained_drive(checkpoint, recording, current.device()), current.settings(PanelJob)
+        open_model_with_recording(checkpoint, recording, current.device()), current.settings(PanelJob)
     )
     save_figure(current.output.panel, draw_panel(panel, figures, current.wildcards.method))
     write_json(current.output.figures, {**figures, "provenance": provenance})

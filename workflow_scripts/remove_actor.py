@@ -4,19 +4,19 @@ from drivesplat.workflow.job import job
 from drivesplat.inspection.drawing import draw_removal
 from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.removal import remove_actor
-from drivesplat.inspection.rendered_view import open_trained_drive
+from drivesplat.inspection.rendered_view import open_model_with_recording
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
+from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.scene.images import write_image
-from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.inspection import RemovalJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, made, checkpoint = current.input, current.output, read_checkpoint(current.input.checkpoint)
-    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
+    recording, upstream = read_evaluation_data(files.scene, files.parser, files.masks)
     provenance = current.provenance(*upstream, checkpoint.provenance)
     pair, record = remove_actor(
-        open_trained_drive(checkpoint, recording, current.device()), current.settings(RemovalJob)
+        open_model_with_recording(checkpoint, recording, current.device()), current.settings(RemovalJob)
     )
     write_image(made.with_car, pair.with_car)
     write_image(made.without_car, pair.without_car)

@@ -3,13 +3,13 @@
 from drivesplat.workflow.job import job
 from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.track_table import draw_tracks, editable_tracks, subjects_by_image, track_rows, write_tracks
-from drivesplat.scene.prepared_drive import read_prepared_drive
+from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.settings.inspection import TracksJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, settings = current.input, current.settings(TracksJob)
     camera, actors = settings.eval_camera, settings.actors if files.actors else None
-    recording, _ = read_prepared_drive(files.scene, files.parser, files.masks)
+    recording, _ = read_evaluation_data(files.scene, files.parser, files.masks)
     subjects = subjects_by_image(recording, camera)
     rows = track_rows(recording, subjects, editable_tracks(files.actors), actors)
     write_tracks(current.output.table, rows)

@@ -7,12 +7,12 @@ from drivesplat.evaluation.synthetic import DriveTruth
 from drivesplat.inspection.truth_film import render_truth_film
 from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.model.checkpoint import read_checkpoint
-from drivesplat.scene.prepared_drive import read_prepared_drive
+from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.settings.render import CompareJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, settings = current.input, current.settings(CompareJob)
-    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
+    recording, upstream = read_evaluation_data(files.scene, files.parser, files.masks)
     checkpoint, known = read_checkpoint(files.checkpoint), DriveTruth.read(files.truth[0], recording)
     provenance = current.provenance(*upstream, checkpoint.provenance, inputs={"truth": sha256_file(known.path)})
     film, method = Path(current.output.film), current.wildcards.method

@@ -14,7 +14,7 @@ from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, psnr
 from drivesplat.evaluation.synthetic import rendered
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import region_masks
 
 NEAR_DB = 0.3
@@ -50,7 +50,7 @@ class QualityCurve:
         self.spent += time.monotonic() - began
 
 
-def held_out_frames(recording: PreparedDrive, camera: str, device: torch.device) -> list[HeldOutFrame]:
+def held_out_frames(recording: EvaluationData, camera: str, device: torch.device) -> list[HeldOutFrame]:
     """The frames of the first group of held-out frames that has some."""
     groups, frames = measured_images(recording.record, camera).values(), []
     for index in next((images for images in groups if images), []):

@@ -44,8 +44,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.provenance.record import provenance
 from drivesplat.rasterization import rasterize
+from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.scene.masks import read_masks_record
-from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import CoarseToFineSettings
@@ -72,7 +72,7 @@ def run(task: Task) -> dict[str, Any]:
     with held_device(task.device) as device:
         record = read_training_record(task.files.parser)
         paths = files_of_size(record, task.images)
-        recording, _ = read_prepared_drive(task.files.scene, task.files.parser, task.files.masks)
+        recording, _ = read_evaluation_data(task.files.scene, task.files.parser, task.files.masks)
         masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
         curve = QualityCurve(held_out_frames(recording, camera, device) if task.visits else [])
         visits, before = Probes(task.visits, curve.see), CpuSample.now()

@@ -1,1 +1,2 @@
-"""The command `drivesplat` of an installed copy: the workflow without a checkout."""
+"""The command `drivesplat` of an installed copy: runs Snakemake with its workflow, and opens viewer pages. Nothing else
+imports it."""

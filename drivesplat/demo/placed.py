@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivesplat.demo.optics.raycast import NO_HIT, Rays
+from drivesplat.demo.optics.raycast import NO_HIT, StreetRays
 from drivesplat.demo.recorder import Recorder, Viewpoint
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.errors import ConfigError
@@ -43,7 +43,7 @@ def first_contact(recorder: Recorder, edit: str, name: str) -> tuple[float, str]
     length = np.linalg.norm(toward, axis=1)
     origins = np.einsum("nij,nj->ni", poses[:, :3, :3], start) + poses[:, :3, 3]
     directions = np.einsum("nij,nj->ni", poses[:, :3, :3], toward / length[:, None])
-    rays = Rays(np.repeat(times, len(starts)), origins, directions, np.arange(len(poses), dtype=np.int32))
+    rays = StreetRays(np.repeat(times, len(starts)), origins, directions, np.arange(len(poses), dtype=np.int32))
     hits = recorder.snapshot(rays.seconds, Viewpoint(edit=edit, without=name)).cast(rays)
     inside = np.flatnonzero((hits.object != NO_HIT) & (hits.distance < length))
     if len(inside) == 0:

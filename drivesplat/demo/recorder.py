@@ -7,10 +7,10 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.optics.imaging import DemoCamera, Picture, geometry, render, to_bytes
-from drivesplat.demo.optics.lidar import Scan, ScanPattern, returns, scan, scan_pattern
+from drivesplat.demo.optics.imaging import DemoCamera, StreetImage, geometry, render, to_bytes
+from drivesplat.demo.optics.lidar import ScanPattern, StreetScan, returns, scan, scan_pattern
 from drivesplat.demo.optics.lighting import Light, daylight, lamplight
-from drivesplat.demo.optics.raycast import RayCaster, Rays, StreetSnapshot
+from drivesplat.demo.optics.raycast import RayCaster, StreetRays, StreetSnapshot
 from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time, recording_sensors
 from drivesplat.demo.shapes.surface_points import SurfacePoints
 from drivesplat.demo.street.edited import Variation, edited
@@ -101,14 +101,14 @@ class Recorder:
         gains = self.world.exposures.get(sensor.channel, (1.0, 1.0, 1.0))
         return DemoCamera(sensor.intrinsics(width), times, poses, width, height, gains)
 
-    def picture(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> Picture:
+    def picture(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> StreetImage:
         """The image without sensor noise, with depth, objects and classes."""
         seconds = time_us * 1e-6
         camera = self.camera(sensor, seconds, view)
         snapshot = self.snapshot(camera.seconds, view)
         return render(snapshot, self.light(seconds, view), camera, self.world.samples_per_pixel)
 
-    def geometry(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> Picture:
+    def geometry(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> StreetImage:
         """Depth, objects and classes of an image."""
         camera = self.camera(sensor, time_us * 1e-6, view)
         return geometry(self.snapshot(camera.seconds, view), camera)
@@ -126,7 +126,7 @@ class Recorder:
         """The rays of a revolution of the LiDAR."""
         return scan_pattern(self.world.lidar, self.world.lidar_hz)
 
-    def scan(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> Scan:
+    def scan(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> StreetScan:
         """The revolution that ends at a time, or happens at it if the LiDAR does not spin."""
         times, poses = self._firings(sensor, time_us, view)
         snapshot = self.snapshot(times, view, for_lidar=True)
@@ -137,7 +137,7 @@ class Recorder:
         """The returns (n, 5) of a revolution; see `lidar.returns`."""
         return self.returns(self.scan(sensor, time_us, view), sensor, time_us, view)
 
-    def returns(self, found: Scan, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> np.ndarray:
+    def returns(self, found: StreetScan, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> np.ndarray:
         """The recorded returns (n, 5) of a scan."""
         _, poses = self._firings(sensor, time_us, view)
         at_timestamp = self.ego_to_street(np.array([time_us * 1e-6]), view)[0] @ sensor.sensor_to_ego
@@ -176,7 +176,7 @@ class Recorder:
         chosen = (depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)
         toward, owner = points[chosen] - center, owner[chosen]
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        rays = Rays(time, center[None], toward, np.zeros(len(toward), np.int32))
+        rays = StreetRays(time, center[None], toward, np.zeros(len(toward), np.int32))
         found = self.snapshot(time).cast(rays).object
         visible += np.bincount(owner[found == owner], minlength=len(visible))
         inside += np.bincount(owner, minlength=len(inside))

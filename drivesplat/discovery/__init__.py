@@ -1,1 +1,1 @@
-"""Moving objects of a drive that nobody labelled, found in its LiDAR scans."""
+"""Moving objects that nobody labelled, found in the LiDAR scans of a drive: clusters, chains, boxes, tracks."""

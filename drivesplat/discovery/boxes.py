@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivesplat.discovery.clusters import Chain, Cluster
-from drivesplat.discovery.smoothing import Path, smooth_path
+from drivesplat.discovery.smoothing import SmoothPath, smooth_path
 from drivesplat.scene.object_class import ObjectClass
 
 MIN_HEADING_SPEED = 0.4
@@ -44,7 +44,7 @@ class Discovered:
 
     object_class: ObjectClass
     size: Float[np.ndarray, "3"]
-    path: Path
+    path: SmoothPath
     seconds: Float[np.ndarray, " k"]
     headings: Float[np.ndarray, " k"]
     grounds: Float[np.ndarray, " k"]
@@ -83,7 +83,7 @@ def fitted_box(chain: Chain, grounds: Float[np.ndarray, " k"], blind: float = 0.
     return Discovered(object_class, size, path, seconds, headings_of(path, seconds), grounds, returns)
 
 
-def headings_of(path: Path, seconds: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+def headings_of(path: SmoothPath, seconds: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
     """The directions of motion in radians; while it stands, those before and after."""
     velocities = path.velocities(seconds)
     moving = np.linalg.norm(velocities, axis=1) > MIN_HEADING_SPEED

@@ -33,7 +33,7 @@ STEPS = 2
 
 
 @dataclass(frozen=True)
-class RangeImage:
+class RangeGrid:
     """The ranges of a scan's measured returns on a grid of beams, from low to high, and even steps of azimuth from -π;
     NaN where there is none."""
 
@@ -111,7 +111,7 @@ class RangeImage:
 def seen_empty(scans: Sequence[RecordedScan]) -> list[Bool[np.ndarray, " n"]]:
     """For each of the scans of one LiDAR, in order of time, which of its measured returns (`RecordedScan.points`) lie
     in space that other scans prove empty."""
-    images = [RangeImage(scan) for scan in scans]
+    images = [RangeGrid(scan) for scan in scans]
     seconds = np.array([scan.seconds for scan in scans])
     found = []
     for number, scan in enumerate(scans):

@@ -23,7 +23,7 @@ ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class Path:
+class SmoothPath:
     """A path in the plane, twice continuously differentiable; straight on at constant velocity beyond its ends."""
 
     spline: BSpline
@@ -41,7 +41,7 @@ class Path:
 
 def smooth_path(
     seconds: Float[np.ndarray, " k"], places: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, "k 2"]
-) -> Path:
+) -> SmoothPath:
     """The path that is near `places` (metres) at increasing `seconds`: the least sum of weighted squared deviations, of
     squared accelerations and of squared jerks. `weights` are those of each coordinate."""
     first, last = float(seconds[0]), float(seconds[-1])
@@ -62,7 +62,7 @@ def smooth_path(
             off = np.abs(wanted - design @ coefficients[:, axis])
             own = weights[:, axis] * np.minimum(1.0, OUTLIER / np.maximum(off, 1e-9))
     coefficients += middle  # B-splines add up to 1
-    return Path(BSpline(knots, coefficients, DEGREE), first, last)
+    return SmoothPath(BSpline(knots, coefficients, DEGREE), first, last)
 
 
 def _integral_of_squares(knots: np.ndarray, inner: np.ndarray, order: int) -> np.ndarray:

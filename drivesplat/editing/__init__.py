@@ -1,1 +1,4 @@
-"""Edits of a recorded drive: changed motion of actors and of the ego vehicle."""
+"""Edits of a trained drive: films, rendered drive folders, LiDAR scans, and samples for viewers.
+
+The change of motion by an edit is in `edited_motion`.
+"""

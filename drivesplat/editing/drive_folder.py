@@ -11,7 +11,7 @@ from PIL import Image
 
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
-from drivesplat.editing.rendered_drive import RenderedDrive, rendered_drive
+from drivesplat.editing.render_plan import ImageRenderPlan, image_render_plan
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.storage import Provenance, atomic_write, write_json
 from drivesplat.machine.device import explain_out_of_memory
@@ -44,13 +44,13 @@ def write_rendered_drive(
     """Writes the drive folder of `path`, its drive.json: images/, and the same drive as nuScenes tables in nuscenes/.
 
     `source` names the `scene`, the `method`, and the `edit` or the `trajectory` in the record that marks the drive as
-    rendered; the scene of the tables is called by scene and edit or trajectory. Raises what `rendered_drive` raises;
+    rendered; the scene of the tables is called by scene and edit or trajectory. Raises what `image_render_plan` raises;
     DeviceError; ResultError where a rendering contains NaN or Inf, or the disk is full.
     """
     folder, what = path.parent, " ".join(f"{key} {value}" for key, value in source.items())
     _remove(folder)
     model, device = open_model(checkpoint, device_settings)
-    drive = rendered_drive(scene, model, job, folder, what)
+    drive = image_render_plan(scene, model, job, folder, what)
     try:
         with explain_out_of_memory(lambda: len(model)):
             pictures = prefetch_items(_pictures(model, drive, drive.views(device)))
@@ -65,7 +65,7 @@ def write_rendered_drive(
 
 
 def _write_records(
-    drive: RenderedDrive,
+    drive: ImageRenderPlan,
     labels: Labels,
     job: DriveJob,
     path: Path,
@@ -98,7 +98,7 @@ def _remove(folder: Path) -> None:
             shutil.rmtree(part)
 
 
-def _pictures(model: SplatModel, drive: RenderedDrive, views: Iterator[View]) -> Iterator[np.ndarray]:
+def _pictures(model: SplatModel, drive: ImageRenderPlan, views: Iterator[View]) -> Iterator[np.ndarray]:
     """The rendering of each view, (h, w, 3) uint8."""
     placements = drive.placements()
     if placements is not None:

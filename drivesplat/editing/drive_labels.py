@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from drivesplat.editing.rendered_drive import RenderedDrive
+from drivesplat.editing.render_plan import ImageRenderPlan
 from drivesplat.editing.shown_objects import NONE, SeenObject
 from drivesplat.lidar.sweeps import nearest_returns
 from drivesplat.readers.nuscenes.write import ImageBox, Labels
@@ -21,8 +21,8 @@ LEVELS = (0.4, 0.6, 0.8)
 
 
 def labelled(
-    scene: Scene, drive: RenderedDrive, trained_until: int | None, device: torch.device, where: str
-) -> tuple[RenderedDrive, Labels]:
+    scene: Scene, drive: ImageRenderPlan, trained_until: int | None, device: torch.device, where: str
+) -> tuple[ImageRenderPlan, Labels]:
     """The drive with the boxes of what it shows, their visibility known at key frames, and the labels of its images.
 
     An object without Gaussians of its own keeps its boxes if the background shows it in an image of a key frame. Warns,
@@ -48,7 +48,7 @@ def labelled(
     return replace(drive, scene=replace(drive.scene, tracks=tracks), tracks=kept(drive.tracks)), labels
 
 
-def _warn_of_traces(drive: RenderedDrive, shown_by: Mapping[str, str], where: str) -> None:
+def _warn_of_traces(drive: ImageRenderPlan, shown_by: Mapping[str, str], where: str) -> None:
     others = zip(drive.objects.others, drive.objects.parts, strict=True)
     count = sum(shown_by[item.id] == NONE and not parts for item, parts in others)
     if count:

@@ -57,7 +57,7 @@ def render_edit(
     """
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {scene.name}, edit {files.film.stem!r}"
-    drive = edited_drive(scene, model, job, where)
+    drive = edited_shots(scene, model, job, where)
     after, seconds = drive.after, np.array(drive.after.seconds)
     colliding = warn_of_collisions(drive.actors, after.cameras.camera_to_world, seconds, where)
     panels = Panels(("recorded", files.film.stem), after.size)
@@ -82,7 +82,7 @@ def render_edit(
 
 
 @dataclass(frozen=True)
-class EditedDrive:
+class EditedShots:
     """A drive with an edit: the actors of the model as `recorded` and as edited (`actors`), and shots of the same times
     `before` the edit and `after` it."""
 
@@ -103,14 +103,14 @@ class EditedDrive:
         return ShownObjects.of_scene(scene, model, self.actors, others)
 
 
-def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> EditedDrive:
+def edited_shots(scene: Scene, model: SplatModel, job: EditJob, where: str) -> EditedShots:
     """The drive with the edit of `job`. Raises ConfigError, starting with `where` (the scene and the edit), if the edit
     does not fit the scene or the model has no actors, DatasetError if the scene lacks the camera."""
     recorded, actors = recorded_and_edited(model, scene, job.camera, job.edit, where)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     before, after = (Shot(scene, cameras, job, film_size(scene, job)) for cameras in (unedited, path))
-    return EditedDrive(recorded, actors, before, after)
+    return EditedShots(recorded, actors, before, after)
 
 
 def edited_frames(

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from drivesplat.editing.actors import actor_placements
-from drivesplat.editing.film import edited_drive, edited_frames
+from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, write_film
@@ -34,7 +34,7 @@ def render_quad(
     its time. Raises what `render_edit` raises.
     """
     model, device = open_model(checkpoint, device_settings)
-    drive = edited_drive(scene, model, job, f"scene {scene.name}, edit {path.stem!r}")
+    drive = edited_shots(scene, model, job, f"scene {scene.name}, edit {path.stem!r}")
     smooth, after = drive.before, drive.after
     frames, last = recorded_frames(scene, job.camera), last_images(scene, smooth)
     taken = [frames[number] for number in np.unique(last)]

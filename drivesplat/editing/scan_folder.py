@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.editing.scans import SimulatedScan, scan_drive
+from drivesplat.editing.scans import SimulatedScan, scan_render_plan
 from drivesplat.errors import ResultError
 from drivesplat.io.point_cloud import write_vertices
 from drivesplat.io.storage import Provenance, atomic_write, write_json
@@ -33,13 +33,13 @@ def write_scan_folder(
     """Writes the scans of `records` after the edit of `job` or along its trajectory into the folder of `path`, and last
     `path`, scans.json, which lists them.
 
-    `source` names the `scene`, the `method`, and the `edit` or the `trajectory`. Raises what `scan_drive` raises;
+    `source` names the `scene`, the `method`, and the `edit` or the `trajectory`. Raises what `scan_render_plan` raises;
     DeviceError; ResultError for a model that was trained without LiDAR, where a rendering contains NaN or Inf, or where
     the disk is full.
     """
     what = " ".join(f"{key} {value}" for key, value in source.items())
     model, device = open_model(checkpoint, device_settings)
-    drive = scan_drive(scene, model, records.scans, job, what)
+    drive = scan_render_plan(scene, model, records.scans, job, what)
     objects, folder, listed = drive.objects(scene), path.parent, []
     _remove_scans(folder)
     try:

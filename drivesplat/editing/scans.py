@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class SimulatedScan:
     """What a LiDAR would have measured. `sensor` has its rays, its pose and its velocities (what else it holds was
-    recorded); `rendered`, what the rays return; `objects`, the index into `ScanDrive.objects` of what each return
+    recorded); `rendered`, what the rays return; `objects`, the index into `ScanRenderPlan.objects` of what each return
     belongs to, or NO_OBJECT."""
 
     sensor: RecordedScan
@@ -54,7 +54,7 @@ class SimulatedScan:
 
 
 @dataclass(frozen=True)
-class ScanDrive:
+class ScanRenderPlan:
     """Scans to render: the rays of `sensors`, each with the pose and the velocities that the sensor then has; the
     `actors` of the model as they then are; and the annotated objects (`others`) that the model shows in its static
     part, with their `boxes`."""
@@ -110,9 +110,9 @@ class ScanDrive:
         return numbers[self.boxes.met(*found.places(), seconds)]
 
 
-def scan_drive(
+def scan_render_plan(
     scene: Scene, model: SplatModel, scans: Sequence[RecordedScan], job: ScanFolderJob, where: str
-) -> ScanDrive:
+) -> ScanRenderPlan:
     """The drive of `job`: the rays of `scans`, as long as the ego vehicle is on its recorded path.
 
     Warns where a sensor is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the
@@ -135,7 +135,7 @@ def scan_drive(
         if colliding.any():
             first, last = seconds[colliding][[0, -1]]
             log.warning("%s: the LiDAR is inside a vehicle between %.1f and %.1f s", where, first, last)
-    return ScanDrive(sensors, actors, [scene.tracks[i] for i in boxes.indices], boxes)
+    return ScanRenderPlan(sensors, actors, [scene.tracks[i] for i in boxes.indices], boxes)
 
 
 def _beside(scene: Scene, scans: Sequence[RecordedScan], job: ScanFolderJob) -> list[RecordedScan]:

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 
 from drivesplat.evaluation.metrics import psnr
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import region_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.scene_warnings import REC_709, duration, max_displacement, standing_time
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 
-def summarize_drive(recording: PreparedDrive, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
+def summarize_drive(recording: EvaluationData, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
     """The `drive` of metrics.json; `measured` are the images by held-out group.
 
     `moved_m`: the largest distance in metres between two ego positions; `standing_s`: seconds at standstill, of
@@ -32,7 +32,7 @@ def summarize_swept_drive(scene: Scene) -> dict[str, Any]:
     return {"moved_m": max_displacement(scene), **times, **dict.fromkeys(HELD_OUT_GROUPS)}
 
 
-def _group(recording: PreparedDrive, camera: str, images: list[int]) -> dict[str, float | None]:
+def _group(recording: EvaluationData, camera: str, images: list[int]) -> dict[str, float | None]:
     """`from_training_m`: distance in metres from a held-out image to the nearest training image of `camera`, mean over
     `images`; None without training images. `luminance`: mean luma (Rec. 709) of their pixels. `flat_psnr`: PSNR in dB
     of the mean colour of their static pixels, the trivial baseline; None without such pixels or if all are equal.

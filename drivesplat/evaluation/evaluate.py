@@ -28,8 +28,8 @@ from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
+from drivesplat.scene.evaluation_data import EvaluationData, read_evaluation_data
 from drivesplat.scene.masks import MasksRecord, read_masks_record
-from drivesplat.scene.prepared_drive import PreparedDrive, read_prepared_drive
 from drivesplat.scene.regions import region_mask
 from drivesplat.scene.scan_record import ScanRecords, read_scans
 from drivesplat.scene.splits import HELD_OUT_GROUPS, SIDE_CAMERA
@@ -50,7 +50,7 @@ class EvaluationInputs:
 
     checkpoint: TrainedCheckpoint
     summary: dict[str, Any]
-    recording: PreparedDrive
+    recording: EvaluationData
     masks_record: MasksRecord
     lpips_record: dict[str, Any] | None
     truth: Path | None
@@ -69,7 +69,7 @@ def read_evaluation_inputs(
 ) -> tuple[EvaluationInputs, list[Provenance]]:
     """Reads the inputs of an evaluation from files, the last three where given; `summary` is the content of train.json.
     Returns them with the provenances of these files."""
-    recording, upstream = read_prepared_drive(scene, parser, masks)
+    recording, upstream = read_evaluation_data(scene, parser, masks)
     trained, revolutions = read_checkpoint(checkpoint), [read_scans(path) for path in scans]
     inputs = EvaluationInputs(
         trained,
@@ -195,7 +195,7 @@ def findings(group: dict[str, Any]) -> dict[str, bool | None]:
     }
 
 
-def render_sample_pair(model: SplatModel, recording: PreparedDrive, camera: str, device: torch.device) -> SamplePair:
+def render_sample_pair(model: SplatModel, recording: EvaluationData, camera: str, device: torch.device) -> SamplePair:
     """The held-out key frame of `camera` with the most pixels of moving vehicles, from the first group with held-out
     frames; a training key frame if nothing is held out."""
     group, images = _candidates(recording, camera)
@@ -205,7 +205,7 @@ def render_sample_pair(model: SplatModel, recording: PreparedDrive, camera: str,
     return SamplePair(group, index, recording.image(index), picture.clip(0.0, 1.0))
 
 
-def _candidates(recording: PreparedDrive, camera: str) -> tuple[str, list[int]]:
+def _candidates(recording: EvaluationData, camera: str) -> tuple[str, list[int]]:
     for group in (*HELD_OUT_GROUPS, "train"):
         images = held_out_images(recording.record, group, camera)
         if images:

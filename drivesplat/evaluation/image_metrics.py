@@ -25,7 +25,7 @@ from drivesplat.lidar.depth import depths_in, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import REGIONS, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS, SIDE_CAMERA
 from drivesplat.scene.training_record import TrainingRecord
@@ -34,7 +34,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 
 def evaluate_groups(
     model: SplatModel,
-    recording: PreparedDrive,
+    recording: EvaluationData,
     camera: str,
     lpips_map: LpipsMap | None,
     device: torch.device,
@@ -47,7 +47,7 @@ def evaluate_groups(
 
 
 def side_camera_metrics(
-    model: SplatModel, recording: PreparedDrive, lpips_map: LpipsMap | None, device: torch.device
+    model: SplatModel, recording: EvaluationData, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, dict[str, Any]]:
     """The metrics by region of each camera of `holdout.cameras`, over its key frames at which other cameras were
     trained on. LiDAR depth of these was trained on, too, and is not measured."""
@@ -60,7 +60,7 @@ def side_camera_metrics(
 
 def _group_metrics(
     model: SplatModel,
-    recording: PreparedDrive,
+    recording: EvaluationData,
     lpips_map: LpipsMap | None,
     device: torch.device,
     depths: Mapping[int, PixelDepths],
@@ -93,7 +93,7 @@ def _group_metrics(
     return {**with_gap(metrics.summary()), **depth.summary()}
 
 
-def held_out_depths(recording: PreparedDrive, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
+def held_out_depths(recording: EvaluationData, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
     """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
     missing."""
     scene = recording.scene

@@ -37,8 +37,8 @@ from drivesplat.readers.truth import (
     read_truth,
     truth_image,
 )  # fmt: skip
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.images import continuous_intrinsics, read_image
-from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame
@@ -54,10 +54,10 @@ class DriveTruth:
 
     truth: Truth
     path: Path
-    recording: PreparedDrive
+    recording: EvaluationData
 
     @classmethod
-    def read(cls, path: str | Path, recording: PreparedDrive) -> "DriveTruth":
+    def read(cls, path: str | Path, recording: EvaluationData) -> "DriveTruth":
         """Reads truth.json. Raises ResultError that names the file and its rule if it is invalid."""
         return cls(read_truth(path), Path(path), recording)
 

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from drivesplat.edited_motion.edited_drive import EditedDrive
+from drivesplat.edited_motion.sampled_edit import SampledEdit
 from drivesplat.export import viewer_page as template
 from drivesplat.export.modes import fitted_modes
 from drivesplat.export.thinning import thinned_groups
@@ -41,7 +41,7 @@ def export_viewer(
     record: TrainingRecord,
     job: ViewerJob,
     method: str,
-    edits: Sequence[EditedDrive],
+    edits: Sequence[SampledEdit],
     provenance: Provenance,
 ) -> None:
     """Writes the page with the `job.gaussians` Gaussians of a checkpoint that have the largest coverage, viewed from

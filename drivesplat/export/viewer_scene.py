@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.edited_motion.edited_drive import EditedDrive, Instance, InstanceMotion
+from drivesplat.edited_motion.sampled_edit import Instance, InstanceMotion, SampledEdit
 from drivesplat.export.modes import Gait, Modes
 from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
 from drivesplat.export.trained_parts import SampledGroup
@@ -47,7 +47,7 @@ class ViewerContent:
     sky: Sky | None
     antialiased: bool
     path: RecordedPath
-    edits: Sequence[EditedDrive] = ()
+    edits: Sequence[SampledEdit] = ()
     images: Sequence[dict[str, Any]] = ()
     method: str = ""
     methods: Sequence[str] = ()
@@ -146,7 +146,7 @@ class MotionRecords:
             for (name, group), first in zip(groups.items(), firsts[:-1], strict=True)
         ]
 
-    def edits(self, drives: Sequence[EditedDrive], groups: Sequence[str]) -> list[dict[str, Any]]:
+    def edits(self, drives: Sequence[SampledEdit], groups: Sequence[str]) -> list[dict[str, Any]]:
         """A record for each edited drive: its `instances`, each with the number of its `group` and what differs from
         it, and the range of rows of its `camera`; null: as recorded."""
         return [

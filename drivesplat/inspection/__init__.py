@@ -1,1 +1,5 @@
-"""Looking at a trained model: ghost panel, removal of a vehicle, track table."""
+"""Pictures, films and tables of trained models beside recordings: ghost panel, removal of a vehicle, comparison of
+methods, LiDAR scans, track table.
+
+Metrics of methods are in `evaluation`.
+"""

@@ -9,7 +9,7 @@ from matplotlib import colormaps
 
 from drivesplat.errors import ResultError
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.settings.render import FilmEncoding
 
 MAX_ERROR = 0.5
@@ -62,7 +62,7 @@ def even_size(size: tuple[int, int]) -> tuple[int, int]:
     return max(2, width // 2 * 2), max(2, height // 2 * 2)
 
 
-def image_rate(recording: PreparedDrive, images: Sequence[int]) -> int:
+def image_rate(recording: EvaluationData, images: Sequence[int]) -> int:
     """Images a second, rounded, at least 1."""
     times = recording.record.timestamps[list(images)]
     return max(1, round(1e6 / float(np.median(np.diff(times))))) if len(images) > 1 else 1

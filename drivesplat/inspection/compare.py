@@ -26,7 +26,7 @@ from drivesplat.model.view import view_of
 from drivesplat.rendering.captions import BEYOND, Caption
 from drivesplat.rendering.film import encode_film
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import CompareJob, FilmEncoding
 
@@ -43,7 +43,7 @@ NOTES = {
 class _Comparison:
     """A recording with the models of several methods, and the figures of each image compared so far."""
 
-    recording: PreparedDrive
+    recording: EvaluationData
     models: Mapping[str, SplatModel]
     device: torch.device
     panels: Panels
@@ -72,7 +72,7 @@ class _Comparison:
 
 def render_comparison(
     checkpoints: Mapping[str, TrainedCheckpoint],
-    recording: PreparedDrive,
+    recording: EvaluationData,
     job: CompareJob,
     device_settings: DeviceSettings,
     path: Path,
@@ -96,7 +96,7 @@ def render_comparison(
     return film_record(job.eval_camera, encoding, panels, comparison.figures, written)
 
 
-def images_of(recording: PreparedDrive, camera: str) -> list[int]:
+def images_of(recording: EvaluationData, camera: str) -> list[int]:
     """The indices of a camera's images by time. Raises DatasetError if the scene lacks that camera."""
     record = recording.record
     if camera not in record.camera_names:

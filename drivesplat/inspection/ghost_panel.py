@@ -13,7 +13,7 @@ from drivesplat.inspection.ghosts import (
     ghost_figures,
     ghosts_of,
 )
-from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive, colors_of
+from drivesplat.inspection.rendered_view import ModelWithRecording, RenderedView, colors_of
 from drivesplat.inspection.subject import Subject, choose_subject, no_subject_reason, subject_record
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.regions import region_mask
@@ -45,7 +45,7 @@ class GhostPanel:
     path: np.ndarray
 
 
-def ghost_panel(drive: TrainedDrive, job: PanelJob) -> tuple[GhostPanel, dict[str, Any]]:
+def ghost_panel(drive: ModelWithRecording, job: PanelJob) -> tuple[GhostPanel, dict[str, Any]]:
     """The panel, and the content of ghost_panel.json without provenance.
 
     If no moving vehicle is visible, the panel shows the middle key frame, and the figures of vehicle and ghosts are

@@ -36,7 +36,7 @@ MAX_SAMPLED = 20
 
 
 @dataclass(frozen=True)
-class Place:
+class Rectangle:
     """A rectangle of the frame in pixels."""
 
     left: int
@@ -55,11 +55,11 @@ class Place:
         return figure.add_axes((self.left / width, bottom / height, self.width / width, self.height / height))
 
 
-RECORDED, RENDERED = Place(75, 92, 1730, 108), Place(75, 232, 1730, 108)
+RECORDED, RENDERED = Rectangle(75, 92, 1730, 108), Rectangle(75, 232, 1730, 108)
 SHOWN_SHARE = 0.97
 """Share of the recorded returns that views from above reach, at least 20 m and at most 100 m."""
 VIEW_SIZE, VIEW_TOP = 540, 400
-VIEWS = tuple(Place(left, VIEW_TOP, VIEW_SIZE, VIEW_SIZE) for left in (75, 690, 1305))
+VIEWS = tuple(Rectangle(left, VIEW_TOP, VIEW_SIZE, VIEW_SIZE) for left in (75, 690, 1305))
 DOT = 2
 """Pixels of a return seen from above."""
 
@@ -141,7 +141,7 @@ class LidarFrames:
             axis.set_xlim(180.0, -180.0)
             names = [f"{degrees:.0f}°" if self._ahead is None else word for degrees, word in DIRECTIONS]
             axis.set_xticks([degrees for degrees, _ in DIRECTIONS], names if place is RENDERED else [])
-        _bar(figure, Place(1830, 92, 16, 248), RANGE_COLORS, RANGES, (1.0, 10.0, 100.0), "{:g} m")
+        _bar(figure, Rectangle(1830, 92, 16, 248), RANGE_COLORS, RANGES, (1.0, 10.0, 100.0), "{:g} m")
         titles = ("From above, recorded", "From above, rendered", "Error of range, from above")
         for place, name in zip(VIEWS, titles, strict=True):
             self._rings(_panel(figure, place, name))
@@ -197,7 +197,7 @@ def _bytes(color: str) -> UInt8[np.ndarray, "3"]:
 
 
 def _enlarged(
-    colors: UInt8[np.ndarray, "b a 3"], place: Place, beams: Int[np.ndarray, " b"], firings: Int[np.ndarray, " a"]
+    colors: UInt8[np.ndarray, "b a 3"], place: Rectangle, beams: Int[np.ndarray, " b"], firings: Int[np.ndarray, " a"]
 ) -> np.ndarray:
     """An image of rays in the size of its place, each pixel that of the nearest ray."""
     rows, columns = (
@@ -206,7 +206,7 @@ def _enlarged(
     return colors[rows][:, columns]
 
 
-def _panel(figure: Figure, place: Place, title: str) -> Axes:
+def _panel(figure: Figure, place: Rectangle, title: str) -> Axes:
     axis = place.axes(figure)
     axis.set_facecolor("black")
     axis.set_title(title, loc="left", fontsize=13, color=INK, pad=5)
@@ -216,12 +216,14 @@ def _panel(figure: Figure, place: Place, title: str) -> Axes:
     return axis
 
 
-def _below(view: Place) -> Place:
+def _below(view: Rectangle) -> Rectangle:
     """The place of the colour bar of a view."""
-    return Place(view.left, view.top + view.height + 10, 330, 14)
+    return Rectangle(view.left, view.top + view.height + 10, 330, 14)
 
 
-def _bar(figure: Figure, place: Place, colors: Colormap, norm: Normalize, ticks: Sequence[float], form: str) -> None:
+def _bar(
+    figure: Figure, place: Rectangle, colors: Colormap, norm: Normalize, ticks: Sequence[float], form: str
+) -> None:
     orientation = "horizontal" if place.width > place.height else "vertical"
     bar = figure.colorbar(ScalarMappable(norm, colors), cax=place.axes(figure), orientation=orientation)
     labels = [form.format(tick).replace("-", "−").replace("+0 ", "0 ") for tick in ticks]

@@ -11,7 +11,7 @@ from skimage.filters import sobel
 
 from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.inspection.ghosts import MIN_COVERING_OPACITY, ghost_figures, ghosts_of
-from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive, colors_of
+from drivesplat.inspection.rendered_view import ModelWithRecording, RenderedView, colors_of
 from drivesplat.inspection.subject import Subject, choose_subject, no_subject_reason, subject_record
 from drivesplat.model.removal import Removal, removal_of
 from drivesplat.scene.regions import fill
@@ -44,7 +44,7 @@ class RemovalPair:
     outline: np.ndarray
 
 
-def remove_actor(drive: TrainedDrive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
+def remove_actor(drive: ModelWithRecording, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
     """The pair of images and the content of removal.json without provenance.
 
     If no moving vehicle is visible, both images are those of the middle key frame, and the figures are None, with the

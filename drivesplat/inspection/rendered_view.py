@@ -15,33 +15,33 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.device import DeviceSettings
 
 
 @dataclass(frozen=True)
-class TrainedDrive:
+class ModelWithRecording:
     """A trained model with the recording that it was trained on."""
 
     model: SplatModel
-    recording: PreparedDrive
+    recording: EvaluationData
     device: torch.device
 
 
-def open_trained_drive(
-    checkpoint: TrainedCheckpoint, recording: PreparedDrive, device_settings: DeviceSettings
-) -> TrainedDrive:
+def open_model_with_recording(
+    checkpoint: TrainedCheckpoint, recording: EvaluationData, device_settings: DeviceSettings
+) -> ModelWithRecording:
     """The model of a checkpoint on the device, with its recording. Raises DeviceError."""
     model, device = open_model(checkpoint, device_settings)
-    return TrainedDrive(model, recording, device)
+    return ModelWithRecording(model, recording, device)
 
 
 @dataclass(frozen=True)
 class RenderedView:
     """Renderings of the model of `drive` at the image `index` of the training record."""
 
-    drive: TrainedDrive
+    drive: ModelWithRecording
     index: int
 
     @cached_property

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import ConfigError
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import LABELS, REGIONS, Hull, labelled_hulls
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box
@@ -37,7 +37,7 @@ class Subject:
         return int(self.visible.sum())
 
 
-def choose_subject(recording: PreparedDrive, camera: str, settings: SubjectSettings) -> Subject | None:
+def choose_subject(recording: EvaluationData, camera: str, settings: SubjectSettings) -> Subject | None:
     """The subject in the key frames of `camera` at training resolution; None if no moving vehicle is visible there.
 
     Raises ConfigError, listing the candidates, if the settings name a track or a key frame without such a vehicle.
@@ -51,7 +51,7 @@ def choose_subject(recording: PreparedDrive, camera: str, settings: SubjectSetti
     return best
 
 
-def visible_subjects(recording: PreparedDrive, index: int) -> list[Subject]:
+def visible_subjects(recording: EvaluationData, index: int) -> list[Subject]:
     """The visible annotated objects of dynamic classes in an image, farthest first."""
     frame, size = recording.frame(index), recording.size(index)
     hulls, owners, labels = labelled_hulls(recording.scene, frame, size)
@@ -63,7 +63,7 @@ def visible_subjects(recording: PreparedDrive, index: int) -> list[Subject]:
     return [subject for subject in subjects if subject.visible.any()]
 
 
-def _candidates(recording: PreparedDrive, camera: str, settings: SubjectSettings) -> Iterator[Subject]:
+def _candidates(recording: EvaluationData, camera: str, settings: SubjectSettings) -> Iterator[Subject]:
     """The candidates in the requested key frames: moving vehicles, or the requested track."""
     for index in recording.scene.key_frames(camera):
         if settings.key_frame not in (None, recording.frame(index).sample_index):
@@ -77,7 +77,7 @@ def _candidates(recording: PreparedDrive, camera: str, settings: SubjectSettings
                 yield subject
 
 
-def _not_found_message(recording: PreparedDrive, camera: str, settings: SubjectSettings) -> str:
+def _not_found_message(recording: EvaluationData, camera: str, settings: SubjectSettings) -> str:
     requested = " and ".join(f"{name} {value}" for name, value in settings if value is not None)
     by_track: dict[str, list[int]] = {}
     for subject in _candidates(recording, camera, SubjectSettings()):
@@ -94,7 +94,7 @@ def no_subject_reason(camera: str) -> str:
     return f"no moving vehicle is visible from {camera} in this scene"
 
 
-def subject_record(subject: Subject, recording: PreparedDrive) -> dict[str, Any]:
+def subject_record(subject: Subject, recording: EvaluationData) -> dict[str, Any]:
     """The subject in the stages' JSON files: metres, m/s, microseconds; `object_to_world` (4, 4) at the box centre."""
     box = subject.box
     return {

@@ -12,7 +12,7 @@ from drivesplat.inspection.figures import BOX, draw_outline, image_grid, show
 from drivesplat.inspection.subject import Subject, visible_subjects
 from drivesplat.io.storage import write_csv
 from drivesplat.scene.actor_record import read_actors
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import MIN_PIXELS
 from drivesplat.scene.scene import Track
 from drivesplat.scene.tracks import box_at, ever_moves, short_ids
@@ -60,7 +60,7 @@ SubjectsByImage = Mapping[int, Sequence[Subject]]
 """The visible dynamic objects in each key frame of the evaluated camera, by the index of the image."""
 
 
-def subjects_by_image(recording: PreparedDrive, camera: str) -> SubjectsByImage:
+def subjects_by_image(recording: EvaluationData, camera: str) -> SubjectsByImage:
     """The visible dynamic objects in the key frames of `camera`."""
     return {index: visible_subjects(recording, index) for index in recording.scene.key_frames(camera)}
 
@@ -72,7 +72,7 @@ def editable_tracks(actors: Sequence[str]) -> set[str]:
 
 
 def track_rows(
-    recording: PreparedDrive,
+    recording: EvaluationData,
     subjects: SubjectsByImage,
     editable: Collection[str],
     actors: ActorSeedSettings | None,
@@ -123,7 +123,7 @@ def write_tracks(path: str | Path, rows: Sequence[TrackRow]) -> None:
     write_csv(path, [field.name for field in fields(TrackRow)], map(asdict, rows))
 
 
-def draw_tracks(recording: PreparedDrive, subjects: SubjectsByImage, rows: Sequence[TrackRow], camera: str) -> Figure:
+def draw_tracks(recording: EvaluationData, subjects: SubjectsByImage, rows: Sequence[TrackRow], camera: str) -> Figure:
     """Few key frames that show every moving object well, at most MAX_IMAGES, with outlines and the starts of
     their ids; the outlines of those that cannot be edited are dashed. The middle key frame if nothing moves."""
     largest = {row.id: row.pixels for row in rows if row.moves and row.pixels >= MIN_PIXELS}

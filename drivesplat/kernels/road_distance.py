@@ -67,11 +67,11 @@ def road_distance(
     if len(road.weights) == 0 or len(means) == 0:
         return means.sum() * 0.0
     if triton_support.usable_for(means):
-        from drivesplat.kernels.triton.road_distance import RoadDistance as OnGpu
+        from drivesplat.kernels.triton.road_distance import TritonRoadDistance as OnGpu
 
         return OnGpu.apply(means, quats, scales, opacities, road, ROUGHNESS)
     if not means.is_cuda:
-        from drivesplat.kernels.numba.road_distance import RoadDistance as OnCpu
+        from drivesplat.kernels.numba.road_distance import NumbaRoadDistance as OnCpu
 
         return OnCpu.apply(means, quats, scales, opacities, road, ROUGHNESS)
     return by_torch(means, quats, scales, opacities, road)

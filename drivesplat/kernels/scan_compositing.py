@@ -28,16 +28,19 @@ def composite_scan(met: Sequence[MetPart], values: Float[Tensor, "n v"]) -> list
     elsewhere. Where Triton cannot be used, or for float64, tensors on a GPU are copied to the CPU and back."""
     single = all(tensor.dtype == torch.float32 for tensor in (values, *met[0].gaussians))
     if triton_support.usable_for(values) and single:
+        from drivesplat.kernels.cuda import scans
         from drivesplat.kernels.triton.scan_compositing import composite_parts
+        from drivesplat.kernels.triton.scan_sums import CopiedChunks
 
-        return [CompositedScan(*composited) for composited in composite_parts(met, values)]
+        kind = scans.GatheredChunks if scans.can_composite(values) else CopiedChunks
+        return [CompositedScan(*composited) for composited in composite_parts(met, values, kind.of)]
     return [_on_cpu(part, values) for part in met]
 
 
 def _on_cpu(met: MetPart, values: Float[Tensor, "n v"]) -> CompositedScan:
-    from drivesplat.kernels.numba.scan_compositing import ScanCompositing
+    from drivesplat.kernels.numba.scan_compositing import NumbaScanCompositing
 
     inputs, rays = [tensor.cpu() for tensor in (*met.gaussians, values)], met.rays.on_cpu
     until = torch.zeros_like(rays.azimuths) if met.until is None else met.until.cpu()
-    composited = ScanCompositing.apply(*inputs, rays.within, rays.elevations, until, rays.borders)
+    composited = NumbaScanCompositing.apply(*inputs, rays.within, rays.elevations, until, rays.borders)
     return CompositedScan(*(tensor.to(values.device) for tensor in composited))

@@ -30,7 +30,7 @@ SERIAL = 32768
 """Number of values up to which torch uses one thread."""
 
 
-class Placement(NamedTuple):
+class SensorPlacement(NamedTuple):
     """Where Gaussians are in the sensor's frame, and how they lie: centres (3, n) in metres, and axes (3, 3, n): the
     scaled principal axes, coordinates first."""
 
@@ -64,7 +64,7 @@ def scanned(
 def _placed(
     means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"],
     world_to_sensor: Float[Tensor, "4 4"],
-) -> Placement:  # fmt: skip
+) -> SensorPlacement:  # fmt: skip
     """The Gaussians in the sensor's frame at the sweep's timestamp."""
     w, x, y, z = normalize(quats, dim=-1).T.unbind()
     xx, yy, zz, xy, xz, yz = 2 * x * x, 2 * y * y, 2 * z * z, 2 * x * y, 2 * x * z, 2 * y * z
@@ -76,10 +76,12 @@ def _placed(
     ]).reshape(3, 3, -1)  # fmt: skip
     rotation, translation = world_to_sensor[:3, :3, None], world_to_sensor[:3, 3:]
     axes = _turned(rotation, (rotations * scales.T).reshape(3, -1)).reshape(3, 3, -1)
-    return Placement(_turned(rotation, means.T) + translation, axes)
+    return SensorPlacement(_turned(rotation, means.T) + translation, axes)
 
 
-def _at_firing(gaussians: Placement, revolution: Revolution, world_to_sensor: Float[Tensor, "4 4"]) -> Placement:
+def _at_firing(
+    gaussians: SensorPlacement, revolution: Revolution, world_to_sensor: Float[Tensor, "4 4"]
+) -> SensorPlacement:
     """The Gaussians in the sensor's frame at the times at which the beams pass them."""
     with torch.no_grad():
         relative = -revolution.linear[:, None].expand_as(gaussians.centers)
@@ -91,7 +93,7 @@ def _at_firing(gaussians: Placement, revolution: Revolution, world_to_sensor: Fl
             offsets = firings.offsets_s[torch.searchsorted(firings.between, _atan2(y, x))]
         turns, moved = _turns(-revolution.angular, offsets), relative * offsets
     axes = torch.stack([_turned(turns, axis) for axis in gaussians.axes.unbind(1)], dim=1)
-    return Placement(_turned(turns, gaussians.centers + moved), axes)
+    return SensorPlacement(_turned(turns, gaussians.centers + moved), axes)
 
 
 def _length(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
@@ -123,7 +125,7 @@ def _turned(turns: Float[Tensor, "rows 3 #n"], vectors: Float[Tensor, "3 n"]) ->
 
 
 def _project(
-    gaussians: Placement, opacities: Float[Tensor, " n"], beam_spread: tuple[float, float], max_range: float
+    gaussians: SensorPlacement, opacities: Float[Tensor, " n"], beam_spread: tuple[float, float], max_range: float
 ) -> ScannedGaussians:
     """Projects Gaussians in the sensor's frame to azimuth, elevation and range."""
     with torch.no_grad():

@@ -21,14 +21,14 @@ def view_colors(
     ValueError for too few coefficients, and on the CPU for degrees above 3.
     """
     if not means.is_cuda:
-        from drivesplat.kernels.numba.view_colors import MAX_DEGREE, ViewColors
+        from drivesplat.kernels.numba.view_colors import MAX_DEGREE, NumbaViewColors
 
         if not 0 <= degree <= MAX_DEGREE or coefficients.shape[1] < (degree + 1) ** 2:
             raise ValueError(
                 f"spherical harmonics of degree {degree} from {coefficients.shape[1]} coefficients: "
                 f"the CPU knows degrees 0 to {MAX_DEGREE}, and needs (degree + 1)² coefficients"
             )
-        return ViewColors.apply(means, coefficients, viewmats, radii, degree)
+        return NumbaViewColors.apply(means, coefficients, viewmats, radii, degree)
     from gsplat import spherical_harmonics
 
     rotations, translations = viewmats[:, :3, :3], viewmats[:, :3, 3:]
@@ -50,6 +50,5 @@ def fused_view_colors(
     where the kernel does not apply; it needs Triton, degree 0 or 1 and a camera without gradient."""
     if degree > 1 or camera_to_world.requires_grad or not triton_support.usable_for(means):
         return None
-    from drivesplat.kernels.triton.view_colors import ViewColors
 
-    return ViewColors.apply(means, sh0, shN, camera_to_world, degree)
+    return NumbaViewColors.apply(means, sh0, shN, camera_to_world, degree)

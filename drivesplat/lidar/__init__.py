@@ -1,1 +1,4 @@
-"""LiDAR sweeps as rays and points."""
+"""LiDAR sweeps and scans: rays, points, ground, occlusion, colours, records of depth and free space, baselines.
+
+It reads sweeps by `readers`, and imports no model.
+"""

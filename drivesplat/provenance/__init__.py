@@ -1,1 +1,1 @@
-"""Where a result comes from: provenance records and code digests."""
+"""Where a result comes from: provenance records, and digests of code, syntax and files."""

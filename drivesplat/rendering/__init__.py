@@ -1,1 +1,1 @@
-"""Films and frames from trained models, along trajectories."""
+"""Films and frames of trained models: camera paths, panels, captions, the encoder."""

@@ -1,1 +1,5 @@
-"""The record of a drive: sensors, frames, tracks, splits, regions."""
+"""Records of a drive: `Scene` with sensors, frames, sweeps and tracks; masks, splits, regions, the training record;
+rigid motion and lenses.
+
+It knows no dataset and no model, and imports `errors`, `io` and `settings` alone.
+"""

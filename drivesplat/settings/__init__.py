@@ -1,4 +1,5 @@
-"""The base class of all settings records, and one-line messages for their errors.
+"""Settings: a record per section of config.yaml and per rule, and the generated config.yaml and schema. This module has
+their base class, and one-line messages for their errors.
 
 Fields are documented by attribute docstrings, so that a reworded comment does not change the code digest (see
 `drivesplat.provenance.code_digest`).

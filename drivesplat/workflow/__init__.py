@@ -1,4 +1,5 @@
-"""What the rules ask: plan, stages, inputs, jobs, GPUs and measured costs."""
+"""What the rules ask: plan, stages, inputs, jobs, GPUs and measured costs. Every process of Snakemake imports it, so
+that it imports nothing heavy."""
 
 import os
 import sys

@@ -5,17 +5,17 @@ from typing import Any
 
 from drivesplat.errors import ConfigError
 from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
-from drivesplat.workflow.place import Place
+from drivesplat.workflow.job_scope import JobScope
 from drivesplat.workflow.without_cameras import HOW, no_camera
 
 
-def film_format(at: Place) -> dict[str, Any]:
+def film_format(at: JobScope) -> dict[str, Any]:
     """Of a `FilmFormat`."""
     fields = ("fps", "width", "height", "horizontal_fov", "crf", "captions")
     return {"camera": at.config.eval_camera, **{name: getattr(at.config.render, name) for name in fields}}
 
 
-def film(at: Place) -> dict[str, Any]:
+def film(at: JobScope) -> dict[str, Any]:
     """Of a `FilmJob`. Raises ConfigError for an unknown trajectory."""
     trajectories = at.config.render.trajectories
     if at.film not in trajectories:
@@ -23,7 +23,7 @@ def film(at: Place) -> dict[str, Any]:
     return {"trajectory": trajectories[at.film], **film_format(at)}
 
 
-def quad(at: Place) -> dict[str, Any]:
+def quad(at: JobScope) -> dict[str, Any]:
     """Of an `EditJob` that writes no frames. Raises ConfigError for an unknown edit."""
     edits = scene_edits(at.config, at.scene)
     if at.film not in edits:
@@ -31,23 +31,23 @@ def quad(at: Place) -> dict[str, Any]:
     return {"edit": edits[at.film], **film_format(at)}
 
 
-def edited_film(at: Place) -> dict[str, Any]:
+def edited_film(at: JobScope) -> dict[str, Any]:
     """Of an `EditJob`; raises as `quad`."""
     return {**quad(at), "frames": at.config.render.edited_frames}
 
 
-def _edit_or_trajectory(at: Place) -> dict[str, Any]:
+def _edit_or_trajectory(at: JobScope) -> dict[str, Any]:
     kind, _, name = at.film.partition("/")
     of_film = replace(at, film=name)
     return {"edit": quad(of_film)["edit"]} if kind == EDITS else {"trajectory": film(of_film)["trajectory"]}
 
 
-def drive_folder(at: Place) -> dict[str, Any]:
+def drive_folder(at: JobScope) -> dict[str, Any]:
     """Of a `DriveJob`; raises as `quad` or `film`."""
     return {**_edit_or_trajectory(at), "width": at.config.export.drive_width}
 
 
-def scan_folder(at: Place) -> dict[str, Any]:
+def scan_folder(at: JobScope) -> dict[str, Any]:
     """Of a `ScanFolderJob`; raises as `quad` or `film`, and ConfigError for an edit of a scene without cameras."""
     camera = at.config.eval_camera if at.config.cameras else None
     if camera is None and at.film.startswith(f"{EDITS}/"):
@@ -55,6 +55,6 @@ def scan_folder(at: Place) -> dict[str, Any]:
     return {**_edit_or_trajectory(at), "eval_camera": camera, "formats": at.config.export.scan_formats}
 
 
-def encoding(at: Place) -> dict[str, Any]:
+def encoding(at: JobScope) -> dict[str, Any]:
     """How films that combine others are encoded."""
     return {name: getattr(at.config.render, name) for name in ("crf", "captions")}

@@ -22,9 +22,8 @@ from drivesplat.readers.outline import (
     without_training,
 )
 from drivesplat.settings.config import for_scene
-from drivesplat.workflow.costs.measured import TRAIN, WORLD
 from drivesplat.workflow.job_resources import JobResources
-from drivesplat.workflow.stages import SCANS
+from drivesplat.workflow.stages import SCANS, TRAIN, WORLD
 
 TRAINING_MB = 16_000
 """Memory in MB of a training without its images."""

@@ -29,8 +29,8 @@ from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.workflow import film_fields
 from drivesplat.workflow.film_names import no_such_edit, scene_edits
+from drivesplat.workflow.job_scope import JobScope
 from drivesplat.workflow.named_tracks import fitting_edits, shows_subject
-from drivesplat.workflow.place import Place
 from drivesplat.workflow.without_cameras import (
     CAMERA_STAGES,
     LIDAR_METHOD_STAGES,
@@ -39,15 +39,17 @@ from drivesplat.workflow.without_cameras import (
     no_camera,
 )
 
+TRAIN, WORLD = "train", "demo_world"
+"""The stages of a training and of a synthetic world."""
 SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
-METHOD_STAGES = ("train", "evaluate")
+METHOD_STAGES = (TRAIN, "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
 ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
-    "demo_world", "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
+    WORLD, "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
     "scan_folder",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
@@ -68,11 +70,11 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
     there, dataset = for_scene(config, scene, method), config.dataset_of(scene)
     if not there.cameras and stage in CAMERA_STAGES:
         raise ConfigError(f"{no_camera(scene)}: the stage {stage} needs images")
-    place = Place(there, dataset, scene if stage in OF_ONE_SCENE else "", method or "", film or "")
+    place = JobScope(there, dataset, scene if stage in OF_ONE_SCENE else "", method or "", film or "")
     return canonical_json(_record(stage, place).model_dump(mode="json"))
 
 
-def _record(stage: str, place: Place) -> Settings:
+def _record(stage: str, place: JobScope) -> Settings:
     record, own_fields = _STAGES[stage]
     sections = {name: getattr(place.config, name) for name in record.model_fields if name in Config.model_fields}
     return record(**sections | own_fields(place))
@@ -80,10 +82,10 @@ def _record(stage: str, place: Place) -> Settings:
 
 def refines_poses(config: Config, scene: str) -> bool:
     """Whether a scene's poses are refined before all other stages."""
-    return _refines(Place(for_scene(config, scene), config.dataset_of(scene), scene, "", ""))
+    return _refines(JobScope(for_scene(config, scene), config.dataset_of(scene), scene, "", ""))
 
 
-def _refines(at: Place) -> bool:
+def _refines(at: JobScope) -> bool:
     enabled, world = at.config.refine_poses.enabled, at.dataset.world
     if not at.config.cameras:
         return False
@@ -132,11 +134,11 @@ def idle_variants(config: Config, scene: str) -> list[str]:
     return [without for without, settings in zip(job.without, others, strict=True) if settings == whole]
 
 
-def _nothing(_: Place) -> dict[str, Any]:
+def _nothing(_: JobScope) -> dict[str, Any]:
     return {}
 
 
-def _scene_source(at: Place) -> dict[str, Any]:
+def _scene_source(at: JobScope) -> dict[str, Any]:
     start = at.config.refine_poses.start
     return {
         "dataset": at.dataset_name,
@@ -150,7 +152,7 @@ def _scene_source(at: Place) -> dict[str, Any]:
     }
 
 
-def _ego_mask(at: Place) -> dict[str, Any]:
+def _ego_mask(at: JobScope) -> dict[str, Any]:
     config, kind = at.config, at.config.masks.own_car
     polygons = config.masks.own_car_polygons if kind != "none" else {}
     excluded = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
@@ -159,22 +161,22 @@ def _ego_mask(at: Place) -> dict[str, Any]:
     return {"polygons": polygons, "search": search if cameras else None}
 
 
-def _lidar_rays(at: Place) -> dict[str, Any]:
+def _lidar_rays(at: JobScope) -> dict[str, Any]:
     if at.config.refine_poses.start != "images":
         return {}
     return {"lidar": LidarRays(ray_spacing=at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius"))}
 
 
-def _lidar_depth(at: Place) -> dict[str, Any]:
+def _lidar_depth(at: JobScope) -> dict[str, Any]:
     return {"ray_spacing": at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius", "box_margin")}
 
 
-def _lidar(at: Place, *names: str) -> dict[str, Any]:
+def _lidar(at: JobScope, *names: str) -> dict[str, Any]:
     """Settings of the seed that hold for all uses of LiDAR."""
     return {name: getattr(at.config.lidar_seed, name) for name in names}
 
 
-def _training(at: Place) -> dict[str, Any]:
+def _training(at: JobScope) -> dict[str, Any]:
     config, method = at.config, at.config.all_methods[at.method]
     train = config.train.for_parts(method.parts)
     if not config.cameras:
@@ -186,7 +188,7 @@ def _training(at: Place) -> dict[str, Any]:
     return {"parts": method.parts, "train": train, "reference_camera": reference}
 
 
-def _evaluation(at: Place) -> dict[str, Any]:
+def _evaluation(at: JobScope) -> dict[str, Any]:
     return {
         "tracks": at.tracks,
         "lidar": _record("lidar_depth", at),
@@ -195,7 +197,7 @@ def _evaluation(at: Place) -> dict[str, Any]:
     }
 
 
-def _viewer(at: Place) -> dict[str, Any]:
+def _viewer(at: JobScope) -> dict[str, Any]:
     """The edits of a method that can be edited, and the methods that have pages, too."""
     export, editable = at.config.export, at.config.all_methods[at.method].object_parts
     return {
@@ -207,14 +209,14 @@ def _viewer(at: Place) -> dict[str, Any]:
     }
 
 
-def _subject(at: Place) -> dict[str, Any]:
+def _subject(at: JobScope) -> dict[str, Any]:
     """The vehicle that the user selected for the scene, if its track is one of those that pictures of the method
     show."""
     subject = at.config.subjects.get(at.scene, SubjectSettings())
     return {"subject": subject if shows_subject(subject, at.tracks) else SubjectSettings()}
 
 
-def _world(at: Place) -> dict[str, Any]:
+def _world(at: JobScope) -> dict[str, Any]:
     """Raises ConfigError where an edit whose truth is asked for does not exist."""
     world, edits = at.dataset.world, scene_edits(at.config, at.scene)
     assert world is not None
@@ -231,7 +233,7 @@ def _world(at: Place) -> dict[str, Any]:
     }
 
 
-_STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
+_STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] = {
     "demo_world": (WorldJob, _world),
     "extract": (SceneSource, _scene_source),
     "own_car": (EgoMaskJob, _ego_mask),

@@ -6,7 +6,7 @@ import trimesh
 from helpers.demo_worlds import FRONT, LIDAR, meshes_at, named, names_of, pose_at, recorder_of
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from drivesplat.demo.optics.lidar import MAX_RANGE, Scan, ScanPattern, scan, scan_pattern
+from drivesplat.demo.optics.lidar import MAX_RANGE, ScanPattern, StreetScan, scan, scan_pattern
 from drivesplat.demo.optics.raycast import RayCaster
 from drivesplat.demo.recorder import Recorder, Viewpoint
 from drivesplat.demo.shapes.mesh import Material, box
@@ -30,7 +30,7 @@ def recorder(request) -> Recorder:
 
 
 @pytest.fixture(scope="module")
-def found(recorder) -> Scan:
+def found(recorder) -> StreetScan:
     return recorder.scan(LIDAR, TIME_US)
 
 
@@ -70,7 +70,7 @@ def by_hand(triangles: np.ndarray, origin: np.ndarray, direction: np.ndarray) ->
     return float(distance[hit].min(initial=np.inf))
 
 
-def steps_of(recorder: Recorder, found: Scan) -> np.ndarray:
+def steps_of(recorder: Recorder, found: StreetScan) -> np.ndarray:
     """Steps all round, and some of those that hit each moving object."""
     steps = set(range(0, found.range.shape[1], 150))
     for number, item in enumerate(recorder.objects):
@@ -174,7 +174,7 @@ def test_returns_are_dropped_by_range_and_by_what_they_reflect(recorder, found):
 PATTERN = scan_pattern(WorldLidarSettings(beams=64), 20)
 
 
-def scanned(objects: list, wet: float = 0.0, pattern: ScanPattern = PATTERN, **lidar) -> Scan:
+def scanned(objects: list, wet: float = 0.0, pattern: ScanPattern = PATTERN, **lidar) -> StreetScan:
     """A scan from the origin of a street of `objects`, y ahead."""
     steps = len(pattern.azimuths)
     poses, times = np.tile(np.eye(4), (steps, 1, 1)), np.zeros(steps)
@@ -224,7 +224,7 @@ def test_a_wet_road_returns_less_than_a_dry_one_and_nothing_else_changes():
     np.testing.assert_array_equal(*plain)
 
 
-def edge_scans(gap: float, grey: float) -> tuple[Scan, Scan, np.ndarray]:
+def edge_scans(gap: float, grey: float) -> tuple[StreetScan, StreetScan, np.ndarray]:
     """Scans without and with a divergence of 6 mrad of a plate 2 m wide and high, `gap` metres before a wall of the
     reflectance `grey`; and which rays (beams, steps) come within their cone of the plate's edge."""
     plate = fixed("plate", box((-1.0, 10.0, -1.0), (1.0, 10.02, 1.0), Material.PLAIN, (0.4,) * 3))

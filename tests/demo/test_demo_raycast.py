@@ -7,7 +7,7 @@ import numpy as np
 from helpers.demo_worlds import FRONT, names_of, world_of
 from helpers.patience import PATIENCE_S
 
-from drivesplat.demo.optics.raycast import RayCaster, Rays, Sphere
+from drivesplat.demo.optics.raycast import RayCaster, Sphere, StreetRays
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.shapes.body import RigidBody
 from drivesplat.demo.shapes.mesh import Material, box
@@ -38,7 +38,7 @@ def test_more_than_a_thousand_moving_pieces_are_hit_at_their_own_times():
     for moment, left in ((0, 0.0), (1, 2.0)):
         toward = np.stack([3.0 * rows, np.full(MANY, left), np.full(MANY, -4.5)], axis=-1)
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        hits = caster.at(seconds).cast(Rays(seconds, origins, toward, np.full(MANY, moment, np.int32)))
+        hits = caster.at(seconds).cast(StreetRays(seconds, origins, toward, np.full(MANY, moment, np.int32)))
         assert (hits.object[:200] >= 0).all() and (hits.object[:5] == rows[:5]).all()
     assert hits.object.max() > 50
 
@@ -62,7 +62,7 @@ def test_rays_that_pass_a_limb_are_all_cast_at_it_and_few_others():
     places = np.concatenate([moving.item.poses(seconds)[:, :3, 3] for moving in caster._moving])
     toward = rng.choice(places, count) + rng.normal(0.0, 0.7, (count, 3)) + [0.0, 0.0, 0.9] - origins[moment]
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    rays = Rays(seconds, origins, toward, moment)
+    rays = StreetRays(seconds, origins, toward, moment)
     found, expected = (every.at(seconds).cast(rays) for every in (caster, everywhere))
     for name in ("distance", "object", "face", "normal", "weights"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))

@@ -6,7 +6,7 @@ import trimesh
 from helpers.demo_worlds import named, recorder_of, world_of
 
 from drivesplat.demo.street.objects import EGO_PARTS
-from drivesplat.demo.street.road import STRAIGHT, Road
+from drivesplat.demo.street.road import STRAIGHT, ReferenceLine
 from drivesplat.demo.street.street import BEND_RADIUS, BEND_START, RISE, road_of
 
 S = np.linspace(-40.0, 220.0, 26_001)
@@ -21,7 +21,7 @@ def bend_and_grade(request) -> tuple[float, float]:
 
 
 @pytest.fixture
-def road(bend_and_grade) -> Road:
+def road(bend_and_grade) -> ReferenceLine:
     bend, grade = bend_and_grade
     return road_of(world_of(bend_deg=bend, grade=grade))
 

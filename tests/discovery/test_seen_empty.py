@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.street_scans import HEIGHT, Mover, street_scans
 
-from drivesplat.discovery.seen_empty import BASELINES_S, RangeImage, asked, seen_empty
+from drivesplat.discovery.seen_empty import BASELINES_S, RangeGrid, asked, seen_empty
 
 
 def test_a_scan_sees_places_before_at_and_behind_a_surface():
@@ -18,7 +18,7 @@ def test_a_scan_sees_places_before_at_and_behind_a_surface():
         [12.0, 4.0, 1.0],  # beside, before the facade
         [12.0, 11.75, 1.5],  # the facade
     ])  # fmt: skip
-    empty, occupied = RangeImage(scan).seen(places)
+    empty, occupied = RangeGrid(scan).seen(places)
     np.testing.assert_array_equal(empty, [True, False, False, False, True, False])
     np.testing.assert_array_equal(occupied, [False, True, False, False, False, True])
 
@@ -27,7 +27,7 @@ def test_a_place_is_looked_up_at_the_time_when_the_sensor_looks_there():
     """At 20 m/s the sensor moves two metres in a revolution: a pole beside the way would be missed."""
     pole = Mover((6.0, 5.0), size=(0.4, 0.4, 3.0))
     (scan,) = street_scans([pole], np.array([0.0]), speed=20.0)
-    _, occupied = RangeImage(scan).seen(np.array([[6.0, 4.8, 1.0], [6.0, 4.8, HEIGHT]]))
+    _, occupied = RangeGrid(scan).seen(np.array([[6.0, 4.8, 1.0], [6.0, 4.8, HEIGHT]]))
     assert occupied.all()
 
 

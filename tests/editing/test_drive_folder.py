@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial import ConvexHull
 
 from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_drive
-from drivesplat.editing.rendered_drive import rendered_drive
+from drivesplat.editing.render_plan import image_render_plan
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.storage import unwritable
 from drivesplat.model.part import ActorPlacement
@@ -245,7 +245,7 @@ def with_side_camera(scene: Scene, ends: float) -> Scene:
 def test_every_camera_has_its_images_as_far_as_its_own_path_goes(ego, ends, counts, scene, model):
     rig = with_side_camera(scene, ends)
     job = a_job({"ego": ego}).model_copy(update={"cameras": ("CAM_FRONT", "SIDE")})
-    drive = rendered_drive(rig, model, job, Path("here"), "it")
+    drive = image_render_plan(rig, model, job, Path("here"), "it")
     found = [frame.camera for frame in drive.scene.frames]
     assert (found.count("CAM_FRONT"), found.count("SIDE")) == counts
     along = {(f.camera, f.timestamp): f.ego_to_world[0, 3] for f in drive.scene.frames}

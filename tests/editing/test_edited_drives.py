@@ -8,8 +8,8 @@ from helpers.hand_made_street import AHEAD, GONE, TURNING, checkpoint_of, street
 
 from drivesplat.edited_motion.edited_actors import edited_actors
 from drivesplat.editing.actors import editable_actors
-from drivesplat.editing.drives import edited_drives
 from drivesplat.editing.ego import edited_camera_path
+from drivesplat.editing.sampled_edits import sampled_edits
 from drivesplat.settings.edit import Edit
 
 
@@ -36,7 +36,7 @@ STEPS = (
 
 def test_objects_are_where_the_film_of_the_edit_has_them(scene, checkpoint):
     edit = edit_of(*STEPS)
-    (drive,) = edited_drives(checkpoint, scene, "CAM_FRONT", {"mixed": edit}, 30)
+    (drive,) = sampled_edits(checkpoint, scene, "CAM_FRONT", {"mixed": edit}, 30)
     expected = {a.id: a for a in edited_actors(editable_actors(street_model(), scene, ""), edit, "")}
     assert drive.name == "mixed" and drive.camera is None
     assert {one.id: (one.source, one.scale) for one in drive.instances} == {
@@ -56,7 +56,7 @@ def test_objects_are_where_the_film_of_the_edit_has_them(scene, checkpoint):
 
 def test_a_changed_ego_vehicle_brings_its_camera(scene, checkpoint):
     edit = edit_of({"ego": {"lateral": 1.5}})
-    (drive,) = edited_drives(checkpoint, scene, "CAM_FRONT", {"aside": edit}, 30)
+    (drive,) = sampled_edits(checkpoint, scene, "CAM_FRONT", {"aside": edit}, 30)
     path = edited_camera_path(scene, "CAM_FRONT", 30, edit, "")
     np.testing.assert_array_equal(drive.camera.camera_to_world, path.camera_to_world)
     assert drive.camera.seconds[0] == 0.0 and len(drive.camera.seconds) == len(path)
@@ -66,7 +66,7 @@ def test_a_changed_ego_vehicle_brings_its_camera(scene, checkpoint):
 def test_an_edit_that_does_not_fit_is_left_out_with_a_warning(scene, checkpoint, caplog):
     edits = {"typo": edit_of({"remove": {"track": "abcd"}}), "gone": edit_of({"remove": {"track": GONE}})}
     with caplog.at_level(logging.WARNING):
-        drives = edited_drives(checkpoint, scene, "CAM_FRONT", edits, 30)
+        drives = sampled_edits(checkpoint, scene, "CAM_FRONT", edits, 30)
     assert [drive.name for drive in drives] == ["gone"]
     (message,) = caplog.messages
     assert "edit 'typo', step 1 (remove)" in message and "abcd" in message

@@ -13,7 +13,7 @@ from helpers.scanned_street import ECHO, SPEED, UNMEASURED, WALL_AT, parked_truc
 from plyfile import PlyData
 
 from drivesplat.editing.scan_folder import write_scan_folder
-from drivesplat.editing.scans import ScanDrive, SimulatedScan, scan_drive
+from drivesplat.editing.scans import ScanRenderPlan, SimulatedScan, scan_render_plan
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import scan_of
@@ -56,8 +56,8 @@ def records(scene) -> ScanRecords:
     return scan_records(scene)
 
 
-def driven(scene: Scene, model: SplatModel, records: ScanRecords, job: ScanFolderJob) -> ScanDrive:
-    return scan_drive(scene, model, records.scans, job, "here")
+def driven(scene: Scene, model: SplatModel, records: ScanRecords, job: ScanFolderJob) -> ScanRenderPlan:
+    return scan_render_plan(scene, model, records.scans, job, "here")
 
 
 def simulated(

@@ -12,18 +12,18 @@ from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.image_metrics import measured_images
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.preprocess.parser import training_record
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.images import ParserJob
 
 
-def recording_of(scene: Scene, holdout=HELD_OUT) -> PreparedDrive:
+def recording_of(scene: Scene, holdout=HELD_OUT) -> EvaluationData:
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    return PreparedDrive(scene, training_record(scene, seed, ParserJob(holdout=holdout, images={})))
+    return EvaluationData(scene, training_record(scene, seed, ParserJob(holdout=holdout, images={})))
 
 
-def record_of(recording: PreparedDrive) -> dict:
+def record_of(recording: EvaluationData) -> dict:
     return summarize_drive(recording, "CAM_FRONT", measured_images(recording.record, "CAM_FRONT"))
 
 

@@ -16,7 +16,7 @@ from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.lidar_depth import lidar_depths
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -62,7 +62,7 @@ def test_too_few_pixels_give_null_and_no_sweep_gives_no_entry(count, summary):
     assert errors.summary() == summary
 
 
-def held_out_recording(root: Path) -> PreparedDrive:
+def held_out_recording(root: Path) -> EvaluationData:
     return recording_of(scene_at(root), **HELD_OUT)
 
 

@@ -10,8 +10,8 @@ from drivesplat.evaluation.image_metrics import evaluate_groups
 from drivesplat.evaluation.overlaps import overlap_masks, seen_by_others
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.images import continuous_intrinsics, project
-from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.rigid import inverse
 
 GREY = (0.4, 0.5, 0.6)
@@ -19,13 +19,13 @@ FRONT = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT")
 
 
 @pytest.fixture(scope="module")
-def front(tmp_path_factory) -> PreparedDrive:
+def front(tmp_path_factory) -> EvaluationData:
     return recording_of(
         rig_drive(tmp_path_factory.mktemp("rig"), (*FRONT, "CAM_BACK"), 5), every_nth=4, offset=2, last_block=0
     )
 
 
-def image_of(recording: PreparedDrive, camera: str, key_frame: int) -> int:
+def image_of(recording: EvaluationData, camera: str, key_frame: int) -> int:
     (index,) = [i for i, f in enumerate(recording.scene.frames) if (f.camera, f.sample_index) == (camera, key_frame)]
     return index
 

@@ -10,7 +10,7 @@ from drivesplat.evaluation.image_metrics import evaluate_groups, side_camera_met
 from drivesplat.evaluation.views_aside import place_of_view, views_aside
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 
 GREY = (0.4, 0.5, 0.6)
 CPU = torch.device("cpu")
@@ -23,7 +23,7 @@ def grey() -> SplatModel:
 
 
 @pytest.fixture
-def left_out(tmp_path) -> PreparedDrive:
+def left_out(tmp_path) -> EvaluationData:
     return recording_of(rig_drive(tmp_path, CAMERAS, 6), **HOLDOUT, cameras=("CAM_FRONT_LEFT",))
 
 

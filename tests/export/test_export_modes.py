@@ -24,7 +24,7 @@ from helpers.viewer_pages import (
 from helpers.walkers import SIZE, walker, walking
 from scipy.spatial.transform import Rotation
 
-from drivesplat.edited_motion.edited_drive import EditedDrive, Instance, InstanceMotion
+from drivesplat.edited_motion.sampled_edit import Instance, InstanceMotion, SampledEdit
 from drivesplat.export.modes import Gait, Modes, fitted_modes
 from drivesplat.export.sampled_motion import SampledMotion
 from drivesplat.export.trained_parts import SampledGroup, sampled_shapes, trained_groups
@@ -146,7 +146,7 @@ def test_people_walk_as_recorded_and_as_edited(tmp_path):
     slowed = Instance("slowed", TURNING, "human.pedestrian.adult", np.array(SIZE), 1.0, moved, phase=0.5)
     groups = {"background": SampledGroup(street), TURNING: group}
     content = ViewerContent(
-        groups, sky, False, path_from(frame), [EditedDrive("slowed", (slowed,), None)],
+        groups, sky, False, path_from(frame), [SampledEdit("slowed", (slowed,), None)],
         modes=fitted_modes(model, groups),
     )  # fmt: skip
     file = tmp_path / "viewer.html"

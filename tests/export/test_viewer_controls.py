@@ -33,7 +33,7 @@ from helpers.viewer_pages import (
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.edited_motion.edited_drive import CameraMotion, EditedDrive, Instance, InstanceMotion
+from drivesplat.edited_motion.sampled_edit import CameraMotion, Instance, InstanceMotion, SampledEdit
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_images import key_frame_images
@@ -57,7 +57,7 @@ def aside() -> np.ndarray:
     return rigid(pose[:3, :3], pose[:3, 3] - pose[:3, 0])
 
 
-def edits() -> list[EditedDrive]:
+def edits() -> list[SampledEdit]:
     """The car removed; and a copy of it, half as large, beside it from the second 0.5 on, seen from a metre aside."""
     seconds = np.linspace(0.5, 2.0, 46)
     motion = InstanceMotion(seconds, np.stack([beside(second) for second in seconds]), seconds, ((0.5, 2.0),))
@@ -67,7 +67,7 @@ def edits() -> list[EditedDrive]:
         Instance("twin", CAR, "vehicle.car", SIZE, 0.5, motion),
     )
     painted = Instance(CAR, CAR, "vehicle.car", SIZE, 1.0, standing(), SWAPPED)
-    return [EditedDrive("gone", (), None), EditedDrive("twins", copied, camera), EditedDrive("paint", (painted,), None)]
+    return [SampledEdit("gone", (), None), SampledEdit("twins", copied, camera), SampledEdit("paint", (painted,), None)]
 
 
 SWAPPED = np.array([[0.0, 0.8, 0.0], [0.1, 0.0, 0.7], [0.9, 0.0, 0.0]])

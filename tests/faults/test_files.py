@@ -153,11 +153,11 @@ def test_a_resume_state_of_any_kind_executes_nothing(tmp_path, kind):
 
 
 def test_no_script_reads_results_but_by_a_reader_that_is_tested():
-    """`read_prepared_drive`, `read_inputs`, `read_evaluation_inputs` and `read_scan_evaluation_inputs` are made of
+    """`read_evaluation_data`, `read_inputs`, `read_evaluation_inputs` and `read_scan_evaluation_inputs` are made of
     others."""
     tested = {
         "read_json",
-        "read_prepared_drive",
+        "read_evaluation_data",
         "read_inputs",
         "read_evaluation_inputs",
         "read_scan_evaluation_inputs",

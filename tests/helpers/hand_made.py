@@ -17,9 +17,9 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.actor_record import ActorRecord
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.motion import Motion
-from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
@@ -133,12 +133,12 @@ def looking_at(target: Any, place: Any, time: float = 0.0, width: int = 48, heig
     return View(intrinsics, torch.from_numpy(pose).float(), width, height, time)
 
 
-def recording_of(scene: Scene, masks: Path | None = None, width: int | None = None, **holdout: int) -> PreparedDrive:
+def recording_of(scene: Scene, masks: Path | None = None, width: int | None = None, **holdout: int) -> EvaluationData:
     """A scene as a recording; nothing is held out but what `holdout` says."""
     settings = HoldoutSettings(**{"every_nth": 0, "last_block": 0, **holdout})
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
     job = ParserJob(holdout=settings, images=ImageSettings(width=width))
-    return PreparedDrive(scene, training_record(scene, seed, job), masks)
+    return EvaluationData(scene, training_record(scene, seed, job), masks)
 
 
 def write_labels(folder: Path, scene: Scene, labels: np.ndarray) -> Path:

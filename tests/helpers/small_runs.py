@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.evaluation.scene_metrics import side_by_side
-from drivesplat.inspection.rendered_view import TrainedDrive, open_trained_drive
+from drivesplat.inspection.rendered_view import ModelWithRecording, open_model_with_recording
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
@@ -16,7 +16,7 @@ from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import training_record
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, load
@@ -57,7 +57,7 @@ class Finished:
     folder: Path
     config: Config
     metrics: dict[str, Any]
-    drives: dict[str, TrainedDrive]
+    drives: dict[str, ModelWithRecording]
 
     def job(self, stage: str, kind: type[S], method: str | None = None, film: str | None = None) -> S:
         """The settings of a stage."""
@@ -77,7 +77,7 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
     parser = training_record(scene, seed_points(scene, made.job("lidar_seed", SeedJob)), made.job("parser", ParserJob))
     actors = actors_record(scene, made.job("actors", ActorSeedJob)).actors
     depths = lidar_depths(scene, made.job("lidar_depth", LidarDepthJob))
-    recording, known = PreparedDrive(scene, parser, folder / "masks"), {"sky_known": masks.sky_known}
+    recording, known = EvaluationData(scene, parser, folder / "masks"), {"sky_known": masks.sky_known}
     evals = {}
     for method, settings in made.config.methods.items():
         moving = (actors, depths) if "actors" in settings.parts else ([], [])
@@ -87,6 +87,6 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
         checkpoint, summary = read_checkpoint(files.checkpoint), json.loads(files.summary.read_text())
         measured = EvaluationInputs(checkpoint, summary, recording, masks, None, None)
         evals[method] = evaluate_method(measured, made.job("evaluate", EvaluateJob, method), CPU).record
-        made.drives[method] = open_trained_drive(checkpoint, recording, CPU)
+        made.drives[method] = open_model_with_recording(checkpoint, recording, CPU)
     made.metrics.update(side_by_side(evals))
     return made

@@ -17,8 +17,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.rendering.captions import BEYOND, Caption
 from drivesplat.rendering.frames import uint8_image
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.images import read_image
-from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import CompareJob
 
@@ -26,7 +26,7 @@ CPU = DeviceSettings(kind="cpu")
 
 
 @pytest.fixture(scope="module")
-def recording(tiny_scene) -> PreparedDrive:
+def recording(tiny_scene) -> EvaluationData:
     """Key frame 3 and the last two are held out; images of 41x23 pixels, of which the film shows an even size."""
     keys = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
     scene = street_scene(dataclasses.replace(tiny_scene, frames=keys))
@@ -39,7 +39,7 @@ def models() -> dict[str, SplatModel]:
     return {"plain": street_model(whole.parts[0]), "street": whole}
 
 
-def compare(recording: PreparedDrive, models: dict[str, SplatModel], path: Path, **changes: Any) -> dict[str, Any]:
+def compare(recording: EvaluationData, models: dict[str, SplatModel], path: Path, **changes: Any) -> dict[str, Any]:
     job = CompareJob(**{"eval_camera": "CAM_FRONT", "crf": 18, "captions": False, **changes})
     checkpoints = {name: checkpoint_of(model) for name, model in models.items()}
     return json.loads(json.dumps(render_comparison(checkpoints, recording, job, CPU, path)))

@@ -20,7 +20,7 @@ from drivesplat.inspection.drawing import draw_panel, draw_removal
 from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.ghost_panel import GhostPanel, ghost_panel
 from drivesplat.inspection.removal import RemovalPair, remove_actor
-from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive
+from drivesplat.inspection.rendered_view import ModelWithRecording, RenderedView
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
@@ -60,12 +60,12 @@ def drive_of(
     places=(GHOST_AT, ROAD_AT),
     opacities=0.6,
     colors=(0.9, 0.1, 0.1),
-) -> TrainedDrive:
+) -> ModelWithRecording:
     """A background of Gaussians at `places`, and `parts`. Every fourth key frame, from HELD_OUT on, is held out."""
     background = round_gaussians(places, 0.1, opacities, colors)
     model = SplatModel([background, *parts], ConstantSky(SKY, 1e-2))
     recording = recording_of(scene, masks, every_nth=4, offset=HELD_OUT)
-    return TrainedDrive(model.requires_grad_(False), recording, torch.device("cpu"))
+    return ModelWithRecording(model.requires_grad_(False), recording, torch.device("cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +81,12 @@ def job_of(key_frame: int | None = HELD_OUT) -> PanelJob:
 
 
 @pytest.fixture(scope="module")
-def panel_of_car(tiny_scene, masks) -> tuple[GhostPanel, dict[str, Any], TrainedDrive]:
+def panel_of_car(tiny_scene, masks) -> tuple[GhostPanel, dict[str, Any], ModelWithRecording]:
     drive = drive_of(one_car(tiny_scene), masks)
     return *ghost_panel(drive, job_of()), drive
 
 
-def seen_at(drive: TrainedDrive, key_frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def seen_at(drive: ModelWithRecording, key_frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Continuous pixels (n, 2) of world points and their depths, by the camera's matrix."""
     frame = drive.recording.scene.frames[2 * key_frame]
     in_camera = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_to_world).T

@@ -11,7 +11,7 @@ from helpers.hand_made import Own, recording_of, round_gaussians
 from scipy.spatial.transform import Rotation
 
 from drivesplat.inspection.ghosts import boxes_along_path, ghost_figures, ghosts_of, in_swept_volume
-from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive
+from drivesplat.inspection.rendered_view import ModelWithRecording, RenderedView
 from drivesplat.model.part import Part
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scene import Scene, Track
@@ -205,7 +205,7 @@ def test_boxes_along_a_path_are_ordered_and_close(speed):
 
 def render_image(scene: Scene, *parts: Part, index: int = 0) -> RenderedView:
     model = SplatModel(parts, None).requires_grad_(False)
-    return RenderedView(TrainedDrive(model, recording_of(scene), torch.device("cpu")), index)
+    return RenderedView(ModelWithRecording(model, recording_of(scene), torch.device("cpu")), index)
 
 
 def drive_ahead(tiny_scene: Scene) -> Scene:

@@ -12,7 +12,7 @@ from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
 from scipy.ndimage import convolve
 
 from drivesplat.inspection.removal import RemovalPair, figures, remove_actor
-from drivesplat.inspection.rendered_view import TrainedDrive
+from drivesplat.inspection.rendered_view import ModelWithRecording
 from drivesplat.model.part import Part, RigidGroup
 from drivesplat.model.removal import removal_of
 from drivesplat.model.sky import ConstantSky
@@ -123,8 +123,8 @@ def one_car(tiny_scene: Scene, speed: float = 4.0) -> Scene:
     return dataclasses.replace(tiny_scene, tracks=(it,))
 
 
-def drive_of(scene: Scene, *parts: Part, masks: Path | None = None) -> TrainedDrive:
-    return TrainedDrive(model_of(*parts), recording_of(scene, masks), torch.device("cpu"))
+def drive_of(scene: Scene, *parts: Part, masks: Path | None = None) -> ModelWithRecording:
+    return ModelWithRecording(model_of(*parts), recording_of(scene, masks), torch.device("cpu"))
 
 
 def job_of(margin: float = 0.1, key_frame: int | None = 0) -> RemovalJob:

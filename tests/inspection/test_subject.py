@@ -11,7 +11,7 @@ from helpers.hand_made import recording_of, write_labels
 
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.inspection.subject import choose_subject, subject_record
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Track
@@ -50,7 +50,7 @@ def with_actors(scene: Scene, *actors: Actor) -> Scene:
     return dataclasses.replace(scene, tracks=tuple(actor.track(scene) for actor in actors))
 
 
-def recorded(scene: Scene, width: int = WIDTH, masks: Path | None = None) -> PreparedDrive:
+def recorded(scene: Scene, width: int = WIDTH, masks: Path | None = None) -> EvaluationData:
     return recording_of(scene, masks, width, every_nth=4, offset=2, last_block=2)
 
 

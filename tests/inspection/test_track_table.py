@@ -25,23 +25,23 @@ from drivesplat.inspection.track_table import (
 from drivesplat.io.array_file import write_arrays
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.actor_record import ActorRecords
+from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.motion import Motion
-from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import MIN_ID_LENGTH, short_ids
 from drivesplat.settings.actor_seed import ActorSeedSettings
 
 
 @pytest.fixture(scope="module")
-def recording(tiny_scene) -> PreparedDrive:
+def recording(tiny_scene) -> EvaluationData:
     return recording_of(tiny_scene)
 
 
-def rows_of(recording: PreparedDrive, editable: Collection[str] = ()) -> list:
+def rows_of(recording: EvaluationData, editable: Collection[str] = ()) -> list:
     return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"), editable, ActorSeedSettings())
 
 
-def drawn(recording: PreparedDrive, editable: Collection[str] = ()) -> Figure:
+def drawn(recording: EvaluationData, editable: Collection[str] = ()) -> Figure:
     subjects = subjects_by_image(recording, "CAM_FRONT")
     rows = track_rows(recording, subjects, editable, ActorSeedSettings())
     return draw_tracks(recording, subjects, rows, "CAM_FRONT")

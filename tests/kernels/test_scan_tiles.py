@@ -6,11 +6,11 @@ import torch
 from helpers.random_scans import ScanScene, even_rays, random_scan
 
 from drivesplat.kernels.numba import scan_tiles
-from drivesplat.kernels.numba.tiles import TileLists
+from drivesplat.kernels.numba.tiles import NumbaTileLists
 from drivesplat.rasterization import RayGrid
 
 
-def _lists_of(scene: ScanScene) -> TileLists:
+def _lists_of(scene: ScanScene) -> NumbaTileLists:
     arrays = [tensor.numpy() for tensor in scene.render().gaussians[0]]
     arcs = scan_tiles.Arcs.of(scene.rays.whole.borders)
     (lists,) = scan_tiles.scan_lists(scan_tiles.by_range(*arrays, scene.values.numpy(), arcs), arcs)

@@ -1,0 +1,1 @@
+"""Measurements of the sensors of a synthetic world: ray casting, light, materials, camera images, LiDAR scans."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivesplat.demo.optics.lighting import Light, shade
-from drivesplat.demo.optics.raycast import NO_HIT, RayHits, Rays, StreetSnapshot
+from drivesplat.demo.optics.raycast import NO_HIT, RayHits, StreetRays, StreetSnapshot
 from drivesplat.demo.shapes.mesh import GAMMA, SurfaceClass
 
 MAX_RAYS = 400_000
@@ -34,7 +34,7 @@ class DemoCamera:
     height: int
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
-    def rays(self, x: np.ndarray, y: np.ndarray, row: np.ndarray) -> Rays:
+    def rays(self, x: np.ndarray, y: np.ndarray, row: np.ndarray) -> StreetRays:
         """The rays through points x, y (n,) in pixels, which belong to rows `row` (n,)."""
         in_camera = np.empty((len(x), 3))
         in_camera[:, 0] = (x - self.intrinsics[0, 2]) / self.intrinsics[0, 0]
@@ -49,7 +49,7 @@ class DemoCamera:
         else:
             moment = row.astype(np.int32)
             directions = np.einsum("nij,nj->ni", poses[moment, :3, :3], in_camera)
-        return Rays(self.seconds, poses[:, :3, 3], directions, moment)
+        return StreetRays(self.seconds, poses[:, :3, 3], directions, moment)
 
     @property
     def pose(self) -> np.ndarray:
@@ -58,7 +58,7 @@ class DemoCamera:
 
 
 @dataclass(frozen=True)
-class Picture:
+class StreetImage:
     """An image of the street. `radiance` (h, w, 3) float64 times the camera's gains. At pixel centres: `depth` (h, w)
     along the optical axis in metres, infinite for the sky; `objects` (h, w), the index of the visible object, -1 for
     the sky; `classes` (h, w) uint8, values of `SurfaceClass`."""
@@ -69,7 +69,7 @@ class Picture:
     classes: np.ndarray
 
 
-def render(snapshot: StreetSnapshot, light: Light, camera: DemoCamera, samples: int) -> Picture:
+def render(snapshot: StreetSnapshot, light: Light, camera: DemoCamera, samples: int) -> StreetImage:
     """The image. Each pixel has a ray through its centre; where its surface ends or its light changes, it is averaged
     over `samples` rays."""
     picture, radiance, edges = _through_centers(snapshot, light, camera)
@@ -89,14 +89,14 @@ def sample_offsets(samples: int) -> np.ndarray:
     return (0.5 + R2_STEPS * np.arange(samples)[:, None]) % 1.0 - 0.5
 
 
-def geometry(snapshot: StreetSnapshot, camera: DemoCamera) -> Picture:
+def geometry(snapshot: StreetSnapshot, camera: DemoCamera) -> StreetImage:
     """The image without its radiance, which is empty."""
     return _through_centers(snapshot, None, camera)[0]
 
 
 def _through_centers(
     snapshot: StreetSnapshot, light: Light | None, camera: DemoCamera
-) -> tuple[Picture, np.ndarray, np.ndarray]:
+) -> tuple[StreetImage, np.ndarray, np.ndarray]:
     """The geometry at pixel centres, the radiance there (h, w, 3) unless there is no `light`, and the pixels (h, w)
     bool in which a surface ends or its light changes."""
     count, caster = camera.width * camera.height, snapshot.caster
@@ -113,7 +113,7 @@ def _through_centers(
             radiance[block], lit[block] = _radiance(snapshot, light, camera, rays, hits)
     size = camera.height, camera.width
     classes = np.where(face >= 0, caster.surface_class[face], int(SurfaceClass.SKY)).astype(np.uint8)
-    picture = Picture(np.empty((0, 0, 3)), depth.reshape(size), objects.reshape(size), classes.reshape(size))
+    picture = StreetImage(np.empty((0, 0, 3)), depth.reshape(size), objects.reshape(size), classes.reshape(size))
     surfaces = np.where(face >= 0, caster.surface[face], NO_HIT).reshape(size)
     edges = _edges(surfaces, lit.reshape(size), picture.depth) if light else np.zeros(size, dtype=bool)
     return picture, radiance.reshape(*size, 3) if light else radiance, edges
@@ -139,7 +139,7 @@ def _blocks(count: int, rays_each: int) -> Iterator[slice]:
 
 
 def _radiance(
-    snapshot: StreetSnapshot, light: Light, camera: DemoCamera, rays: Rays, hits: RayHits
+    snapshot: StreetSnapshot, light: Light, camera: DemoCamera, rays: StreetRays, hits: RayHits
 ) -> tuple[np.ndarray, np.ndarray]:
     """The radiance (n, 3) that arrives along rays, and whether the sun is visible from what they hit (n,) bool."""
     lit = np.zeros(len(rays), dtype=bool)

@@ -9,7 +9,7 @@ import numpy as np
 from drivesplat.demo.optics.lighting import facing_normal, texture_point
 from drivesplat.demo.optics.materials import GLASS, LEAVES, METAL, PAINT, ROAD_, SIGN, surface
 from drivesplat.demo.optics.patterns import compiled
-from drivesplat.demo.optics.raycast import NO_HIT, RayHits, Rays, StreetSnapshot
+from drivesplat.demo.optics.raycast import NO_HIT, RayHits, StreetRays, StreetSnapshot
 from drivesplat.settings.world import WorldLidarSettings
 
 ELEVATIONS = {32: np.radians(np.linspace(-30.67, 10.67, 32)), 64: np.radians(np.linspace(-24.8, 2.0, 64))}
@@ -71,7 +71,7 @@ def spin_of(revolutions_hz: int) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Scan:
+class StreetScan:
     """One revolution; all arrays (beams, steps). `range` without noise in metres, infinite where nothing is hit;
     `intensity` in [0, 1]; `object`, the index of what is hit, NO_HIT otherwise; `measured`, the range with noise;
     `returned`, whether the sensor records it."""
@@ -86,7 +86,7 @@ class Scan:
 def scan(
     snapshot: StreetSnapshot, pattern: ScanPattern, sensor_to_street: np.ndarray, seconds: np.ndarray,
     lidar: WorldLidarSettings, wet: float, random: np.random.Generator,
-) -> Scan:  # fmt: skip
+) -> StreetScan:  # fmt: skip
     """One revolution. `seconds` (m,) are the times of the pattern's moments, `sensor_to_street` (m, 4, 4) the poses."""
     found = [_cast(snapshot, pattern, sensor_to_street, seconds, wet, *offset) for offset in _beam_offsets(lidar)]
     distance, power, objects = (np.stack(values) for values in zip(*found, strict=True))
@@ -95,10 +95,12 @@ def scan(
     in_range = (hit != NO_HIT) & (true_range > MIN_RANGE) & (true_range < MAX_RANGE)
     returned = in_range & (intensity > np.where(in_range, weakest, 0.0) * random.uniform(0.5, 1.5, pattern.shape))
     measured = echo + random.normal(0.0, RANGE_NOISE, pattern.shape)
-    return Scan(true_range, np.clip(intensity, 0.0, 1.0), hit, measured, returned)
+    return StreetScan(true_range, np.clip(intensity, 0.0, 1.0), hit, measured, returned)
 
 
-def returns(scan: Scan, pattern: ScanPattern, sensor_to_street: np.ndarray, at_timestamp: np.ndarray) -> np.ndarray:
+def returns(
+    scan: StreetScan, pattern: ScanPattern, sensor_to_street: np.ndarray, at_timestamp: np.ndarray
+) -> np.ndarray:
     """The recorded returns (n, 5) float32 of a scan: x, y, z in metres in the sensor's frame at the sweep's timestamp
     (`at_timestamp` (4, 4), sensor to street), intensity 0 to 255, ring. The sensor's own motion is compensated, that of
     objects is not."""
@@ -125,7 +127,7 @@ def _cast(
     of_step = pattern.moments[1]
     directions = np.einsum("sij,bsj->bsi", sensor_to_street[of_step, :3, :3], local).reshape(-1, 3)
     moment = np.tile(of_step, len(pattern.elevations))
-    rays = Rays(seconds, sensor_to_street[:, :3, 3], directions, moment)
+    rays = StreetRays(seconds, sensor_to_street[:, :3, 3], directions, moment)
     hits = snapshot.cast(rays)
     power = _reflected(snapshot, rays, hits, wet)
     return hits.distance.reshape(pattern.shape), power.reshape(pattern.shape), hits.object.reshape(pattern.shape)
@@ -152,7 +154,7 @@ def _strongest_echo(
     return true_range, intensity, hit, np.where(intensity > 0.0, echo, true_range)
 
 
-def _reflected(snapshot: StreetSnapshot, rays: Rays, hits: RayHits, wet: float) -> np.ndarray:
+def _reflected(snapshot: StreetSnapshot, rays: StreetRays, hits: RayHits, wet: float) -> np.ndarray:
     """The fraction of light (n,) that each ray's surface returns: reflectivity times the cosine of incidence."""
     reflected, caster = np.zeros(len(rays)), snapshot.caster
     _reflect(

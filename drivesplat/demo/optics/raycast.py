@@ -25,7 +25,7 @@ SAMPLED_TIMES = 60
 
 
 @dataclass(frozen=True)
-class Rays:
+class StreetRays:
     """n rays from a sensor that moves: unit `directions` (n, 3) in the street frame; `moment` (n,) int32 is the index
     of the ray's time among `seconds` (m,), at which the ray starts from `origins` (m, 3)."""
 
@@ -163,7 +163,7 @@ class StreetSnapshot:
                 centers = moving.sphere.centers(poses)
                 self._moving.append((moving, centers, poses[:, None] @ moving.item.limb_poses(seconds)))
 
-    def cast(self, rays: Rays) -> RayHits:
+    def cast(self, rays: StreetRays) -> RayHits:
         """The first hit of each ray."""
         count = len(rays)
         hits = RayHits(

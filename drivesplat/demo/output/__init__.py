@@ -1,0 +1,1 @@
+"""Files of a synthetic world: nuScenes tables, class maps, ground truth."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivesplat.demo.optics.imaging import Picture, to_bytes
+from drivesplat.demo.optics.imaging import StreetImage, to_bytes
 from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
 from drivesplat.demo.shapes.mesh import SurfaceClass
@@ -112,12 +112,12 @@ def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> 
     return TruthFrame(image, index, pose.tolist(), **{"image": None, **names})
 
 
-def _depth(picture: Picture) -> np.ndarray:
+def _depth(picture: StreetImage) -> np.ndarray:
     depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNITS_PER_METRE, 0.0)
     return np.clip(depth + 0.5, 0, DEPTH_LIMIT).astype(np.uint16)
 
 
-def _instances(recorder: Recorder, view: Viewpoint, picture: Picture) -> np.ndarray:
+def _instances(recorder: Recorder, view: Viewpoint, picture: StreetImage) -> np.ndarray:
     return _numbers_of_objects(recorder, view)[picture.objects + 1]
 
 

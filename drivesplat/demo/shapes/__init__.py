@@ -1,0 +1,1 @@
+"""Meshes and limb motion of the objects of a synthetic world. Where they stand is in `street`."""

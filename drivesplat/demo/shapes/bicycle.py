@@ -32,7 +32,7 @@ SPOKES = 12
 
 
 @dataclass(frozen=True)
-class Frame:
+class BicycleFrame:
     """A frame by the positions (3,) of its saddle and of its left grip."""
 
     saddle: np.ndarray
@@ -45,7 +45,7 @@ class Frame:
         return np.array([AXLES[0, 0] - (height - WHEEL_RADIUS) / np.tan(STEERING_ANGLE), 0.0, height])
 
 
-def frame_mesh(frame: Frame, color: Color, luggage: bool) -> ColoredMesh:
+def frame_mesh(frame: BicycleFrame, color: Color, luggage: bool) -> ColoredMesh:
     """Everything of a bicycle that does not turn; `luggage`: with panniers and a basket."""
     parts = [*_tubes(frame, color), *_handlebar(frame), _saddle(frame), *_mudguards(color), *_chain_case(color)]
     return concatenate([*parts, *(_luggage(frame) if luggage else [])])
@@ -85,7 +85,7 @@ def pedals(crank_angle: np.ndarray) -> np.ndarray:
     return BOTTOM_BRACKET + circle
 
 
-def _tubes(frame: Frame, color: Color) -> list[ColoredMesh]:
+def _tubes(frame: BicycleFrame, color: Color) -> list[ColoredMesh]:
     front, rear = AXLES
     lug = BOTTOM_BRACKET + 0.68 * (frame.saddle - BOTTOM_BRACKET)
     crown = frame.head + 0.33 * (front - frame.head)
@@ -100,7 +100,7 @@ def _tubes(frame: Frame, color: Color) -> list[ColoredMesh]:
     return [cylinder(start, end, radius, Material.METAL, color) for start, end, radius in [*mains, *stays]]
 
 
-def _handlebar(frame: Frame) -> list[ColoredMesh]:
+def _handlebar(frame: BicycleFrame) -> list[ColoredMesh]:
     left, right = frame.grip, frame.grip * (1.0, -1.0, 1.0)
     axis = (frame.head - AXLES[0]) / np.linalg.norm(frame.head - AXLES[0])
     top = frame.head + 0.13 * axis
@@ -112,7 +112,7 @@ def _handlebar(frame: Frame) -> list[ColoredMesh]:
     return parts
 
 
-def _saddle(frame: Frame) -> ColoredMesh:
+def _saddle(frame: BicycleFrame) -> ColoredMesh:
     shape = [(-0.13, 0.0, 0.08), (-0.13, 0.03, 0.07), (-0.05, -0.05, 0.05), (0.14, 0.02, 0.018), (0.14, -0.02, 0.015)]
     return symmetric_hull(shape, Material.PLAIN, LEATHER).moved(frame.saddle)
 
@@ -139,7 +139,7 @@ def _chain_case(color: Color) -> list[ColoredMesh]:
     return [*circles, box(low, (BOTTOM_BRACKET[0], y, WHEEL_RADIUS + 0.045), Material.METAL, color)]
 
 
-def _luggage(frame: Frame) -> list[ColoredMesh]:
+def _luggage(frame: BicycleFrame) -> list[ColoredMesh]:
     """Panniers beside the rear wheel, a basket in front of the handlebar."""
     rear, deck = AXLES[1], 2 * WHEEL_RADIUS + 0.04
     rack = box((rear[0] - 0.22, -0.06, deck), (rear[0] + 0.2, 0.06, deck + 0.02), Material.METAL, METAL)

@@ -13,7 +13,7 @@ from drivesplat.demo.shapes.bicycle import (
     GEAR_RATIO,
     SEAT_ANGLE,
     WHEEL_RADIUS,
-    Frame,
+    BicycleFrame,
     crank,
     frame_mesh,
     pedal,
@@ -131,10 +131,10 @@ class Cyclist:
         return BOTTOM_BRACKET + SEAT_TO_BOTTOM_BRACKET * self.height * along
 
     @property
-    def _frame(self) -> Frame:
+    def _frame(self) -> BicycleFrame:
         """The frame that fits the rider."""
         wrist = self.height * self._posture(np.zeros(1), np.zeros(1)).wrists[0, 0]
-        return Frame(np.subtract(self._hip, (0.02, 0.0, 0.05 * self.height)), np.add(wrist, (0.05, 0.0, -0.035)))
+        return BicycleFrame(np.subtract(self._hip, (0.02, 0.0, 0.05 * self.height)), np.add(wrist, (0.05, 0.0, -0.035)))
 
     def _posture(self, crank_angle: np.ndarray, seconds: np.ndarray) -> Posture:
         """Postures (n) in body heights: the upper body rests, the head looks around, the feet follow the pedals."""

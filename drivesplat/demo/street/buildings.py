@@ -7,7 +7,7 @@ from drivesplat.demo.shapes.buildings import building
 from drivesplat.demo.shapes.mesh import Color, ColoredMesh, Material, SurfaceClass, box, concatenate
 from drivesplat.demo.shapes.plants import hedge
 from drivesplat.demo.shapes.scenery import fence
-from drivesplat.demo.street.road import Road
+from drivesplat.demo.street.road import ReferenceLine
 
 ALONG = (-80.0, 260.0)
 """First and last s (metres) of the buildings."""
@@ -21,7 +21,7 @@ WALLS: tuple[Color, ...] = (
 )  # fmt: skip
 
 
-def rows_of_buildings(road: Road, random: np.random.Generator) -> list[ColoredMesh]:
+def rows_of_buildings(road: ReferenceLine, random: np.random.Generator) -> list[ColoredMesh]:
     """Buildings on both sides, hedges and fences across the gaps between them, and buildings across both ends."""
     found = []
     for side in (-1, 1):

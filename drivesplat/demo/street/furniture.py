@@ -8,7 +8,7 @@ from drivesplat.demo.layout import FURNITURE, TREES
 from drivesplat.demo.shapes import plants, scenery
 from drivesplat.demo.shapes.mesh import ColoredMesh
 from drivesplat.demo.street.buildings import ALONG
-from drivesplat.demo.street.road import Road
+from drivesplat.demo.street.road import ReferenceLine
 
 LAMP_HEIGHT, LAMP_ARM = 6.5, 1.5
 """Metres."""
@@ -28,7 +28,7 @@ def lamp_places() -> np.ndarray:
     return np.array([(s, FURNITURE * (-1) ** i) for i, s in enumerate(range(-30, 200, 24))], dtype=float)
 
 
-def trees(road: Road, random: np.random.Generator) -> list[ColoredMesh]:
+def trees(road: ReferenceLine, random: np.random.Generator) -> list[ColoredMesh]:
     """A row of trees on each sidewalk, some of which overhang the road; between them benches, planters and advertising
     columns."""
     found = []
@@ -54,7 +54,7 @@ def _between_trees(side: int, random: np.random.Generator) -> ColoredMesh:
     return scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
 
 
-def furniture(road: Road, lamps: np.ndarray, random: np.random.Generator) -> list[ColoredMesh]:
+def furniture(road: ReferenceLine, lamps: np.ndarray, random: np.random.Generator) -> list[ColoredMesh]:
     """Street lamps at the places `lamps` (m, 2) with wires between some of them, signs, a bus shelter, and small things
     beside the curb, clear of the pedestrians' path."""
     found = [road.place(scenery.street_lamp(LAMP_HEIGHT, -np.sign(t) * LAMP_ARM), s, t) for s, t in lamps]

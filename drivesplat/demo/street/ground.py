@@ -4,7 +4,7 @@ import numpy as np
 
 from drivesplat.demo.layout import CURB, ROAD, SIDEWALK
 from drivesplat.demo.shapes.mesh import ColoredMesh, Material, SurfaceClass
-from drivesplat.demo.street.road import Road
+from drivesplat.demo.street.road import ReferenceLine
 
 NEAR = (-120.0, 300.0)
 """First and last s (metres) of the street proper."""
@@ -15,7 +15,7 @@ CELL = 3.0
 CURB_HEIGHT = 0.1
 
 
-def ground(road: Road) -> list[ColoredMesh]:
+def ground(road: ReferenceLine) -> list[ColoredMesh]:
     """The strips of the ground and the two curbs."""
     # within the bend's centre no strip may reach: there s, t would be ambiguous
     inner = np.inf if road.is_straight else 0.8 * abs(road.radius)
@@ -28,7 +28,7 @@ def ground(road: Road) -> list[ColoredMesh]:
     return [*strips, *(_curb(road, side) for side in (-1, 1))]
 
 
-def _strip(road: Road, right: float, left: float, surface_class: SurfaceClass) -> ColoredMesh:
+def _strip(road: ReferenceLine, right: float, left: float, surface_class: SurfaceClass) -> ColoredMesh:
     """The ground between two offsets from the centre line."""
     cell = 30.0 if road.is_straight else CELL
     near = np.arange(NEAR[0], NEAR[1] + cell, cell)
@@ -44,7 +44,7 @@ def _strip(road: Road, right: float, left: float, surface_class: SurfaceClass) -
     return road.follow(_mesh(flat, faces, surface_class))
 
 
-def _curb(road: Road, side: int) -> ColoredMesh:
+def _curb(road: ReferenceLine, side: int) -> ColoredMesh:
     """The kerb stones beside the road, which stand out of it."""
     low, high = sorted((side * ROAD, side * CURB))
     cell = 30.0 if road.is_straight else CELL

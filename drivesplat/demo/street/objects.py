@@ -6,7 +6,7 @@ import numpy as np
 
 from drivesplat.demo.shapes.body import Body, RigidBody
 from drivesplat.demo.shapes.mesh import ColoredMesh
-from drivesplat.demo.street.paths import Path, StreetPath
+from drivesplat.demo.street.paths import ObjectPath, StreetPath
 
 EGO_VEHICLE = "ego vehicle"
 """The part of the ego vehicle that cameras see."""
@@ -21,7 +21,7 @@ class StreetObject:
 
     name: str
     body: Body
-    path: Path
+    path: ObjectPath
     category: str | None = None
     attribute: str | None = None
 
@@ -54,6 +54,6 @@ class StreetObject:
         return poses
 
 
-def fixed(name: str, mesh: ColoredMesh, path: Path | None = None, category: str | None = None) -> StreetObject:
+def fixed(name: str, mesh: ColoredMesh, path: ObjectPath | None = None, category: str | None = None) -> StreetObject:
     """A rigid object; without a path its mesh is in the street frame."""
     return StreetObject(name, RigidBody(mesh), path or StreetPath(0.0, 0.0), category)

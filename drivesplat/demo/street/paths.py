@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.street.road import STRAIGHT, Road
+from drivesplat.demo.street.road import STRAIGHT, ReferenceLine
 
 LANE_CENTER = 1.75
 """Traffic drives on the right: at t = -LANE_CENTER along s, at +LANE_CENTER against it."""
@@ -16,7 +16,7 @@ SUSPENSION = ((0.25, 5.1, 0.0), (0.2, 3.7, 1.0), (0.012, 6.3, 0.0))
 
 
 @runtime_checkable
-class Path(Protocol):
+class ObjectPath(Protocol):
     """The motion of an object."""
 
     @property
@@ -48,7 +48,7 @@ class StreetPath:
     heading: float = 0.0
     turning: float = 0.0
     suspension: bool = False
-    road: Road = STRAIGHT
+    road: ReferenceLine = STRAIGHT
 
     @property
     def moves(self) -> bool:

@@ -11,7 +11,7 @@ from drivesplat.demo.shapes.cyclist import Cyclist
 from drivesplat.demo.shapes.people import Person
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import StreetPath
-from drivesplat.demo.street.road import Road
+from drivesplat.demo.street.road import ReferenceLine
 from drivesplat.scene.splits import held_out_key_frames
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.world import WalkwayPlace, WorldSettings
@@ -57,7 +57,9 @@ class Encounter:
     before: int
 
 
-def people(world: WorldSettings, road: Road, ego: StreetPath, random: np.random.Generator) -> list[StreetObject]:
+def people(
+    world: WorldSettings, road: ReferenceLine, ego: StreetPath, random: np.random.Generator
+) -> list[StreetObject]:
     """Pedestrians, bystanders, cyclists and dogs."""
     walkers = _walkers(world, road, ego, random)
     standing = _bystanders(encounters(world, world.bystanders), road, ego, random)
@@ -86,7 +88,9 @@ def _place(ego: StreetPath, met: Encounter, ahead: float) -> float:
     return float(ego.along(np.array([met.second]))[0]) + ahead
 
 
-def _walkers(world: WorldSettings, road: Road, ego: StreetPath, random: np.random.Generator) -> list[StreetObject]:
+def _walkers(
+    world: WorldSettings, road: ReferenceLine, ego: StreetPath, random: np.random.Generator
+) -> list[StreetObject]:
     """Pedestrians, each in the first walkway where the others keep their distance."""
     distance = ABREAST if not world.dogs else 2 * ABREAST
     found: list[StreetObject] = []
@@ -108,7 +112,9 @@ def _start(met: Encounter, walkway: Walkway, row: int, ego: StreetPath) -> float
     return _place(ego, met, walkway.ahead + ABREAST * row) - walkway.speed * met.second
 
 
-def _bystanders(met: list[Encounter], road: Road, ego: StreetPath, random: np.random.Generator) -> list[StreetObject]:
+def _bystanders(
+    met: list[Encounter], road: ReferenceLine, ego: StreetPath, random: np.random.Generator
+) -> list[StreetObject]:
     """Bystanders on both sides, each at the first place that is free."""
     found: list[StreetObject] = []
     taken: dict[int, list[float]] = {-1: [], 1: []}
@@ -121,7 +127,7 @@ def _bystanders(met: list[Encounter], road: Road, ego: StreetPath, random: np.ra
     return found
 
 
-def _bystander(index: int, side: int, place: float, road: Road, random: np.random.Generator) -> StreetObject:
+def _bystander(index: int, side: int, place: float, road: ReferenceLine, random: np.random.Generator) -> StreetObject:
     path = StreetPath(
         place, side * WALL_SIDE, heading=-side * np.pi / 2, turning=random.uniform(0.6, 1.2),
         period=random.uniform(5.0, 8.0), road=road,
@@ -131,7 +137,7 @@ def _bystander(index: int, side: int, place: float, road: Road, random: np.rando
 
 
 def _cyclist(
-    index: int, met: Encounter, road: Road, ego: StreetPath, random: np.random.Generator
+    index: int, met: Encounter, road: ReferenceLine, ego: StreetPath, random: np.random.Generator
 ) -> StreetObject:  # fmt: skip
     side = (-1) ** (index + 1)
     speed = -side * CYCLING_SPEED

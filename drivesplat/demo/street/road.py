@@ -16,7 +16,7 @@ VERTICAL_CURVE = 30.0
 
 
 @dataclass(frozen=True)
-class Road:
+class ReferenceLine:
     """A road that is straight up to `bend_start`, an arc of `radius` for `bend_length`, and straight again; it rises at
     `grade` from `rise_start` to `rise_end`. Metres; a positive radius bends to the left, an infinite one is straight.
     """
@@ -99,4 +99,4 @@ class Road:
         return within**2 / (2 * VERTICAL_CURVE) + np.maximum(past - VERTICAL_CURVE, 0.0)
 
 
-STRAIGHT = Road()
+STRAIGHT = ReferenceLine()

@@ -14,7 +14,7 @@ from drivesplat.demo.street.ground import ground
 from drivesplat.demo.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject, fixed
 from drivesplat.demo.street.paths import StreetPath
 from drivesplat.demo.street.people import people
-from drivesplat.demo.street.road import STRAIGHT, Road
+from drivesplat.demo.street.road import STRAIGHT, ReferenceLine
 from drivesplat.demo.street.traffic import ego_path, free_traffic, parked, queue
 from drivesplat.settings.world import WorldSettings
 
@@ -32,7 +32,7 @@ class Street:
 
     objects: tuple[StreetObject, ...]
     lamps: np.ndarray
-    road: Road
+    road: ReferenceLine
     ego: StreetPath
     leading: str | None
 
@@ -60,13 +60,13 @@ def build_street(world: WorldSettings) -> Street:
     return Street(tuple(sorted(objects, key=lambda item: item.moves)), lamps, road, ego, leading)
 
 
-def road_of(world: WorldSettings) -> Road:
+def road_of(world: WorldSettings) -> ReferenceLine:
     """The course of the road."""
     if not world.bend_deg and not world.grade:
         return STRAIGHT
     angle = np.radians(world.bend_deg)
     radius = np.copysign(BEND_RADIUS, angle) if angle else np.inf
-    return Road(BEND_START, BEND_RADIUS * abs(angle), radius, world.grade, *RISE)
+    return ReferenceLine(BEND_START, BEND_RADIUS * abs(angle), radius, world.grade, *RISE)
 
 
 def street_with(street: Street, objects: tuple[StreetObject, ...]) -> Street:

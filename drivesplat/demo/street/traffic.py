@@ -9,7 +9,7 @@ from drivesplat.demo.shapes.body import RigidBody
 from drivesplat.demo.shapes.vehicles import vehicle
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import LANE_CENTER, StreetPath
-from drivesplat.demo.street.road import Road
+from drivesplat.demo.street.road import ReferenceLine
 from drivesplat.settings.world import WorldSettings
 
 EGO_REACH = (-0.7, 3.5)
@@ -24,7 +24,7 @@ ONCOMING_GAP, ONCOMING_APPROACH = 2.2, 1.7
 """Gap between oncoming vehicles of a queue, and how far one drives up to the standing one before it (metres)."""
 
 
-def ego_path(world: WorldSettings, road: Road) -> StreetPath:
+def ego_path(world: WorldSettings, road: ReferenceLine) -> StreetPath:
     """The path of the ego vehicle."""
     if world.ego == "stands":
         return StreetPath(12.0, -LANE_CENTER, road=road)
@@ -33,7 +33,7 @@ def ego_path(world: WorldSettings, road: Road) -> StreetPath:
     return StreetPath(0.0, -LANE_CENTER, 8.0, 0.6, 0.12, 9.0, suspension=True, road=road)
 
 
-def free_traffic(world: WorldSettings, road: Road, random: np.random.Generator) -> list[StreetObject]:
+def free_traffic(world: WorldSettings, road: ReferenceLine, random: np.random.Generator) -> list[StreetObject]:
     """`world.vehicles` vehicles: the first drives ahead of the ego vehicle; oncoming ones and further ones ahead follow
     alternately."""
     drives = world.ego == "drives"
@@ -48,7 +48,7 @@ def free_traffic(world: WorldSettings, road: Road, random: np.random.Generator) 
     ]
 
 
-def queue(world: WorldSettings, road: Road, random: np.random.Generator) -> list[StreetObject]:
+def queue(world: WorldSettings, road: ReferenceLine, random: np.random.Generator) -> list[StreetObject]:
     """Vehicles at close range in both lanes. Those ahead creep as the ego vehicle does; every third oncoming one
     stands."""
     ego = ego_path(world, road)
@@ -67,7 +67,9 @@ def queue(world: WorldSettings, road: Road, random: np.random.Generator) -> list
     return objects
 
 
-def parked(world: WorldSettings, road: Road, cones: np.ndarray, random: np.random.Generator) -> list[StreetObject]:
+def parked(
+    world: WorldSettings, road: ReferenceLine, cones: np.ndarray, random: np.random.Generator
+) -> list[StreetObject]:
     """Parked vehicles on both sides, away from the crossing and the `cones` (n, 2); every fifth is a van."""
     places = np.arange(4.0, 130.0, PARKED_SPACING)
     free = [(s, side) for s in places for side in (-1, 1) if not CROSSING[0] - 6.0 < s < CROSSING[1] + 5.0]

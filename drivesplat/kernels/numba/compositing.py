@@ -13,7 +13,7 @@ from drivesplat.kernels.numba.layout import CONIC_XX, CONIC_XY, CONIC_YY, MOMENT
 from drivesplat.kernels.numba.pixels import composite_tiles, composite_tiles_backward
 from drivesplat.kernels.numba.projection import arrays
 from drivesplat.kernels.numba.threads import parallel_for
-from drivesplat.kernels.numba.tiles import Splats, TileLists, front_to_back, grid, tile_lists
+from drivesplat.kernels.numba.tiles import NumbaTileLists, Splats, front_to_back, grid, tile_lists
 
 CHUNK = 8
 """Tiles per chunk: few, so that threads finish at the same time."""
@@ -66,7 +66,7 @@ class Compositing(torch.autograd.Function):
         return v_means2d, None, v_conics, None, v_opacities, v_values, None, None, None
 
 
-def _composite(splats: Splats, image: np.ndarray, alpha: np.ndarray) -> tuple[Splats, TileLists | None]:
+def _composite(splats: Splats, image: np.ndarray, alpha: np.ndarray) -> tuple[Splats, NumbaTileLists | None]:
     """Renders one camera. Returns what its backward pass needs; the lists only where one window holds them all."""
     columns, rows = grid(image.shape[1], image.shape[0])
     lists = None
@@ -80,7 +80,7 @@ def _composite(splats: Splats, image: np.ndarray, alpha: np.ndarray) -> tuple[Sp
 
 
 def _composite_backward(
-    splats: Splats, lists: TileLists | None, images: list[np.ndarray], v_inputs: list[np.ndarray], absolute: bool
+    splats: Splats, lists: NumbaTileLists | None, images: list[np.ndarray], v_inputs: list[np.ndarray], absolute: bool
 ) -> None:
     """Adds one camera's gradients to `v_inputs`; `images` are image, alpha and their gradients."""
     columns, rows = grid(images[0].shape[1], images[0].shape[0])

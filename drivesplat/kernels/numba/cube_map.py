@@ -19,7 +19,7 @@ MIN_TRANSMITTANCE = 1e-3
 """Minimum transmittance for gradients of texels: every opaque surface lets a trace of the background through."""
 
 
-class OverCubeMap(torch.autograd.Function):
+class NumbaOverCubeMap(torch.autograd.Function):
     """`drivesplat.kernels.cube_map.over_cube_map`, without gradient for the camera."""
 
     @staticmethod

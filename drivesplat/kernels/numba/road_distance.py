@@ -17,7 +17,7 @@ CHUNK = 2048
 """Gaussians per chunk; sums over Gaussians are made chunk by chunk."""
 
 
-class RoadDistance(torch.autograd.Function):
+class NumbaRoadDistance(torch.autograd.Function):
     """`drivesplat.kernels.road_distance.road_distance`, of at least one Gaussian and one cell."""
 
     @staticmethod

@@ -20,7 +20,7 @@ CHUNK = 4
 """Tiles per chunk: few, so that threads finish at the same time."""
 
 
-class ScanCompositing(torch.autograd.Function):
+class NumbaScanCompositing(torch.autograd.Function):
     """Sums of ranges, alpha, alpha before `until` and values along rays, and the median range without gradient; see
     `drivesplat.kernels.scan_compositing.CompositedScan`. Azimuths are within ±π; gradients reach neither rays nor
     `range_limits`."""

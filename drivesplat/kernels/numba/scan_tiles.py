@@ -15,7 +15,7 @@ import numpy as np
 from drivesplat.kernels.cache import callee, kernel
 from drivesplat.kernels.numba.layout import MIN_ALPHA
 from drivesplat.kernels.numba.threads import parallel_for
-from drivesplat.kernels.numba.tiles import TileLists
+from drivesplat.kernels.numba.tiles import NumbaTileLists
 from drivesplat.kernels.scan_borders import ON_CPU, ScanBorders
 
 BEAMS, FIRINGS = ON_CPU
@@ -101,7 +101,7 @@ def by_range(
     return ScanSplats(order, shapes, values[order])
 
 
-def scan_lists(splats: ScanSplats, arcs: Arcs, first: int = 0, last: int | None = None) -> Iterator[TileLists]:
+def scan_lists(splats: ScanSplats, arcs: Arcs, first: int = 0, last: int | None = None) -> Iterator[NumbaTileLists]:
     """The lists of a scan's tiles, window by window."""
     last = arcs.tiles if last is None else last
     counts = np.zeros(len(splats.order), np.int64)
@@ -117,7 +117,7 @@ def scan_lists(splats: ScanSplats, arcs: Arcs, first: int = 0, last: int | None 
     parallel_for(_fill, len(counts), CHUNK, splats.shapes, *arcs.arguments, first, last, slot_offsets, tile_of, rank_of)
     slots = np.argsort(tile_of, kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(tile_of, minlength=last - first))])
-    yield TileLists(first, last, offsets, rank_of[slots], slots.astype(np.int32), slot_offsets)
+    yield NumbaTileLists(first, last, offsets, rank_of[slots], slots.astype(np.int32), slot_offsets)
 
 
 def wrapped(angles: np.ndarray) -> np.ndarray:

@@ -50,7 +50,7 @@ class Splats:
 
 
 @dataclass(frozen=True)
-class TileLists:
+class NumbaTileLists:
     """The Gaussians of tiles `first` to `last` (excluded) of an image or a LiDAR scan, in rows of tiles.
 
     Those of tile t are `ranks[offsets[t - first] : offsets[t - first + 1]]`, as rows of `shapes`, front to back.
@@ -89,7 +89,7 @@ def front_to_back(
     return Splats(order, np.concatenate(by_column, axis=1, dtype=means2d.dtype, casting="same_kind"), values[order])
 
 
-def tile_lists(splats: Splats, columns: int, rows: int) -> Iterator[TileLists]:
+def tile_lists(splats: Splats, columns: int, rows: int) -> Iterator[NumbaTileLists]:
     """The lists of an image's tiles, window by window."""
     counts, tiles_of = _count(splats, columns, 0, columns * rows)
     windows = _windows(counts.sum(axis=0))
@@ -110,7 +110,9 @@ def _windows(counts: np.ndarray) -> list[tuple[int, int]]:
     return [*windows, (first, len(counts))]
 
 
-def _list(splats: Splats, columns: int, first: int, last: int, counts: np.ndarray, tiles_of: np.ndarray) -> TileLists:
+def _list(
+    splats: Splats, columns: int, first: int, last: int, counts: np.ndarray, tiles_of: np.ndarray
+) -> NumbaTileLists:
     slot_offsets = np.concatenate([[0], np.cumsum(tiles_of)])
     offsets = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     cursors = np.cumsum(counts, axis=0) - counts + offsets[:-1]  # the first entry of a chunk in a tile
@@ -119,7 +121,7 @@ def _list(splats: Splats, columns: int, first: int, last: int, counts: np.ndarra
     parallel_for(
         _fill, len(splats.order), chunk, splats.shapes, columns, first, last, chunk, slot_offsets, cursors, ranks, slots
     )
-    return TileLists(first, last, offsets, ranks, slots, slot_offsets)
+    return NumbaTileLists(first, last, offsets, ranks, slots, slot_offsets)
 
 
 def _chunk_size(m: int) -> int:

@@ -31,7 +31,7 @@ C32 = math.sqrt(105.0 / (4.0 * math.pi))
 C30 = math.sqrt(7.0 / (16.0 * math.pi))
 
 
-class ViewColors(torch.autograd.Function):
+class NumbaViewColors(torch.autograd.Function):
     """The colors (c, n, 3), at least 0, that each camera sees of Gaussians with coefficients (n, k, 3).
 
     Gaussians with radius 0 are out of view; their colors are 0.

@@ -16,7 +16,7 @@ RUN = tl.constexpr(4)
 """Neighbouring pixels that mostly see the same texels."""
 
 
-class OverCubeMap(torch.autograd.Function):
+class TritonOverCubeMap(torch.autograd.Function):
     """`drivesplat.kernels.cube_map.over_cube_map`, without gradient for the camera."""
 
     @staticmethod

@@ -26,7 +26,7 @@ MIN_WEIGHT = tl.constexpr(1e-6)
 """Distances are divided by the sum of their weights, at least by this."""
 
 
-class RoadDistance(torch.autograd.Function):
+class TritonRoadDistance(torch.autograd.Function):
     """`drivesplat.kernels.road_distance.road_distance`, of at least one Gaussian and one cell."""
 
     @staticmethod
@@ -51,8 +51,8 @@ class RoadDistance(torch.autograd.Function):
 def distance_from_road(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, road: Any, roughness: float
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """The distance of `RoadDistance`, of contiguous tensors, and what `write_gradients` reads of the road: its planes,
-    the cell of each Gaussian, and the sum of weights."""
+    """The distance of `TritonRoadDistance`, of contiguous tensors, and what `write_gradients` reads of the road: its
+    planes, the cell of each Gaussian, and the sum of weights."""
     planes = road.normals.contiguous(), road.offsets.contiguous(), road.weights.contiguous()
     count, blocks = len(means), triton.cdiv(len(means), BLOCK)
     cells = torch.empty(count, dtype=torch.int32, device=means.device)

@@ -37,7 +37,7 @@ SIZES = ["capacity", "tiles", "steps", "beams", "firings", "across"]
 """Arguments of kernels that change from scan to scan: they are not compiled for each value."""
 
 
-class Chunks(NamedTuple):
+class ScanEntries(NamedTuple):
     """At most `count` chunks of p entries, in the order of t `tiles`: the fields of each entry, the Gaussians `ids`,
     the first entry of each tile, and its first chunk. Entries beyond the last offset are undefined."""
 
@@ -60,7 +60,7 @@ class Chunks(NamedTuple):
         return len(self.ids), self.tiles, self.tiles.bit_length()
 
 
-def chunks_of(gaussians: ScannedGaussians, values: Float[Tensor, "n v"], lists: TileLists) -> Chunks:
+def chunks_of(gaussians: ScannedGaussians, values: Float[Tensor, "n v"], lists: TileLists) -> ScanEntries:
     """The chunks of the lists of a scan's tiles."""
     capacity, tiles, channels = len(lists.ids), len(lists.offsets) - 1, values.shape[1]
     entries = values.new_empty(VALUES.value + channels, capacity)
@@ -72,7 +72,7 @@ def chunks_of(gaussians: ScannedGaussians, values: Float[Tensor, "n v"], lists: 
             means2d, ranges, conics, slopes, limits, opacities, values.contiguous(), *lists[:3], entries, ids,
             capacity, tiles, channels, BLOCK,
         )  # fmt: skip
-    return Chunks(entries, ids, lists.offsets, firsts)
+    return ScanEntries(entries, ids, lists.offsets, firsts)
 
 
 @triton.jit

@@ -11,7 +11,7 @@ alpha_i); the sum over all j is known from the rendered scan, and that of earlie
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, no_type_check
 
 import torch
@@ -22,32 +22,30 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.capacity import capacities_for
-from drivesplat.kernels.cuda import scans as cuda_scans
 from drivesplat.kernels.scan_chunks import RaySums, ScanChunks, ScanGradients, TileRays
 from drivesplat.kernels.scan_part import MetPart, ScanPart
 from drivesplat.kernels.scanned_gaussians import LEARNED, PROJECTED, ScannedGaussians
 from drivesplat.kernels.triton.rows import ALIGNED
 from drivesplat.kernels.triton.scan_chunks import RAYS, SIZES, SUMS, rays_of
 from drivesplat.kernels.triton.scan_gradients import remain
-from drivesplat.kernels.triton.scan_sums import CopiedChunks
 from drivesplat.kernels.triton.scan_tiles import ReachedTiles, count_tiles, reached_tiles, scan_lists
-from drivesplat.kernels.triton.tiles import TileLists
 
 JOINED = 8
 """Chunks of a tile that are joined at a time."""
 
 
 class Listed(NamedTuple):
-    """A part of a scan, the ranges (metres) before which alpha is wanted, too, and the tiles that Gaussians reach, with
-    the `capacity` of their lists."""
+    """A part of a scan, the ranges (metres) before which alpha is wanted, too, the tiles that Gaussians reach, with the
+    `capacity` of their lists, and the maker of their chunks."""
 
     part: ScanPart
     until: Float[Tensor, "b a"] | None
     reached: ReachedTiles | None
     capacity: int
+    chunks_of: Callable[..., ScanChunks]
 
 
-class ScanCompositing(torch.autograd.Function):
+class TritonScanCompositing(torch.autograd.Function):
     """Sums of ranges, alpha, alpha before `until` and values along the rays of each part of a scan, and the median
     range without gradient, in the order of `drivesplat.kernels.scan_compositing.CompositedScan`, part after part.
 
@@ -108,7 +106,8 @@ def _composited(
 ) -> tuple[ScanChunks, list[Tensor], list[Tensor]]:
     """The chunks of a part, what its gradients need, and what its rays measure."""
     part = listed.part
-    chunks = _chunks_of(gaussians, values, scan_lists(gaussians, part.tiles, listed.reached, listed.capacity))
+    lists = scan_lists(gaussians, part.tiles, listed.reached, listed.capacity)
+    chunks = listed.chunks_of(gaussians, values, lists)
     until = torch.zeros_like(part.azimuths) if listed.until is None else listed.until
     given = [t.to(values).contiguous() for t in (part.within, part.elevations, until)]
     rays, shape, channels = TileRays(part.tiles.tiles, *given), part.azimuths.shape, values.shape[1]
@@ -124,16 +123,16 @@ def _composited(
     return chunks, [*rays, passes, sums, range_sum, alpha, before, out], [range_sum, alpha, before, out, median]
 
 
-def _chunks_of(gaussians: ScannedGaussians, values: Tensor, lists: TileLists) -> ScanChunks:
-    kind = cuda_scans.GatheredChunks if cuda_scans.can_composite(values) else CopiedChunks
-    return kind.of(gaussians, values, lists)
+def composite_parts(
+    met: Sequence[MetPart], values: Tensor, chunks_of: Callable[..., ScanChunks]
+) -> list[tuple[Tensor, ...]]:
+    """The results of `TritonScanCompositing` for each part of a scan. The host waits for the device once.
 
-
-def composite_parts(met: Sequence[MetPart], values: Tensor) -> list[tuple[Tensor, ...]]:
-    """The results of `ScanCompositing` for each part of a scan. The host waits for the device once."""
-    parts = [Listed(part.rays, part.until, *lists) for part, lists in zip(met, _lists_of(met), strict=True)]
+    `chunks_of` takes Gaussians, their values and the lists of tiles; its chunks choose the kernels.
+    """
+    parts = [Listed(part.rays, part.until, *lists, chunks_of) for part, lists in zip(met, _lists_of(met), strict=True)]
     projected = [field for part in met for field in part.gaussians[: len(PROJECTED)]]
-    return _by_part(ScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
+    return _by_part(TritonScanCompositing.apply(met[0].gaussians.opacities, values, parts, *projected), 5)
 
 
 def _lists_of(met: Sequence[MetPart]) -> list[tuple[ReachedTiles | None, int]]:

@@ -21,7 +21,7 @@ from drivesplat.kernels.triton.scan_chunks import (
     SIZES,
     SUMS,
     VALUES,
-    Chunks,
+    ScanEntries,
     alpha_on_rays,
     chunk_of,
     chunks_of,
@@ -41,7 +41,7 @@ GROUP, GROUP_BACKWARD = 16, 8
 class CopiedChunks(ScanChunks):
     """Chunks with a copy of the Gaussian of each entry."""
 
-    chunks: Chunks
+    chunks: ScanEntries
     channels: int
 
     @classmethod

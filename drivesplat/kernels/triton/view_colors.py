@@ -17,7 +17,7 @@ CONSTANT, LINEAR = tl.constexpr(SH_C0), tl.constexpr(0.4886025119029199)
 as in 3D Gaussian Splatting."""
 
 
-class ViewColors(torch.autograd.Function):
+class TritonViewColors(torch.autograd.Function):
     """`drivesplat.kernels.view_colors.fused_view_colors`, without gradient for the camera."""
 
     @staticmethod

@@ -17,8 +17,8 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive.conversion import pose_at, write_folder
 from drivesplat.readers.drive.nerfstudio_file import (
-    Lens,
-    Shot,
+    TransformsFrame,
+    TransformsLens,
     applied_transform,
     clean_name,
     content_of,
@@ -116,7 +116,9 @@ def _stated(scale: Scale, values: dict[str, Any]) -> tuple[float, float]:
     return scale.metres_per_unit, scale.camera_height
 
 
-def _in_metres(shots: Sequence[Shot], values: dict[str, Any], path: Path, scale: Scale, metres: float) -> list[Shot]:
+def _in_metres(
+    shots: Sequence[TransformsFrame], values: dict[str, Any], path: Path, scale: Scale, metres: float
+) -> list[TransformsFrame]:
     """The shots with poses in metres, in a world with z up."""
     undo = inverse(applied_transform(values, path)) if scale.undo_applied_transform else np.eye(4)
     found = []
@@ -134,15 +136,15 @@ def _in_metres(shots: Sequence[Shot], values: dict[str, Any], path: Path, scale:
     return found
 
 
-def grouped(shots: Sequence[Shot]) -> dict[str, list[Shot]]:
+def grouped(shots: Sequence[TransformsFrame]) -> dict[str, list[TransformsFrame]]:
     """The shots of each camera, in time order. A camera is what `camera`, `camera_id` or `camera_name` says, otherwise
     the images of a folder that have the same intrinsics.
 
     Raises DatasetError naming shots of one camera with different intrinsics or equal times, and for too many cameras.
     """
     common = os.path.commonpath([shot.path.absolute().parent for shot in shots])
-    lenses: dict[str, list[Lens]] = {}
-    cameras: dict[tuple[str, int], list[Shot]] = {}
+    lenses: dict[str, list[TransformsLens]] = {}
+    cameras: dict[tuple[str, int], list[TransformsFrame]] = {}
     for shot in shots:
         inside = Path(os.path.relpath(shot.path.absolute().parent, common)).as_posix()
         name = shot.camera or clean_name(Path(common).name if inside == "." else inside) or "camera"
@@ -174,7 +176,7 @@ def grouped(shots: Sequence[Shot]) -> dict[str, list[Shot]]:
     return named
 
 
-def mounted(cameras: dict[str, list[Shot]], ego_camera: str, height: float) -> dict[str, np.ndarray]:
+def mounted(cameras: dict[str, list[TransformsFrame]], ego_camera: str, height: float) -> dict[str, np.ndarray]:
     """Camera to ego (4, 4) of each camera; the ego camera is `height` above the origin.
 
     Raises DatasetError where the ego camera looks up or down.
@@ -197,7 +199,7 @@ def mounted(cameras: dict[str, list[Shot]], ego_camera: str, height: float) -> d
     return mounts
 
 
-def _camera(lens: Lens, mount: np.ndarray) -> dict[str, Any]:
+def _camera(lens: TransformsLens, mount: np.ndarray) -> dict[str, Any]:
     return {
         "width": lens.width,
         "height": lens.height,

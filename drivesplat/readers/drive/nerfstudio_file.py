@@ -31,7 +31,7 @@ TIME_KEYS = ("timestamp", "time")
 
 
 @dataclass(frozen=True)
-class Lens:
+class TransformsLens:
     """The intrinsics of images, as OpenCV defines them."""
 
     width: int
@@ -45,7 +45,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Shot:
+class TransformsFrame:
     """An image of a transforms.json. `camera` is None where the file does not name it; `camera_to_world` (4, 4) is that
     of an OpenCV camera, in the file's units."""
 
@@ -56,7 +56,7 @@ class Shot:
     time: int
     """Microseconds."""
     camera_to_world: np.ndarray
-    lens: Lens
+    lens: TransformsLens
 
 
 def content_of(path: Path) -> dict[str, Any]:
@@ -75,7 +75,9 @@ def content_of(path: Path) -> dict[str, Any]:
     return values
 
 
-def shots_of(values: Mapping[str, Any], path: Path, seconds_per_time: float | None, hz: float | None) -> list[Shot]:
+def shots_of(
+    values: Mapping[str, Any], path: Path, seconds_per_time: float | None, hz: float | None
+) -> list[TransformsFrame]:
     """The images of the content of a transforms.json at `path`, with a unit of their times, or with the rate of images
     that have no times. Raises DatasetError naming a frame whose values cannot be, or whose image is missing."""
     frames, folder, found = values["frames"], path.parent, []
@@ -84,7 +86,7 @@ def shots_of(values: Mapping[str, Any], path: Path, seconds_per_time: float | No
         record = f"{path}: frames[{number}]"
         image = folder / _file(frame, record)
         found.append(
-            Shot(
+            TransformsFrame(
                 record=record,
                 path=image,
                 camera=_camera_name(frame, record),
@@ -192,7 +194,7 @@ def _microseconds(value: Any, seconds_per_time: float, key: str, record: str) ->
     return round(time)
 
 
-def _lens(values: Mapping[str, Any], frame: Mapping[str, Any], image: Path, record: str) -> Lens:
+def _lens(values: Mapping[str, Any], frame: Mapping[str, Any], image: Path, record: str) -> TransformsLens:
     """The intrinsics of a frame, whose image must have the size that they are for."""
     fl_x, fl_y, cx, cy = (_number(values, frame, key, record) for key in ("fl_x", "fl_y", "cx", "cy"))
     if not image.is_file():
@@ -210,7 +212,7 @@ def _lens(values: Mapping[str, Any], frame: Mapping[str, Any], image: Path, reco
             "be those of the images"
         )
     model, coefficients = _distortion(values, frame, record)
-    return Lens(*size, (fl_x, fl_y), (cx - 0.5, cy - 0.5), model, coefficients)
+    return TransformsLens(*size, (fl_x, fl_y), (cx - 0.5, cy - 0.5), model, coefficients)
 
 
 def _distortion(values: Mapping[str, Any], frame: Mapping[str, Any], record: str) -> tuple[str, tuple[float, ...]]:

@@ -62,7 +62,7 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
             f"scene {source.scene}: the drive has no camera {unknown[0]!r}; there are: {', '.join(drive.cameras)}"
         )
     times, ego = key_frame_times(drive, source), EgoPath(drive)
-    reading = _Reading(drive, folder, times, ego, origin_shift(drive, ego, int(times[0])))
+    reading = _DriveReading(drive, folder, times, ego, origin_shift(drive, ego, int(times[0])))
     usual = usual_interval(drive.tracks)
     tracks = (sampled_track(track, times, reading.shift, max_track_gap(track, usual)) for track in drive.tracks)
     sweeps = tuple(sweep for lidar in drive.lidars for sweep in reading.sweeps(lidar, source.lidar_sweeps))
@@ -215,7 +215,7 @@ def _ego_of(drive: Drive, frame: DriveFrame, ego: EgoPath) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Reading:
+class _DriveReading:
     """A drive in `folder` with its key frames, its ego path and the translation that is subtracted from poses."""
 
     drive: Drive

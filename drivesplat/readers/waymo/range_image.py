@@ -18,7 +18,7 @@ from drivesplat.scene.rigid import apply, inverse
 
 
 @dataclass(frozen=True)
-class Rays:
+class LaserRays:
     """All n rays of a sweep, with and without a return, in the laser's frame at the time of each: `azimuth` and
     `elevation` in radians, `range` in metres (NaN without a return), `row`, an index of `Lidar.beam_elevations`."""
 
@@ -59,7 +59,7 @@ def directions(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 
 def points_of(
-    rays: Rays, extrinsic: np.ndarray, pixel_poses: np.ndarray | None = None, frame_pose: np.ndarray | None = None
+    rays: LaserRays, extrinsic: np.ndarray, pixel_poses: np.ndarray | None = None, frame_pose: np.ndarray | None = None
 ) -> np.ndarray:
     """The returns (m, 3) of rays that have one, in order, in the laser's frame at the frame's pose. `extrinsic` (4, 4):
     laser to vehicle; `pixel_poses` (n, 6): roll, pitch, yaw, x, y, z of the vehicle at each ray, `frame_pose` (4, 4)

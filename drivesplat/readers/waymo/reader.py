@@ -77,7 +77,7 @@ def scene_of(segment: Segment, source: SceneSource) -> Scene:
         raise DatasetError(f"scene {source.scene}: there is no camera {unknown[0]!r}; there are: {', '.join(numbers)}")
     times = _key_frame_times(segment, source)
     poses = [pose_of(segment.frames[int(time)], frame_name(int(time))) for time in times]
-    reading = _Reading(segment, times, poses, poses[0][:3, 3].copy())
+    reading = _SegmentReading(segment, times, poses, poses[0][:3, 3].copy())
     cameras = [numbers[camera] for camera in source.cameras]
     lasers = [number for number in LASERS if any(laser == number for _, laser in segment.sweeps)]
     return Scene(
@@ -113,7 +113,7 @@ def _key_frame_times(segment: Segment, source: SceneSource) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Reading:
+class _SegmentReading:
     """A segment with its key frames, the vehicle's poses there, and the origin that is subtracted."""
 
     segment: Segment

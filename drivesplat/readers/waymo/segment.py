@@ -96,7 +96,7 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Recordings:
+class ChosenRecordings:
     """Which recordings to read: frame timestamps with numbers of cameras, or of lasers."""
 
     images: frozenset[tuple[int, int]]

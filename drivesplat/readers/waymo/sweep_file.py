@@ -8,7 +8,7 @@ import numpy as np
 
 from drivesplat.io.storage import atomic_write
 from drivesplat.readers.drive.sweep_file import file_fault, read_checked, read_file
-from drivesplat.readers.waymo.range_image import Rays
+from drivesplat.readers.waymo.range_image import LaserRays
 from drivesplat.scene.scan import Scan, ScanRays, wrapped
 from drivesplat.scene.sensors import Spin
 
@@ -24,7 +24,7 @@ def write_file(
         np.savez(file, azimuth=azimuth, elevation=elevation, range=ranges.astype(np.float32), **returns)
 
 
-def read_rays(path: Path) -> Rays:
+def read_rays(path: Path) -> LaserRays:
     """All rays of a sweep, row by row."""
     with np.load(path, allow_pickle=False) as arrays:
         ranges = arrays["range"].astype(np.float64)
@@ -45,10 +45,10 @@ def read_scan(path: Path, spin: Spin | None) -> Scan:
     return Scan(rays, returned, np.where(returned, ranges, 0.0).astype(np.float32), intensities)
 
 
-def rays_of(azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray) -> Rays:
+def rays_of(azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray) -> LaserRays:
     """The rays of a range image (rows, columns), row by row."""
     shape = ranges.shape
-    return Rays(
+    return LaserRays(
         np.broadcast_to(azimuth, shape).ravel(),
         np.broadcast_to(elevation[:, None], shape).ravel(),
         ranges.ravel(),

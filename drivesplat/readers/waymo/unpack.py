@@ -22,7 +22,7 @@ from drivesplat.readers.waymo.layout import segment_files
 from drivesplat.readers.waymo.names import CAMERAS, LASERS, MAX_CLASS, SKY_CLASS, UNDEFINED_CLASS
 from drivesplat.readers.waymo.range_image import azimuths, points_of
 from drivesplat.readers.waymo.reader import format_of
-from drivesplat.readers.waymo.segment import ImageFile, PanopticLabel, RangeImage, Recordings, sweep_name
+from drivesplat.readers.waymo.segment import ChosenRecordings, ImageFile, PanopticLabel, RangeImage, sweep_name
 from drivesplat.readers.waymo.sweep_file import rays_of, write_file
 from drivesplat.scene.images import DECODING_ERRORS, write_png
 from drivesplat.scene.masks import UNLABELLED
@@ -71,11 +71,11 @@ def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene
     )
 
 
-def _wanted(scene: Scene) -> Recordings:
+def _wanted(scene: Scene) -> ChosenRecordings:
     cameras = {name: number for number, name in CAMERAS.items()}
     lasers = {name: number for number, name in LASERS.items()}
     times = scene.key_frame_timestamps.tolist()
-    return Recordings(
+    return ChosenRecordings(
         frozenset((times[frame.sample_index], cameras[frame.camera]) for frame in scene.frames),
         frozenset((times[sweep.sample_index], lasers[sweep.lidar]) for sweep in scene.sweeps),
     )

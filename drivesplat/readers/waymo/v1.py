@@ -16,12 +16,12 @@ from drivesplat.readers.waymo.segment import (
     MAX_CELLS,
     BoxRecord,
     CameraRecord,
+    ChosenRecordings,
     ImageFile,
     ImageRecord,
     LaserRecord,
     PanopticLabel,
     RangeImage,
-    Recordings,
     Segment,
     cells,
     frame_name,
@@ -50,7 +50,7 @@ def read_segment(files: SegmentFiles) -> Segment:
     return segment
 
 
-def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile | PanopticLabel | RangeImage]:
+def read_recordings(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[ImageFile | PanopticLabel | RangeImage]:
     """The wanted images, with their labels, and range images, one at a time."""
     calibrated = Segment(files.name, files.version)
     for frame in _frames(files):

@@ -18,12 +18,12 @@ from drivesplat.readers.waymo.parquet import batches, rows, whole
 from drivesplat.readers.waymo.segment import (
     BoxRecord,
     CameraRecord,
+    ChosenRecordings,
     ImageFile,
     ImageRecord,
     LaserRecord,
     PanopticLabel,
     RangeImage,
-    Recordings,
     Segment,
     cells,
     frame_name,
@@ -58,7 +58,7 @@ def read_segment(files: SegmentFiles) -> Segment:
     return segment
 
 
-def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile | PanopticLabel | RangeImage]:
+def read_recordings(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[ImageFile | PanopticLabel | RangeImage]:
     """The wanted images, with their labels, and range images, one at a time."""
     return chain(_image_files(files, wanted), _labels(files, wanted), _range_images(files, wanted))
 
@@ -129,7 +129,7 @@ def _boxes(read: _Rows) -> Iterator[BoxRecord]:
         )  # fmt: skip
 
 
-def _image_files(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile]:
+def _image_files(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[ImageFile]:
     path = files.files["camera_image"]
     for row in rows(path, [TIME, CAMERA, IMAGE], files.name, LARGE_ROWS):
         time, camera = whole(row[TIME], path, TIME), whole(row[CAMERA], path, CAMERA)
@@ -137,7 +137,7 @@ def _image_files(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile]
             yield ImageFile(time, camera, row[IMAGE] if isinstance(row[IMAGE], bytes) else b"")
 
 
-def _labels(files: SegmentFiles, wanted: Recordings) -> Iterator[PanopticLabel]:
+def _labels(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[PanopticLabel]:
     if SEGMENTATION not in files.files:
         return
     path, divisor = files.files[SEGMENTATION], f"{LABEL}_divisor"
@@ -147,7 +147,7 @@ def _labels(files: SegmentFiles, wanted: Recordings) -> Iterator[PanopticLabel]:
             yield PanopticLabel(time, camera, row[LABEL], whole(row[divisor], path, divisor))
 
 
-def _range_images(files: SegmentFiles, wanted: Recordings) -> Iterator[RangeImage]:
+def _range_images(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[RangeImage]:
     """The range images, the TOP laser's with the poses of its pixels. Both files are read side by side; where they
     have another order, poses wait for their range images."""
     if not wanted.sweeps:
@@ -167,7 +167,7 @@ def _range_images(files: SegmentFiles, wanted: Recordings) -> Iterator[RangeImag
 
 
 def _matrices(
-    files: SegmentFiles, component: str, column: str, channels: int, wanted: Recordings
+    files: SegmentFiles, component: str, column: str, channels: int, wanted: ChosenRecordings
 ) -> Iterator[tuple[Key, np.ndarray]]:
     """The wanted range images of a component by time and laser."""
     path = files.files[component]

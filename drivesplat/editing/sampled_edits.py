@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drivesplat.edited_motion.edited_drive import CameraMotion, EditedDrive, Instance, sampled_actor
+from drivesplat.edited_motion.sampled_edit import CameraMotion, Instance, SampledEdit, sampled_actor
 from drivesplat.editing.actors import recorded_and_edited
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError
@@ -18,9 +18,9 @@ from drivesplat.settings.edit import Edit
 log = logging.getLogger(__name__)
 
 
-def edited_drives(
+def sampled_edits(
     checkpoint: TrainedCheckpoint, scene: Scene, camera: str, edits: Mapping[str, Edit], rate: int
-) -> list[EditedDrive]:
+) -> list[SampledEdit]:
     """The edits of a trained scene, sampled `rate` times a second and at the images of a camera.
 
     An edit that does not fit the scene or the model is left out with a warning.
@@ -39,7 +39,7 @@ def edited_drives(
 
 def _edited_drive(
     model: SplatModel, scene: Scene, camera: str, name: str, edit: Edit, rate: int, where: str
-) -> EditedDrive:
+) -> SampledEdit:
     _, edited = recorded_and_edited(model, scene, camera, edit, where)
     timestamps, _ = sampled_path(scene, camera, rate)
     seconds = np.array([scene.seconds(timestamp) for timestamp in timestamps])
@@ -51,7 +51,7 @@ def _edited_drive(
         )
         for actor in edited
     )  # fmt: skip
-    return EditedDrive(name, instances, _edited_camera(scene, camera, edit, rate, where))
+    return SampledEdit(name, instances, _edited_camera(scene, camera, edit, rate, where))
 
 
 def _edited_camera(scene: Scene, camera: str, edit: Edit, rate: int, where: str) -> CameraMotion | None:

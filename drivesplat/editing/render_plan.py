@@ -36,7 +36,7 @@ RENDERED = "rendered"
 
 
 @dataclass(frozen=True)
-class RenderedDrive:
+class ImageRenderPlan:
     """A drive to render. `scene` has its images, by their paths to be, which the model shows at `seconds` (n,); its
     tracks are all annotated objects at key frames, and `tracks` are the same at LABEL_INTERVAL. `objects` are what the
     model shows of them; `edited`: whether it has the actors of an edit."""
@@ -65,7 +65,7 @@ class RenderedDrive:
         return actor_placements(self.objects.actors, self.seconds) if self.edited else None
 
 
-def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> RenderedDrive:
+def image_render_plan(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> ImageRenderPlan:
     """The drive of `job`; its images are to lie in `folder`/images.
 
     All images of the cameras at their own times, as long as the ego vehicle is on its recorded path. Warns where a
@@ -93,7 +93,7 @@ def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path,
     objects = [*actors, *others]
     times = [*key_times.tolist(), *(frame.timestamp for frame in frames)]
     label_times = np.union1d(key_times, np.arange(min(times), max(times) + 1, LABEL_INTERVAL))
-    return RenderedDrive(
+    return ImageRenderPlan(
         replace(rendered, tracks=_tracks(scene, objects, key_times)),
         seconds,
         _tracks(scene, objects, label_times),

@@ -47,7 +47,7 @@ class CameraMotion:
 
 
 @dataclass(frozen=True)
-class EditedDrive:
+class SampledEdit:
     """An edit: its objects that can move, and its camera; None: as recorded."""
 
     name: str

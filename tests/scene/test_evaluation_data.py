@@ -1,4 +1,4 @@
-"""The prepared drive of the stages after training: images, labels and splits by image index."""
+"""The evaluation data of the stages after training: images, labels and splits by image index."""
 
 import dataclasses
 import json
@@ -14,7 +14,7 @@ from drivesplat.evaluation.image_metrics import evaluate_groups
 from drivesplat.io.storage import write_json
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.prepared_drive import read_prepared_drive
+from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import write_scene
 from drivesplat.scene.training_record import write_training_record
@@ -78,13 +78,13 @@ def test_a_prepared_drive_is_read_with_the_provenance_of_its_three_files(tiny_sc
     write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance=made("scene")))
     write_training_record(tmp_path / "parser.pkl", record)
     paths = (tmp_path / "scene.json", tmp_path / "parser.pkl", masks / "masks.json")
-    drive, provenances = read_prepared_drive(*paths)
+    drive, provenances = read_evaluation_data(*paths)
     assert provenances == [made("scene"), made("parser"), made("masks")]
     assert drive.frame(2).token == tiny_scene.frames[2].token and drive.size(2) == (48, 27)
     np.testing.assert_array_equal(drive.labels(2), labels)
     (tmp_path / "masks.json").write_text("[]")
     with pytest.raises(ResultError, match=r"masks\.json.*masks"):
-        read_prepared_drive(*paths[:2], tmp_path / "masks.json")
+        read_evaluation_data(*paths[:2], tmp_path / "masks.json")
 
 
 def test_held_out_groups_are_measured_over_the_regions_of_the_labels(tiny_scene, masks, labels):

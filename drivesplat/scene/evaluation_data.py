@@ -1,4 +1,4 @@
-"""A prepared drive: the recorded images, labels and splits with which renderings of a model are compared."""
+"""Evaluation data: the recorded images, labels and splits with which renderings of a model are compared."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 
 
 @dataclass(frozen=True)
-class PreparedDrive:
+class EvaluationData:
     """A `scene`, its training `record`, whose images are the scene's frames in the same order, and the folder of the
     stage `masks`; without it the labels are computed from the scene's boxes."""
 
@@ -49,10 +49,10 @@ class PreparedDrive:
         return next((name for name, images in self.record.splits.items() if index in images), None)
 
 
-def read_prepared_drive(
+def read_evaluation_data(
     scene: str | Path, parser: str | Path, masks: str | Path
-) -> tuple[PreparedDrive, list[Provenance]]:
+) -> tuple[EvaluationData, list[Provenance]]:
     """Reads scene.json, parser.pkl and masks.json; returns the drive and the provenances of these files."""
-    drive = PreparedDrive(read_scene(scene), read_training_record(parser), Path(masks).parent)
+    drive = EvaluationData(read_scene(scene), read_training_record(parser), Path(masks).parent)
     record = read_masks_record(drive.masks)
     return drive, [drive.scene.provenance, drive.record.provenance, record.provenance]

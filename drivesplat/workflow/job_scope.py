@@ -8,7 +8,7 @@ from drivesplat.settings.tracks import Tracks
 
 
 @dataclass(frozen=True)
-class Place:
+class JobScope:
     """The dataset, scene, method and film (trajectory or edit; of a folder of a drive or of scans with its kind,
     'edits/…') of a job, empty where it has none, and the config that applies to it. `scene` is also empty for stages
     that are not in OF_ONE_SCENE."""
