@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.small_drives import scene_at, seconds_of
+from helpers.drives import LIDAR_AT, START_US, World, cast_lidar, scene_at, seconds_of, write_world
 from helpers.small_runs import S, settings_of
-from helpers.tiny_world import LIDAR_AT, START_US, World, cast_lidar, write_world
 from PIL import Image
 
 from drivesplat.errors import DatasetError

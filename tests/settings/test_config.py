@@ -334,11 +334,12 @@ def test_the_shipped_methods_are_first_whatever_order_snakemake_merges_files_in(
 
 
 def test_overrides_of_a_method_reach_its_own_stages_only():
-    values = {"methods": {"vanilla": {}, "no_sky": {"overrides": {"sky": "none", "train": {"iterations": 5}}}}}
+    methods = {"vanilla": {}, "no_sky": {"overrides": {"sky": "none", "train": {"iterations": 5}}}}
+    values, defaults = load({"methods": methods}), load({})
     assert stage_record(values, "train", method="no_sky")["sky"] == "none"
     assert stage_record(values, "train", method="no_sky")["train"]["iterations"] == 5
     for stage in STAGES:
-        expected = stage_record({}, stage)
+        expected = stage_record(defaults, stage)
         if stage == "export_viewer":  # its page switches to those of all methods
             expected["methods"] = ["no_sky", "vanilla"]
         assert stage_record(values, stage, method="vanilla") == expected
@@ -393,14 +394,22 @@ def reversed_keys(value: Any) -> Any:
     return {key: reversed_keys(value[key]) for key in reversed(value)} if isinstance(value, dict) else value
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stage(defaults, stage):
-    plain = spelled({}, stage)
+@pytest.fixture(scope="module")
+def plain() -> dict[str, str]:
+    """The settings of all stages without any given one."""
+    return spelled_stages({})
+
+
+def spelled_stages(values: dict[str, Any]) -> dict[str, str]:
+    config = load(values)
+    return {stage: spelled(config, stage) for stage in STAGES}
+
+
+def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_any_stage(defaults, plain):
     for values in (defaults, reversed_keys(defaults), {"train": {"iterations": defaults["train"]["iterations"]}}):
-        assert spelled(values, stage) == plain
+        assert spelled_stages(values) == plain
     written_out = {"sky": defaults["sky"], "train": {"iterations": defaults["train"]["iterations"]}}
-    of_methods = merged(defaults, at("methods.vanilla.overrides", written_out))
-    assert spelled(of_methods, stage) == plain
+    assert spelled_stages(merged(defaults, at("methods.vanilla.overrides", written_out))) == plain
 
 
 @pytest.mark.parametrize(
@@ -479,9 +488,9 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
     ],
     ids=str,
 )
-def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, change, readers):
-    before, after = load(defaults), load(merged(defaults, with_methods_kept(change)))
-    assert {stage for stage in STAGES if spelled(before, stage) != spelled(after, stage)} == set(readers.split())
+def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, plain, change, readers):
+    after = spelled_stages(merged(defaults, with_methods_kept(change)))
+    assert {stage for stage in STAGES if plain[stage] != after[stage]} == set(readers.split())
 
 
 def test_for_a_synthetic_world_the_evaluation_gets_the_settings_of_removal(defaults):
