@@ -410,11 +410,11 @@ import torch
 from drivesplat.training.trainer import Trainer
 
 
-def fit_one(self, shown=True):
+def training_step(self, shown=True):
     raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
 
-Trainer.fit_one = fit_one
+Trainer.training_step = training_step
 """
 
 
