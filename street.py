@@ -53,7 +53,7 @@ Picture = namedtuple("Picture", "image alpha depth actors_alpha gaussians")
 """(h, w, 3) with the sky, (h, w) of all Gaussians, (h, w) metres, (h, w) of actors alone or None, and `Gaussians`."""
 View = namedtuple("View", "K camera_to_world pixels sky ego static moving dynamic lidar_pixels lidar_depth time")
 """An image: (3, 3), pixels with centres at halves; (4, 4); (h, w, 3) uint8; masks (h, w) of the sky, the ego vehicle,
-what is static, moving vehicles, these and moving people; row-major indices (k,) of pixels with LiDAR depth (k,) in
+static pixels, moving vehicles, these and moving people; row-major indices (k,) of pixels with LiDAR depth (k,) in
 metres along the optical axis; seconds since the first image."""
 
 
@@ -244,7 +244,7 @@ class Sky:
 
 
 class Street:
-    """The model: `parts`, the background and, where anything moves, the actors; `sky`."""
+    """The model: `parts`, the background and, with any moving vehicle, the actors; `sky`."""
 
     def __init__(self, record: dict, actors: list[ActorRecord], views: list[View], args: Namespace):
         device, cap = views[0].K.device, min(args.cap_max, sum(view.sky.numel() for view in views) // 20)
@@ -312,7 +312,7 @@ def losses(picture: Picture, view: View, model: Street) -> dict[str, Tensor]:
     if len(view.lidar_depth):  # the worst 5 % are returns from behind edges
         off = (picture.depth.flatten()[view.lidar_pixels] - view.lidar_depth).abs()
         terms["depth"] = 0.01 * off.topk(max(1, len(off) * 95 // 100), largest=False).values.mean()
-    if len(model.parts) > 1:  # few pixels show what moves; actors are opaque, or not there
+    if len(model.parts) > 1:  # dynamic pixels are few; actors are opaque, or absent
         terms["dynamic"] = 0.1 * (difference.mean(dim=2) * view.dynamic).sum() / view.dynamic.sum().clamp(min=1)
         o = picture.actors_alpha.masked_fill(view.ego, 1.0).clamp(1e-4, 1.0 - 1e-4)
         terms["entropy"] = -0.005 * (o * o.log() + (1.0 - o) * (1.0 - o).log()).mean()
