@@ -47,6 +47,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/snakefmt --check Snakefile rules
 	$(BIN)/snakemake --lint
+	$(BIN)/python -m scripts.check_texts
 
 # Uses the Python at hand where there is no .venv: GPU machines often bring their own torch. Imports only modules with
 # GPU tests, since such a machine may lack what the others need (ffmpeg, usd-core, ...).

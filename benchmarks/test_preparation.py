@@ -6,7 +6,7 @@ import time
 import numpy as np
 import yaml
 from helpers import REPOSITORY
-from helpers.tiny_world import World, write_world
+from helpers.drives import World, write_world
 from helpers.workflow_copy import WorkflowCopy
 from PIL import Image
 

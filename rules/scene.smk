@@ -3,9 +3,9 @@
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
 # where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
-# lidar_depth.npz, free_space.npz and scans.npz. The scene of all rules after these (plan.scene) is the refined one where
-# there is one. What depends on tracks is made for each kind of tracks that methods train with (tracks.smk): the wildcard
-# {tracks} is empty for annotated ones, else the folder 'discovered/' or 'unlabelled/'.
+# lidar_depth.npz and scans.npz. The scene of all rules after these (plan.scene) is the refined one where there is one.
+# What depends on tracks is made for each kind of tracks that methods train with (tracks.smk): the wildcard {tracks} is
+# empty for annotated ones, else the folder 'discovered/' or 'unlabelled/'.
 
 
 rule extract:
@@ -100,7 +100,7 @@ rule lidar_seed:
         scene=plan.scene,
         own_car="<results>/{scene}/own_car.json",
         points_file=plan.points_file,
-        triangulated=plan.triangulated("lidar_seed"),
+        triangulated=plan.triangulated,
     output:
         seed="<results>/{scene}/{tracks}seed.ply",
     log:
@@ -223,32 +223,6 @@ rule lidar_depth:
         code=plan.code("lidar_depth"),
     script:
         "../workflow_scripts/lidar_depth.py"
-
-
-rule free_space:
-    """
-    Finds empty voxels: crossed by LiDAR rays of training key frames or by rays from training images to triangulated
-    points, with no end of a ray near them.
-    """
-    input:
-        scene=plan.scene,
-        triangulated=plan.triangulated("free_space"),
-    output:
-        free_space="<results>/{scene}/{tracks}free_space.npz",
-    log:
-        "<logs>/{scene}/{tracks}free_space.log",
-    benchmark:
-        "<benchmarks>/{scene}/{tracks}free_space.tsv"
-    conda:
-        "../envs/drivesplat.yaml"
-    resources:
-        mem_mb=4000,
-        runtime=15,
-    params:
-        settings=plan.settings("free_space"),
-        code=plan.code("free_space"),
-    script:
-        "../workflow_scripts/free_space.py"
 
 
 rule scans:

@@ -1,8 +1,8 @@
 # The training of one method on one scene.
 #
 # REQUIRED INPUTS: <results>/{scene}/parser.pkl and, of scenes with cameras, masks/masks.json; actors.npz,
-# lidar_depth.npz, free_space.npz and scans.npz if the method has actors, is supervised with LiDAR depth, keeps Gaussians
-# out of empty space, and renders LiDAR; in discovered/ or unlabelled/ where the method has such tracks.
+# lidar_depth.npz and scans.npz if the method has actors, is supervised with LiDAR depth, and renders LiDAR; in
+# discovered/ or unlabelled/ where the method has such tracks.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While a training
 # runs, resume/ holds its resume checkpoint; no rule declares it, so that Snakemake does not delete it.
 
@@ -16,7 +16,6 @@ rule train:
         masks=plan.images_of_tracks("masks/masks.json"),
         actors=plan.training_input("actors"),
         lidar_depth=plan.training_input("lidar_depth"),
-        free_space=plan.training_input("free_space"),
         scans=plan.training_input("scans"),
     output:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",

@@ -8,14 +8,21 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch comes: its threads
 # Copies of the workflow run the same kernels as the tests themselves: those that the set-up compiled.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drivesplat/__pycache__"))
 
+import hypothesis
 import pytest
 import torch
-from helpers.checked_types import check_types_of
+from helpers.checked_types import begin_test, check_types_of
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # asked for before Triton comes: its own library is kernels, too
 
 check_types_of("drivesplat")
+
+# The same examples in every run; no test measures time, and fixtures are read only or renewed by the test itself.
+hypothesis.settings.register_profile(
+    "repeatable", derandomize=True, deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck)
+)
+hypothesis.settings.load_profile("repeatable")
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -37,6 +44,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = [item for share in shares for item in share] + others
 
 
+def pytest_runtest_setup() -> None:
+    begin_test()
+
+
 @pytest.fixture(scope="module")
 def one_thread():
     """Tests run side by side: with a thread per core each, they would mostly wait for each other."""
@@ -49,24 +60,34 @@ def one_thread():
 @pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory) -> Path:
     """A tiny drive in nuScenes format: scene 0001, read only."""
-    from helpers.tiny_world import World, write_world
+    from helpers.drives import World, write_world
 
     return write_world(tmp_path_factory.mktemp("tiny"), World())
+
+
+@pytest.fixture(scope="module")
+def uncompared():
+    """Extractions and checks do not compare recordings with each other."""
+    from helpers.drives import uncompared
+
+    with uncompared():
+        yield
+
+
+@pytest.fixture(scope="session")
+def small_root(tmp_path_factory) -> Path:
+    """A tiny drive of three key frames with smaller images, read only."""
+    from helpers.drives import SMALL, write_world
+
+    return write_world(tmp_path_factory.mktemp("small"), SMALL)
 
 
 @pytest.fixture(scope="session")
 def tiny_scene(tiny_root):
     """The tiny drive as a Scene, with the images between key frames."""
-    from drivesplat.preprocess.extract import extract_scene
-    from drivesplat.settings.extract import SceneSource
+    from helpers.drives import scene_at
 
-    return extract_scene(
-        SceneSource(
-            dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None,
-            cameras=("CAM_FRONT",), sweeps=True, on_missing="stop",
-        ),
-        tiny_root,
-    )  # fmt: skip
+    return scene_at(tiny_root)
 
 
 @pytest.fixture(scope="session")
@@ -87,13 +108,21 @@ def demo_job():
 
 
 @pytest.fixture(scope="session")
+def finished_run(tmp_path_factory):
+    """The workflow run to its end on the tiny drive, with two methods and two edits: read only."""
+    from helpers.shared_runs import finished_run
+
+    return finished_run(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
 def demo_root(demo_job, tmp_path_factory) -> Path:
     """A small synthetic drive in nuScenes format with its truth: scene demo, read only."""
+    from helpers.shared_runs import made_once
+
     from drivesplat.demo.world import make_world
 
-    root = tmp_path_factory.mktemp("demo")
-    make_world(root, demo_job, {"stages": {}}, workers=2)
-    return root
+    return made_once(tmp_path_factory, "demo", lambda root: make_world(root, demo_job, {"stages": {}}, workers=2))
 
 
 @pytest.fixture(scope="session")

@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from helpers.checked_types import checked
+from helpers.checked_types import CHECKED_CALLS, begin_test, checked
 from jaxtyping import Float, TypeCheckError, jaxtyped
 
 
 def scaling(factor: float, kind: type) -> Callable:
     @jaxtyped(typechecker=checked)
-    def scaled(values: Float[np.ndarray, "n"], others: Float[np.ndarray, "n"]) -> kind:
+    def scaled(values: Float[np.ndarray, " n"], others: Float[np.ndarray, " n"]) -> kind:
         return kind(factor * (values + others).sum())
 
     return scaled
@@ -18,6 +18,7 @@ def scaling(factor: float, kind: type) -> Callable:
 
 def test_nested_functions_are_checked_by_their_own_annotations():
     for _ in range(2):
+        begin_test()
         for factor, kind in ((2.0, float), (3.0, int), (4.0, str)):
             result = scaling(factor, kind)(np.ones(3), np.ones(3))
             assert result == kind(6.0 * factor) and type(result) is kind
@@ -37,3 +38,16 @@ def test_a_nested_function_that_returns_another_type_is_refused():
     assert made(3)() == 3
     with pytest.raises(TypeCheckError):
         made("3")()
+
+
+def test_the_first_calls_of_a_function_in_each_test_are_checked():
+    @jaxtyped(typechecker=checked)
+    def same(value: int) -> int:
+        return value
+
+    for _ in range(2):
+        begin_test()
+        for _ in range(CHECKED_CALLS):
+            with pytest.raises(TypeCheckError):
+                same("3")
+        assert same("3") == "3"

@@ -8,7 +8,7 @@ from drivesplat.training.run import TrainingFiles, read_inputs, run_training
 
 with job(snakemake, dataset=("images",)) as current:
     files = current.input
-    wanted = ([*paths] for paths in (files.masks, files.actors, files.lidar_depth, files.free_space, files.scans))
+    wanted = ([*paths] for paths in (files.masks, files.actors, files.lidar_depth, files.scans))
     inputs, upstream = read_inputs(files.parser, *wanted)
     made = TrainingFiles(Path(current.output.checkpoint), Path(current.output.summary))
     provenance = current.provenance(*upstream)

@@ -38,7 +38,7 @@ from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
-from drivesplat.training.visits import NO_VISITS, Visits
+from drivesplat.training.probes import NO_PROBES, Probes
 
 CHECKPOINT = "ckpt.npz"
 
@@ -63,7 +63,7 @@ def fit(
     folder: Path,
     clock: Clock = UNTIMED,
     sky: CubemapSky | None = None,
-    visits: Visits = NO_VISITS,
+    visits: Probes = NO_PROBES,
 ) -> PlainSummary:
     """Fits Gaussians, and the `sky` behind them, to `images` on their device; `scale` is the scene's. Scalars and
     checkpoints go to `folder`. `clock` times the stages of an iteration; `visits` see the model during the training."""
@@ -112,14 +112,14 @@ class PlainTraining:
         writer: SummaryWriter,
         folder: Path,
         extent: float,
-        visits: Visits = NO_VISITS,
+        visits: Probes = NO_PROBES,
     ) -> float:
         """All iterations. Returns their seconds, without those of visits, which see Gaussians of this `extent`."""
         began = time.monotonic()
         bar = tqdm(range(self.recipe.schedule.iterations), desc="plain", disable=not sys.stderr.isatty())
         for _ in bar:
             with self.clock.stage(ITERATION):
-                terms, info = self.fit_one(data)
+                terms, info = self.training_step(data)
                 bar.set_description(f"loss={terms['loss'].item():.3f}")
                 if self.step % LOGGED_EVERY == 0:
                     self._log(terms, writer)
@@ -138,7 +138,7 @@ class PlainTraining:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
-    def fit_one(self, data: Iterator[dict[str, Tensor]]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def training_step(self, data: Iterator[dict[str, Tensor]]) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The first half of an iteration: renders the next image and computes gradients. Returns the terms of the loss,
         and the rasterizer's output for densification."""
         with self.clock.stage("data"):

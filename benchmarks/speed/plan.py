@@ -27,11 +27,10 @@ class SceneFiles:
     masks: str
     actors: tuple[str, ...]
     lidar_depth: tuple[str, ...]
-    free_space: tuple[str, ...]
     scans: tuple[str, ...] = ()
 
     def all(self) -> list[str]:
-        return [self.scene, self.parser, self.masks, *self.actors, *self.lidar_depth, *self.free_space, *self.scans]
+        return [self.scene, self.parser, self.masks, *self.actors, *self.lidar_depth, *self.scans]
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,6 @@ def files_for(run: SnakemakeRun, method: str) -> SceneFiles:
         str(folder / "masks/masks.json"),
         tuple(plan.training_input("actors")(at)),
         tuple(plan.training_input("lidar_depth")(at)),
-        tuple(plan.training_input("free_space")(at)),
         tuple(plan.training_input("scans")(at)),
     )
 

@@ -50,9 +50,9 @@ from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import CoarseToFineSettings
 from drivesplat.training.clock import UNTIMED, Clock
+from drivesplat.training.probes import Probes
 from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
 from drivesplat.training.train import TrainingFolders, train
-from drivesplat.training.visits import Visits
 from drivesplat.workflow.gpus import hold_gpu
 
 Times = dict[str, Any]
@@ -75,7 +75,7 @@ def run(task: Task) -> dict[str, Any]:
         recording, _ = read_evaluation_data(task.files.scene, task.files.parser, task.files.masks)
         masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
         curve = QualityCurve(held_out_frames(recording, camera, device) if task.visits else [])
-        visits, before = Visits(task.visits, curve.see), CpuSample.now()
+        visits, before = Probes(task.visits, curve.see), CpuSample.now()
         if task.recipe == OURS:
             times, model = ours(task, device, visits)
         else:
@@ -99,7 +99,7 @@ def run(task: Task) -> dict[str, Any]:
         }
 
 
-def plain(task: Task, device: torch.device, paths: list[str], visits: Visits) -> tuple[Times, SplatModel]:
+def plain(task: Task, device: torch.device, paths: list[str], visits: Probes) -> tuple[Times, SplatModel]:
     """Times of a training by a variant of the plain recipe, and its model. Raises DeviceError for a packed one without
     a GPU."""
     variant = _variant(task)
@@ -128,7 +128,7 @@ def _sky(task: Task, device: torch.device) -> CubemapSky | None:
     return None if sky is None else sky.to(device)
 
 
-def ours(task: Task, device: torch.device, visits: Visits) -> tuple[Times, SplatModel]:
+def ours(task: Task, device: torch.device, visits: Probes) -> tuple[Times, SplatModel]:
     """Times of a training by the function of the rule `train`, and its model. Two iterations before it load its
     kernels."""
     _continue(task, device, 2)
@@ -187,13 +187,13 @@ def _continue(
     settings = begun.settings.model_copy(update={**continued, "coarse_to_fine": WHOLE_IMAGES})
     folders = TrainingFolders(_profile_folder(task) / "resume", _profile_folder(task) / "tensorboard", "", task.label)
     trained = begun.model if model is None else model
-    train(trained, begun.views, settings, task.seed, device, folders, begun.priors, clock, scans=begun.scans)
+    train(trained, begun.views, settings, task.seed, device, folders, begun.road, clock, scans=begun.scans)
     shutil.rmtree(_profile_folder(task))
 
 
 def _inputs(task: Task) -> tuple[TrainingInputs, list[dict[str, Any]]]:
     files = task.files
-    return read_inputs(files.parser, [files.masks], files.actors, files.lidar_depth, files.free_space, files.scans)
+    return read_inputs(files.parser, [files.masks], files.actors, files.lidar_depth, files.scans)
 
 
 def _profile_folder(task: Task) -> Path:

@@ -35,12 +35,12 @@ def over_cube_map(
     """
     learned = camera_to_world.requires_grad
     if not learned and triton_support.usable_for(image):
-        pass
+        from drivesplat.kernels.triton.cube_map import TritonOverCubeMap as OverCubeMap
     elif not learned and image.device.type == "cpu":
-        from drivesplat.kernels.numba.cube_map import NumbaOverCubeMap
+        from drivesplat.kernels.numba.cube_map import NumbaOverCubeMap as OverCubeMap
     else:
         return image + (1.0 - alpha) * cube_map_colors(cube, rays())
-    return NumbaOverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
+    return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
 
 
 def cube_map_colors(cube: CubeMap, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

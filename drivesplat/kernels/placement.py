@@ -61,7 +61,7 @@ def mirrored(gaussians: LocalGaussians, side: Float[Tensor, " n"]) -> LocalGauss
     return gaussians._replace(means=means, quats=gaussians.quats * torch.stack([same, side, same, side], dim=1))
 
 
-def of_owners(values: Float[Tensor, "a *v"], owns: Float[Tensor, "n a"]) -> Float[Tensor, "n *v"]:
+def of_owners(values: Float[Tensor, " a *v"], owns: Float[Tensor, "n a"]) -> Float[Tensor, " n *v"]:
     """The values of every Gaussian's object. The product with the one-hot matrix is exact, and its gradient is a matrix
     product too, while that of indexing is a sum row by row."""
     return (owns.to(values.dtype) @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])

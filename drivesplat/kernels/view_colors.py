@@ -50,5 +50,6 @@ def fused_view_colors(
     where the kernel does not apply; it needs Triton, degree 0 or 1 and a camera without gradient."""
     if degree > 1 or camera_to_world.requires_grad or not triton_support.usable_for(means):
         return None
+    from drivesplat.kernels.triton.view_colors import TritonViewColors
 
-    return NumbaViewColors.apply(means, sh0, shN, camera_to_world, degree)
+    return TritonViewColors.apply(means, sh0, shN, camera_to_world, degree)

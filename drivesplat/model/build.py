@@ -9,7 +9,6 @@ import torch
 
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
-from drivesplat.model.camera_poses import TIMES, CameraPoses
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import drifting_seed
@@ -26,8 +25,6 @@ from drivesplat.settings.train_objects import ActorSettings
 
 EXPOSURE_PREFIX = "exposure.first."
 """Prefix of the initial gains of exposures in a model's state; the camera name follows."""
-POSES_PREFIX = "camera_poses." + TIMES
-"""Prefix of the times of corrected camera poses in a model's state; the camera name follows."""
 OBJECTS: dict[str, type[Actors]] = {kind.name: kind for kind in (Actors, Deformable)}
 """The parts that consist of objects, by name."""
 MIN_SEED_POINTS = 4
@@ -38,8 +35,7 @@ MIN_SEED_POINTS = 4
 class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
-    (3,) of every camera in `exposed`, whose exposure is learned, and for every camera in `posed`, whose poses are
-    corrected, the times of its training images in seconds, the initial logits of LiDAR's intensity and return
+    (3,) of every camera in `exposed`, whose exposure is learned, the initial logits of LiDAR's intensity and return
     (`echo`; None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
 
     record: TrainingRecord
@@ -47,7 +43,6 @@ class ModelInit:
     sky_color: np.ndarray
     classes: int = 0
     exposed: dict[str, np.ndarray] = field(default_factory=dict)
-    posed: Mapping[str, Sequence[float]] = field(default_factory=dict)
     echo: tuple[float, float] | None = None
     scans: int = 0
 
@@ -78,7 +73,6 @@ def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, sett
         _sky(sky, settings, init.sky_color),
         settings.antialiased,
         _exposures(init.exposed, settings),
-        _camera_poses(init.posed, settings),
         settings.rolling_shutter,
         settings.max_scale,
     )
@@ -104,13 +98,11 @@ def rebuild_model(
     exposed = {
         key.removeprefix(EXPOSURE_PREFIX): gains for key, gains in state.items() if key.startswith(EXPOSURE_PREFIX)
     }
-    posed = {key.removeprefix(POSES_PREFIX): at.tolist() for key, at in state.items() if key.startswith(POSES_PREFIX)}
     model = SplatModel(
         made,
         _sky(sky, settings, np.full(3, 0.5)),
         settings.antialiased,
         _exposures(exposed, settings),
-        _camera_poses(posed, settings),
         settings.rolling_shutter,
         settings.max_scale,
     )
@@ -212,10 +204,6 @@ def random_subset(count: int, limit: int) -> np.ndarray:
 def _exposures(first: Mapping[str, Any], settings: TrainSettings) -> Exposures | None:
     gains = {camera: torch.as_tensor(values).float().clone() for camera, values in first.items()}
     return Exposures(gains, settings.exposure) if gains else None
-
-
-def _camera_poses(times: Mapping[str, Sequence[float]], settings: TrainSettings) -> CameraPoses | None:
-    return CameraPoses(times, settings.camera_poses) if times else None
 
 
 def _sky(kind: SkyKind, settings: TrainSettings, color: np.ndarray) -> Sky | None:

@@ -1,8 +1,8 @@
 """People, animals and cyclists: actors whose limbs move.
 
-A set of Gaussians per track, as `drivesplat.model.actors`, that also deform in the frame of their box, by a field that
-depends on the phase of a gait and on time. The phase advances with the distance walked, so that limbs stand where the
-object stands, and follow the pace of an edit.
+A set of Gaussians per track, as `drivesplat.model.actors`, that also deform in the frame of their box, by a lattice
+that depends on the phase of a gait and on time. The phase advances with the distance walked, so that limbs stand where
+the object stands, and follow the pace of an edit.
 """
 
 import math
@@ -14,13 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from drivesplat.kernels.placement import LocalGaussians, of_owners
+from drivesplat.kernels.placement import LocalGaussians
 from drivesplat.kernels.quaternions import turned
 from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.actors import Actors
-from drivesplat.model.deformation import Field, Undeformed
-from drivesplat.model.deformation_network import NetworkField
-from drivesplat.model.lattice import LatticeField
+from drivesplat.model.lattice import Lattice, Undeformed
 from drivesplat.model.parameters import make_parameters
 from drivesplat.model.part import ActorPlacement, Shapes
 from drivesplat.model.timeline import ActorTrack, TimeState
@@ -34,13 +32,15 @@ MIN_STEP, FAR = 0.01, 1e6
 class Deformable(Actors):
     """The Gaussians of a tracks that deform, as `Actors`.
 
-    `shared` also holds the parameters of a `Field`; `stride` (a,), the logarithm of a cycle's length relative to that
-    of the settings; and `phase` (m,), corrections of the phase where the object was at its m annotations, in cycles,
-    linear in the distance walked.
+    `shared` also holds the nodes of their lattices, `lattice` (see `Lattice`); `stride` (a,), the logarithm of a
+    cycle's length relative to the settings; and `phase` (m,), corrections of the phase where the object was at its m
+    annotations, in cycles, linear in the distance walked.
     """
 
     name = "deformable"
+    decaying = (*Actors.decaying, "stride", "phase", "lattice")
     _per_annotation = ("translation", "yaw", "phase")
+    _per_track = ("stride", "lattice")
 
     def __init__(
         self,
@@ -50,14 +50,9 @@ class Deformable(Actors):
         gaussians: GaussianSettings,
     ):
         super().__init__(params, tracks, settings, gaussians)
-        self._gait, self._field = settings.gait, field_of(settings)
-        self._out_of_box_weight = settings.out_of_box_weight
-        self.penalties_depend_on_time = settings.out_of_box_weight > 0
-        initial = self._field.initial(len(tracks))
-        self._field_names = tuple(initial)
-        self._per_track = ("stride", *(name for name in ("lattice", "embedding") if name in initial))
+        self._gait, self._lattice = settings.gait, lattice_of(settings)
         gait = {"stride": torch.zeros(len(tracks)), "phase": torch.zeros(len(self.shared["yaw"]))}
-        self.shared.update(make_parameters({**gait, **initial}))
+        self.shared.update(make_parameters({**gait, "lattice": self._lattice.initial(len(tracks))}))
         walked = [track.motion.walked(track.motion.times) for track in tracks]
         self.register_buffer("_annotated", self.timeline.of_actors, persistent=False)
         self.register_buffer("_knots", torch.from_numpy(hat_functions(walked)).float(), persistent=False)
@@ -94,7 +89,7 @@ class Deformable(Actors):
     def local(self, state: TimeState) -> LocalGaussians:
         p = self.params
         gaussians = Undeformed(p["means"], p["owner"], self._owns, self._reach)
-        moved = self._field.deformation(dict(self.shared.items()), gaussians, self.basis(state))
+        moved = self._lattice.deformation(self.shared["lattice"], gaussians, self.basis(state))
         quats = turned(p["quats"], moved.turns)
         return LocalGaussians(p["means"] + moved.shifts, quats, p["scales"], p["opacities"])
 
@@ -122,35 +117,20 @@ class Deformable(Actors):
         basis = torch.stack([self.basis(state)[self._known.index(placements[0].source)] for state in states])
         return torch.cat([torch.ones_like(basis[:, :1]), basis], dim=1)
 
-    @property
-    def decaying(self) -> tuple[str, ...]:
-        return (*super().decaying, "stride", "phase", *self._field_names)
-
     def learning_rates(self) -> dict[str, float]:
         own = {"stride": self._gait.lr_stride, "phase": self._gait.lr_phase}
-        return {**super().learning_rates(), **own, **dict.fromkeys(self._field_names, self._field.learning_rate)}
+        return {**super().learning_rates(), **own, "lattice": self._lattice.settings.learning_rate}
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
         corrections = self.shared["stride"].square().mean() + self.shared["phase"].square().mean()
-        of_field = self._field.penalties(dict(self.shared.items()))
-        return {**super().penalties(), "gait": self._gait.weight * corrections, **of_field}
-
-    def penalties_at(self, time: float) -> dict[str, Float[Tensor, ""]]:
-        if not self._out_of_box_weight:
-            return {}
-        state = self.time_state(time)
-        present = of_owners(state.present.float(), self._owns)
-        outside = (self.local(state).means.abs() - of_owners(self._reach, self._owns)).clamp(min=0.0)
-        mean = (outside.sum(dim=1) * present).sum() / present.sum().clamp(min=1.0)
-        return {"out_of_box": self._out_of_box_weight * mean}
+        of_lattice = self._lattice.penalties(self.shared["lattice"])
+        return {**super().penalties(), "gait": self._gait.weight * corrections, **of_lattice}
 
 
-def field_of(settings: DeformableSettings) -> Field:
-    """The field that settings name, for the functions of `Deformable.basis`."""
+def lattice_of(settings: DeformableSettings) -> Lattice:
+    """The lattice of the settings, for the functions of `Deformable.basis`."""
     orders = np.concatenate([np.repeat(np.arange(1, settings.gait.harmonics + 1), 2), np.arange(1, settings.fourier)])
-    if settings.field == "lattice":
-        return LatticeField(settings.lattice, orders.astype(np.float64))
-    return NetworkField(settings.network, len(orders))
+    return Lattice(settings.lattice, orders.astype(np.float64))
 
 
 def hat_functions(walked: Sequence[np.ndarray]) -> np.ndarray:

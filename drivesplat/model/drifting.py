@@ -17,7 +17,7 @@ from torch import Tensor
 from drivesplat.model.drifting_seed import DriftingSeed
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
-from drivesplat.model.part import GEOMETRY, Part, PartDefinition, RigidGroup, active_fraction
+from drivesplat.model.part import GEOMETRY, Part, PartDefinition, RigidGroup
 from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train import GaussianSettings
 
@@ -118,14 +118,6 @@ class Drifting(Part):
         own = self._settings
         rates = {"means": own.lr_means, "velocities": own.lr_velocities, "peaks": own.lr_peaks, "spans": own.lr_spans}
         return {**learning_rates(self._gaussians, self.extent), **rates}
-
-    def penalties_at(self, time: float) -> dict[str, Float[Tensor, ""]]:
-        """The mean opacity at a time. A Gaussian that is absent then has no gradient."""
-        weight = self._settings.opacity_weight
-        if not weight:
-            return {}
-        _, lived = self.time_state(time)
-        return {"drifting": weight * self._opacities(lived).mean() / active_fraction([self])}
 
     def definition(self) -> PartDefinition:
         return PartDefinition(self.name, self.extent, seconds=self._seconds)

@@ -1,7 +1,6 @@
 """Free-form deformation of objects: displacements and rotations at the nodes of a lattice in each object's box, with
 trilinear interpolation between them (Sederberg and Parry, SIGGRAPH 1986, with linear in place of Bernstein bases)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,8 +12,26 @@ from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.constants import constant
 from drivesplat.kernels.placement import of_owners
-from drivesplat.model.deformation import Deformation, Field, Undeformed
 from drivesplat.settings.deformable import LatticeSettings
+
+
+class Deformation(NamedTuple):
+    """What n Gaussians are moved by in the frames of their objects: `shifts` in metres, and `turns`, rotation vectors
+    halved (radians): the rotation of a turn t is the normalised quaternion (1, t)."""
+
+    shifts: Float[Tensor, "n 3"]
+    turns: Float[Tensor, "n 3"]
+
+
+@dataclass(frozen=True)
+class Undeformed:
+    """n Gaussians of a objects: their centres (metres, in the frames of their objects), the object of each as index and
+    as one-hot matrix, and half the size (metres) of the objects' boxes, enlarged by the margin."""
+
+    means: Float[Tensor, "n 3"]
+    owner: Int[Tensor, " n"]
+    owns: Float[Tensor, "n a"]
+    reach: Float[Tensor, "a 3"]
 
 
 class Corners(NamedTuple):
@@ -25,37 +42,37 @@ class Corners(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LatticeField(Field):
-    """A lattice for each object. The parameter `lattice` (a, k, x, y, z, 6) holds the displacements (metres) and halved
-    rotation vectors (radians) of the nodes for each of k functions, whose `orders` (k,) the penalty of size rises with.
-    """
+class Lattice:
+    """A lattice for each of a objects, whose `nodes` (a, k, x, y, z, 6) hold the displacements (metres) and halved
+    rotation vectors (radians) of the nodes for each of k functions of phase and time. The penalty of size rises with
+    their `orders` (k,)."""
 
     settings: LatticeSettings
     orders: Float[np.ndarray, " k"]
 
-    def initial(self, count: int) -> dict[str, Tensor]:
-        return {"lattice": torch.zeros(count, len(self.orders), *self.settings.nodes, 6)}
+    def initial(self, count: int) -> Float[Tensor, "a k x y z 6"]:
+        """The nodes of `count` objects, which deform nothing."""
+        return torch.zeros(count, len(self.orders), *self.settings.nodes, 6)
 
     def deformation(
-        self, parameters: Mapping[str, Tensor], gaussians: Undeformed, basis: Float[Tensor, "a k"]
+        self, nodes: Float[Tensor, "a k x y z 6"], gaussians: Undeformed, basis: Float[Tensor, "a k"]
     ) -> Deformation:
-        around, nodes = corners(gaussians, self.settings.nodes), parameters["lattice"]
+        """The deformation where the k functions of each object have the values `basis`."""
+        around = corners(gaussians, self.settings.nodes)
         at_nodes = torch.einsum("ak,akm->am", basis, nodes.flatten(2)).reshape(-1, 6)
         chosen = at_nodes.index_select(0, around.nodes.flatten())  # its gradient is faster than that of indexing
-        return Deformation.of((around.weights[..., None] * chosen.reshape(-1, 8, 6)).sum(dim=1))
+        values = (around.weights[..., None] * chosen.reshape(-1, 8, 6)).sum(dim=1)
+        return Deformation(values[:, :3], values[:, 3:])
 
-    def penalties(self, parameters: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
-        nodes, own = parameters["lattice"], self.settings
+    def penalties(self, nodes: Float[Tensor, "a k x y z 6"]) -> dict[str, Float[Tensor, ""]]:
+        """Weighted terms of the training loss, by name."""
+        own = self.settings
         scaled = (nodes.flatten(2) * constant(tuple(self.orders.tolist()), nodes.device)[:, None]).flatten()
         values = max(1, nodes.numel() // len(self.orders))
         return {
             "lattice_size": own.l2_weight / values * scaled.dot(scaled),
             "lattice_roughness": own.smoothness_weight * roughness(nodes),
         }
-
-    @property
-    def learning_rate(self) -> float:
-        return self.settings.learning_rate
 
 
 def corners(gaussians: Undeformed, nodes: tuple[int, int, int]) -> Corners:

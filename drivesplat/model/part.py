@@ -89,8 +89,6 @@ class Part(nn.Module, ABC):
     """Whether its Gaussians are dynamic: at other places at other times."""
     has_objects = False
     """Whether its Gaussians belong to objects with tracks."""
-    penalties_depend_on_time = False
-    """Whether it has `penalties_at` times."""
     mirrored: Float[Tensor, " a"] | None
     """The probabilities with which an iteration of a training mirrors each of its a objects; None: never."""
     geometry: tuple[str, ...] = GEOMETRY
@@ -215,10 +213,6 @@ class Part(nn.Module, ABC):
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
         """Its own weighted terms of the training loss, by name."""
-        return {}
-
-    def penalties_at(self, time: float) -> dict[str, Float[Tensor, ""]]:
-        """Those that depend on the time of the image (seconds since the first one)."""
         return {}
 
     def confine(self) -> None:

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from drivesplat.errors import ResultError
 from drivesplat.kernels.colored_projection import SetOnRoad
 from drivesplat.kernels.road_distance import Road
-from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, GaussianSets, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Shapes, Sky
@@ -25,9 +24,8 @@ from drivesplat.rasterization import Rendering, rasterize, rasterize_projected
 
 
 class SplatModel(nn.Module):
-    """Parts, a sky (None: black), exposures of cameras (None: all alike), pose corrections (None: recorded poses).
-    Without `rolling_shutter`, views are rendered as if they had a global shutter. With `max_scale` above 0, Gaussians
-    in images have `limited_scales`."""
+    """Parts, a sky (None: black) and exposures of cameras (None: all alike). Without `rolling_shutter`, views are
+    rendered as if they had a global shutter. With `max_scale` above 0, Gaussians in images have `limited_scales`."""
 
     def __init__(
         self,
@@ -35,7 +33,6 @@ class SplatModel(nn.Module):
         sky: Sky | None,
         antialiased: bool = False,
         exposure: Exposures | None = None,
-        camera_poses: CameraPoses | None = None,
         rolling_shutter: bool = True,
         max_scale: float = 0.0,
     ):
@@ -43,7 +40,6 @@ class SplatModel(nn.Module):
         self.parts = nn.ModuleList(parts)
         self.sky = sky
         self.exposure = exposure
-        self.camera_poses = camera_poses
         self.antialiased = antialiased
         self.rolling_shutter = rolling_shutter
         self.max_scale = max_scale
@@ -52,9 +48,9 @@ class SplatModel(nn.Module):
         return sum(len(part) for part in self.parts)
 
     @property
-    def beside_parts(self) -> dict[str, Sky | Exposures | CameraPoses]:
+    def beside_parts(self) -> dict[str, Sky | Exposures]:
         """Other learned modules by name, with `params` and `learning_rates()`."""
-        named = {"sky": self.sky, "exposure": self.exposure, "camera_poses": self.camera_poses}
+        named = {"sky": self.sky, "exposure": self.exposure}
         return {name: module for name, module in named.items() if module is not None}
 
     def precompute(self, times: Sequence[float]) -> None:
@@ -170,7 +166,6 @@ class SplatModel(nn.Module):
         sh_degree: int | None = None,
         *,
         gaussians: Gaussians | Sequence[Gaussians] | None = None,
-        absgrad: bool = False,
         with_depth: bool = False,
         with_objects: bool = False,
         with_surface_depth: bool = False,
@@ -188,15 +183,15 @@ class SplatModel(nn.Module):
         plain = not (with_surface_depth or self.antialiased or self.max_scale)
         on_road = self._on_road(road, sets)
         projected = projected_sets(sets, seen_from, sh_degree, with_depth, on_road) if plain else None
-        options = {"absgrad": absgrad, "objects": self._rows_of_objects() if with_objects else None}
+        objects = self._rows_of_objects() if with_objects else None
         if projected is not None:
             size = seen_from.width, seen_from.height
-            rendering = rasterize_projected(projected, *size, with_depth=with_depth, **options)
+            rendering = rasterize_projected(projected, *size, with_depth=with_depth, objects=objects)
         else:
             colors, degree = rasterizer_colors(sets, seen_from, sh_degree)
             rendering = rasterize(
                 **self._placed(sets.shapes, seen_from), colors=colors, sh_degree=degree, with_depth=with_depth,
-                with_surface_depth=with_surface_depth, **options,
+                with_surface_depth=with_surface_depth, objects=objects,
             )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
         image = splats
@@ -239,10 +234,8 @@ class SplatModel(nn.Module):
         return self.sets_at(view.time, with_velocities=self.rolling_shutter and view.shutter is not None)
 
     def seen_from(self, view: View) -> View:
-        """The view from its camera's corrected pose, where this model corrects poses, and without rolling shutter,
-        where it renders none."""
-        shown = view if self.rolling_shutter else view.global_shutter
-        return shown if self.camera_poses is None else self.camera_poses.corrected(shown)
+        """The view, without rolling shutter where this model renders none."""
+        return view if self.rolling_shutter else view.global_shutter
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
         """The alpha of the parts with objects alone, for a picture with a set of each part; None without such parts.

@@ -22,7 +22,6 @@ from drivesplat.settings.download import NuscenesMiniSettings
 from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
 from drivesplat.settings.extract import ExtractSettings
-from drivesplat.settings.free_space import FreeSpaceSettings
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.inspection import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.lidar_depth import LidarDepthSettings
@@ -32,6 +31,7 @@ from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, buil
 from drivesplat.settings.names import require_name, suggestion
 from drivesplat.settings.published import PublishedFigures
 from drivesplat.settings.refine_poses import RefinePosesSettings
+from drivesplat.settings.removed import refuse_removed
 from drivesplat.settings.renamed import current_names
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.results_folder import ResultsFolder
@@ -41,7 +41,7 @@ from drivesplat.settings.world import CameraChannel
 
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
-    "lidar_depth", "free_space", "scans", "discover", "masks", "sky", "train", "render", "ghosts", "removal", "export",
+    "lidar_depth", "scans", "discover", "masks", "sky", "train", "render", "ghosts", "removal", "export",
     "device",
 )  # fmt: skip
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
@@ -80,7 +80,6 @@ class Config(Settings):
     lidar_seed: LidarSeedSettings = LidarSeedSettings()
     actors: ActorSeedSettings = ActorSeedSettings()
     lidar_depth: LidarDepthSettings = LidarDepthSettings()
-    free_space: FreeSpaceSettings = FreeSpaceSettings()
     scans: ScanSettings = ScanSettings()
     discover: DiscoverSettings = DiscoverSettings()
     masks: MaskSettings = MaskSettings()
@@ -260,6 +259,7 @@ def load(values: Mapping[str, Any]) -> Config:
             "a result of this workflow is among the config files, where Snakemake takes what follows --configfile: "
             "put -- before the targets, as in --configfile mine.yaml -- results/0103/metrics.json"
         )
+    refuse_removed(values)
     config = validated(Config, in_current_names(values)[0])
     variants = {name: variant for name, variant in config.ablation.without.items() if variant is not None}
     for kind, named, allowed in (
@@ -291,7 +291,8 @@ def _overridden(config: Config, overrides: Mapping[str, Any], where: str) -> Con
 
 
 def require_known(overrides: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
-    """Raises ConfigError where the tree of overrides at `where` sets a key that is not `allowed`."""
+    """Raises ConfigError where the tree of overrides at `where` sets a key that is not `allowed`, or was removed."""
+    refuse_removed(overrides, f"{where}.")
     for key in overrides:
         if key not in allowed:
             raise ConfigError(f"'{where}.{key}' cannot be set there; what can: {', '.join(allowed)}")

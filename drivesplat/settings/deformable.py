@@ -1,7 +1,7 @@
 """Settings of the deformation of people, animals and cyclists."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
@@ -40,7 +40,7 @@ class GaitSettings(Settings):
 
 
 class LatticeSettings(Settings):
-    """field: lattice. Displacements and rotations at the nodes of a lattice in each box."""
+    """Displacements and rotations at the nodes of a lattice in each box."""
 
     nodes: tuple[Nodes, Nodes, Nodes] = (3, 8, 12)
     """Nodes along the length, width and height of the box."""
@@ -57,21 +57,3 @@ class LatticeSettings(Settings):
         """The settings with the weights of means over so many `objects`, in a scene of so many training `views`."""
         weights = {name: getattr(self, name) * objects / max(1, views) for name in ("l2_weight", "smoothness_weight")}
         return self.model_copy(update=weights)
-
-
-class NetworkSettings(Settings):
-    """field: network. One network for all objects, with an embedding for each. Slow without a GPU."""
-
-    layers: int = Field(8, ge=1, le=16)
-    """Number of hidden layers."""
-    width: int = Field(256, ge=8, le=1024)
-    """Values of a hidden layer."""
-    frequencies: int = Field(10, ge=0, le=16)
-    """Frequencies of the encoding of places."""
-    embedding: int = Field(16, ge=1, le=256)
-    """Values of an object's embedding."""
-    learning_rate: float = Field(5e-4, gt=0)
-    """Learning rate of the network and the embeddings."""
-
-
-FieldName = Literal["lattice", "network"]

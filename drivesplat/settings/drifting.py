@@ -45,9 +45,6 @@ class DriftingSettings(Settings):
     seed: DriftingSeedSettings = DriftingSeedSettings()
     min_span: float = Field(0.3, gt=0)
     """Minimum life span (seconds): the standard deviation of opacity over time. Shorter ones show single images."""
-    opacity_weight: float = Field(0.0, ge=0)
-    """Loss weight of the mean opacity of its Gaussians at the time of an image, beside train.opacity_reg. It separates
-    moving from static content, at the cost of PSNR. Where it is too large nothing drifts."""
     lr_means: float = Field(0.01, gt=0)
     """Initial learning rate of positions (metres). It decays as that of all positions does."""
     lr_velocities: float = Field(0.05, gt=0)

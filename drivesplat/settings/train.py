@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, model_validator
 from drivesplat.settings import Settings
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.drifting import DriftingSettings
-from drivesplat.settings.train_cameras import CameraPoseSettings, ExposureSettings
+from drivesplat.settings.train_cameras import ExposureSettings
 from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.settings.train_objects import ActorSettings, DeformableSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
@@ -78,8 +78,6 @@ class McmcSettings(Settings):
     """Opacity below which Gaussians are relocated."""
     refine_every: int = Field(100, ge=1)
     """Iterations between densification steps (relocation and growth)."""
-    growth: float = Field(0.05, ge=0)
-    """Growth factor per densification step: the number of Gaussians grows by this fraction, up to the limit."""
 
 
 class DefaultSettings(Settings):
@@ -89,8 +87,6 @@ class DefaultSettings(Settings):
     """Mean screen-space gradient above which Gaussians are split or duplicated."""
     prune_opacity: float = Field(0.005, gt=0, lt=1)
     """Opacity below which Gaussians are removed."""
-    absgrad: bool = False
-    """Use absolute gradients. Needs a larger grow_grad2d (8e-4 in gsplat's example)."""
     refine_every: int = Field(100, ge=1)
     """Iterations between densifications."""
     reset_every: int = Field(3000, ge=1)
@@ -120,7 +116,6 @@ class TrainSettings(Settings):
     default: DefaultSettings = DefaultSettings()
     floaters: FloaterSettings = FloaterSettings()
     exposure: ExposureSettings = ExposureSettings()
-    camera_poses: CameraPoseSettings = CameraPoseSettings()
     coarse_to_fine: CoarseToFineSettings = CoarseToFineSettings()
     scans: ScanTrainingSettings = ScanTrainingSettings()
     refine_start: float = Field(0.0167, ge=0, le=1)
@@ -162,10 +157,7 @@ class TrainSettings(Settings):
     neighbouring pixels, divided by inverse depth; clipped and down-weighted at edges (docs/off_the_lane.md)."""
     entropy_weight: float = Field(0.005, ge=0)
     """Loss weight of the entropy of the alpha of objects, which favours opaque or absent ones. Only with parts that
-    consist of objects."""
-    entropy_every: int = Field(1, ge=1)
-    """Iterations with an image from one that has this term to the next, which is weighted by their number. Without CUDA
-    kernels objects are rendered alone for it, which takes time."""
+    consist of objects. Without CUDA kernels objects are rendered alone for it, which takes time."""
     dynamic_weight: float = Field(0.1, ge=0)
     """Loss weight of the mean absolute colour difference over the pixels of moving objects. Only with parts that
     consist of objects."""
@@ -216,7 +208,7 @@ class TrainSettings(Settings):
         parts and, without any part that consists of objects, the loss weights of objects."""
         fields = [part for part in MOVING_PARTS if part not in parts]
         if not set(STAGE_OF_PART) & set(parts):
-            fields += ["entropy_weight", "entropy_every", "dynamic_weight"]
+            fields += ["entropy_weight", "dynamic_weight"]
         return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
 
 

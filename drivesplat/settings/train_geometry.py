@@ -11,8 +11,6 @@ class FloaterSettings(Settings):
     radius: float = Field(1.0, ge=0, le=10)
     """Distance from the path of the training cameras (metres) within which Gaussians are faded out: the ego vehicle
     drove there, so the space is empty. 0 = off."""
-    free_space: bool = False
-    """Also fade out Gaussians whose centres lie in space that LiDAR rays prove empty (see `free_space`)."""
     below_road: bool = False
     """Also fade out Gaussians whose centres lie `train.road.reach` to 5 m below the road. Needs `train.road_weight`
     above 0. Leave this off on wet roads, which mirror what is above them."""

@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.deformable import FieldName, GaitSettings, LatticeSettings, NetworkSettings
+from drivesplat.settings.deformable import GaitSettings, LatticeSettings
 
 
 class TrackSettings(Settings):
@@ -40,12 +40,6 @@ class ActorSettings(Settings):
     """Number of Fourier coefficients over time of every colour coefficient. 1 = colours constant in time."""
     box_margin: float = Field(0.1, ge=0, le=2)
     """Gaussians with centres farther than this (metres) outside their box are faded out."""
-    mirrored: float = Field(0.0, ge=0, le=1)
-    """Probability with which an iteration mirrors an object, left for right, so that each side learns from images of
-    the other (docs/measured.md)."""
-    mirrored_images: int = Field(30, ge=1)
-    """Number of training images per camera in which an object is present, up to which `mirrored` applies in full. With
-    more of them the probability falls, to 0 at twice as many: they show both sides, and how these differ."""
     tracks: TrackSettings = TrackSettings()
 
     def for_scene(self, cap: int, objects: int, views: int) -> "ActorSettings":
@@ -67,13 +61,11 @@ class DeformableSettings(ActorSettings):
     mirrored: float = Field(0.5, ge=0, le=1)
     """Probability with which an iteration mirrors an object, left for right and half a cycle later in its gait, so that
     each side learns from images of the other."""
-    field: FieldName = "lattice"
-    """What deforms them."""
-    out_of_box_weight: float = Field(0.0, ge=0)
-    """Loss weight of the mean distance (metres) by which deformed Gaussians leave their box and its margin."""
+    mirrored_images: int = Field(30, ge=1)
+    """Number of training images per camera in which an object is present, up to which `mirrored` applies in full. With
+    more of them the probability falls, to 0 at twice as many: they show both sides, and how these differ."""
     gait: GaitSettings = GaitSettings()
     lattice: LatticeSettings = LatticeSettings()
-    network: NetworkSettings = NetworkSettings()
 
     def for_scene(self, cap: int, objects: int, views: int) -> "ActorSettings":
         lattice = self.lattice.for_scene(objects, views)

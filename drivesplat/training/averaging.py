@@ -31,7 +31,7 @@ class ParameterAverage:
         return cls(int(begin * settings.iterations) + 1, settings.iterations)
 
     @torch.no_grad()
-    def follow(self, step: int, model: SplatModel) -> bool:
+    def update(self, step: int, model: SplatModel) -> bool:
         """To be called after each iteration, `step` of which are done. Writes the mean to the model after the last one;
         returns whether it did."""
         if not self.first <= step <= self.last or (self.last - step) % EVERY:

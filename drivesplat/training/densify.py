@@ -72,16 +72,16 @@ class Densifier:
 def coarse_cap(cap: int, settings: TrainSettings) -> tuple[int, int]:
     """The cap while images are reduced, and the iteration at which it ends at the latest: early enough to grow to the
     full `cap` before densification stops."""
-    fraction, mcmc = settings.coarse_to_fine.fraction, settings.mcmc
-    if settings.strategy != "mcmc" or fraction == 1.0 or mcmc.growth == 0.0:
+    from drivesplat.training.strategies import GROWTH
+
+    fraction, every = settings.coarse_to_fine.fraction, settings.mcmc.refine_every
+    if settings.strategy != "mcmc" or fraction == 1.0:
         return cap, 0
-    steps = math.ceil(-math.log(fraction) / math.log1p(mcmc.growth)) + 1
-    return max(1, int(fraction * cap)), int(settings.refine_stop * settings.iterations) - steps * mcmc.refine_every
+    steps = math.ceil(-math.log(fraction) / math.log1p(GROWTH)) + 1
+    return max(1, int(fraction * cap)), int(settings.refine_stop * settings.iterations) - steps * every
 
 
 def _info_of_rows(info: dict[str, Any], rows: slice) -> dict[str, Any]:
     """The `info` of a rendering for gsplat's DefaultStrategy, of some rows only."""
-    means2d = info["means2d"]
-    gradients = {name: getattr(means2d, name, None) for name in ("grad", "absgrad")}
-    own = {name: values[:, rows] for name, values in gradients.items() if values is not None}
-    return {**info, "means2d": SimpleNamespace(**own), "radii": info["radii"][:, rows]}
+    gradient = info["means2d"].grad
+    return {**info, "means2d": SimpleNamespace(grad=gradient[:, rows]), "radii": info["radii"][:, rows]}

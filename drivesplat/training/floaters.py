@@ -1,5 +1,4 @@
-"""Floaters: Gaussians where nothing is seen, since the ego vehicle drove or LiDAR rays passed through the space, or the
-road hides it."""
+"""Floaters: Gaussians where nothing is seen, since the ego vehicle drove through the space, or the road hides it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -91,25 +90,22 @@ def cells_around(starts: Float[np.ndarray, "m 3"], ends: Float[np.ndarray, "m 3"
 
 @dataclass(frozen=True)
 class EmptySpace:
-    """Space in which nothing is seen: along the `path` of sensors, the cells of `free` in world metres, and below the
-    `road`; each None where it is unknown or not wanted."""
+    """Space in which nothing is seen: along the `path` of sensors, and below the `road`; each None where it is unknown
+    or not wanted."""
 
     path: SensorPath | None = None
-    free: SparseGrid | None = None
     road: Road | None = None
 
     @property
     def known(self) -> bool:
         """Whether any space is known to be empty."""
-        return self.path is not None or self.free is not None or self.road is not None
+        return self.path is not None or self.road is not None
 
     def holds(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """The mask of points in empty space."""
         held = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         if self.path is not None:
             held = held | self.path.holds(points)
-        if self.free is not None:
-            held = held | self.free.lookup(points)[1]
         return held if self.road is None else held | self.road.is_above(points)
 
 
@@ -117,8 +113,7 @@ class EmptySpace:
 def fade_floaters(part: Part, empty: EmptySpace) -> None:
     """Fades the Gaussians of a static part whose centres lie in empty space.
 
-    Only centres count, whatever the size: the centre of a large flat Gaussian lies in the surface it shows. Free space
-    keeps a margin around LiDAR returns, so a centre inside it belongs to no surface.
+    Only centres count, whatever the size: the centre of a large flat Gaussian lies in the surface it shows.
     """
     part.fade(empty.holds(part.params["means"]))
 

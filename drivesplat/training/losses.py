@@ -1,5 +1,7 @@
 """The terms of the training loss, by name, for logs and error messages."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
@@ -9,6 +11,9 @@ from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.constants import constant
 from drivesplat.kernels.depth_error import mean_depth_error
+from drivesplat.kernels.regularizers import mean_thickness
+from drivesplat.kernels.road_distance import Road, road_distance
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import active_fraction
 from drivesplat.model.picture import Picture
 from drivesplat.model.scans import ScanPicture
@@ -56,10 +61,9 @@ def loss_terms(
     logits = model.class_logits(picture, view.view) if view.classes is not None else None
     if logits is not None:
         terms["semantic"] = settings.semantic_weight, class_cross_entropy(logits, view.classes)
-    for name, learned in (("exposure", model.exposure), ("camera_poses", model.camera_poses)):
-        penalty = learned.penalty(view.view.camera) if learned is not None else None
-        if penalty is not None:
-            terms[name] = 1.0, penalty
+    penalty = model.exposure.penalty(view.view.camera) if model.exposure is not None else None
+    if penalty is not None:
+        terms["exposure"] = 1.0, penalty
     return weighted({**terms, **_dynamic_terms(picture, view, model, settings)})
 
 
@@ -86,13 +90,41 @@ def _dynamic_terms(picture: Picture, view: TrainingView, model: SplatModel, sett
     name are added over the parts."""
     terms: Means = {}
     for part in model.parts:
-        for name, penalty in (part.penalties() | part.penalties_at(view.view.time)).items():
+        for name, penalty in part.penalties().items():
             terms[name] = 1.0, terms[name][1] + penalty if name in terms else penalty
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
         seen = alpha if view.ego_mask is None else alpha.masked_fill(view.ego_mask, 1.0)
         terms["entropy"] = settings.entropy_weight, mean_entropy(seen)
     return terms
+
+
+def surface_terms(
+    sets: Sequence[Gaussians],
+    model: SplatModel,
+    road: Road | None,
+    settings: TrainSettings,
+    from_road: Float[Tensor, ""] | None = None,
+) -> dict[str, Float[Tensor, ""]]:
+    """The weighted loss terms of the surfaces of static parts, from the `sets` of Gaussians of all parts at one time.
+    `from_road` is the distance of these sets from the `road`, None where it is not known yet."""
+    if not settings.flatness_weight and road is None:
+        return {}
+    parts = [(part, own) for part, own in zip(model.parts, sets, strict=True) if not part.moves]
+    static = concatenate([own for _, own in parts])
+    terms: Means = {}
+    if settings.flatness_weight:
+        thickness = mean_thickness(static.scales) / active_fraction([part for part, _ in parts])
+        terms["flatness"] = settings.flatness_weight, thickness
+    if road is not None:
+        distance = road_loss(static, road) if from_road is None else from_road
+        terms["road"] = settings.road_weight, distance
+    return weighted(terms)
+
+
+def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
+    """The weighted mean distance in metres of the road's Gaussians from its surface: see `road_distance`."""
+    return road_distance(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, road)
 
 
 def class_cross_entropy(logits: Float[Tensor, "h w c"], classes: UInt8[Tensor, "h w"]) -> Float[Tensor, ""]:

@@ -1,5 +1,5 @@
-"""Mirrored objects: iterations render vehicles and people as their mirror images at random, so that each side learns
-from images of the other, as in AutoSplat (Khan et al. 2024, arXiv 2407.02598)."""
+"""Mirrored people: iterations render people and animals as their mirror images at random, so that each side learns from
+images of the other, as vehicles in AutoSplat (Khan et al. 2024, arXiv 2407.02598)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.model.actors import Actors
+from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.time_states import TimeStates
@@ -18,19 +18,19 @@ from drivesplat.model.view import View
 from drivesplat.scene.motion import HALF_STEP
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
-from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.settings.train_objects import DeformableSettings
 
 
 def choose_mirrored(model: SplatModel, record: TrainingRecord, settings: TrainSettings) -> None:
-    """Sets the probabilities `Part.mirrored` of all objects, for the training images of a scene."""
+    """Sets the probabilities `Part.mirrored` of all objects that deform, for the training images of a scene."""
     for part in model.parts:
-        if isinstance(part, Actors):
-            shares = mirrored_shares(part.timeline.tracks, record, getattr(settings, part.name))
+        if isinstance(part, Deformable):
+            shares = mirrored_shares(part.timeline.tracks, record, settings.deformable)
             part.mirrored = torch.from_numpy(shares).float().to(part.params["means"].device) if shares.any() else None
 
 
 def mirrored_shares(
-    tracks: Sequence[ActorTrack], record: TrainingRecord, settings: ActorSettings
+    tracks: Sequence[ActorTrack], record: TrainingRecord, settings: DeformableSettings
 ) -> Float[np.ndarray, " a"]:
     """The probability with which iterations mirror each object: `mirrored`, or less for one that is present in more
     than `mirrored_images` training images of each camera, in the mean."""

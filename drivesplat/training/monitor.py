@@ -37,14 +37,9 @@ def readable(optimizer: str, model: SplatModel) -> str:
 
 
 def camera_figures(model: SplatModel) -> dict[str, float]:
-    """The learned figures of cameras by name: 'exposure/CAM_BACK/gain_red', 'camera_poses/CAM_FRONT/shift_m'."""
-    learned = {"exposure": model.exposure, "camera_poses": model.camera_poses}
-    return {
-        f"{kind}/{name}": value
-        for kind, module in learned.items()
-        if module is not None
-        for name, value in module.figures().items()
-    }
+    """The learned figures of cameras by name: 'exposure/CAM_BACK/gain_red'."""
+    figures = {} if model.exposure is None else model.exposure.figures()
+    return {f"exposure/{name}": value for name, value in figures.items()}
 
 
 class FiniteGuard:

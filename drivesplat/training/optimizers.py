@@ -15,7 +15,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
 DECAY = 0.01
-"""Final learning rate of what decays (positions, cameras, deformations, ...), and of all that is fine-tuned, as a
+"""Final learning rate of what decays (positions, exposures, deformations, ...), and of all that is fine-tuned, as a
 fraction of the initial rate."""
 FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.5, 6.0
 """Factors of the learning rates at which the fine-tuning of positions, and of all else, begins."""
@@ -54,7 +54,7 @@ Optimizers = dict[str, Adam]
 @dataclass
 class ModelOptimizers:
     """The optimizers of a model: `parts[i]` for the Gaussians of part i, `shared[i]` for its shared parameters,
-    `beside_parts`, by name, for sky, exposure and camera poses."""
+    `beside_parts`, by name, for sky and exposure."""
 
     parts: list[Optimizers]
     shared: list[Optimizers]
@@ -142,7 +142,7 @@ def choose_learned(optimizers: ModelOptimizers, fine_tunes: bool) -> None:
 
 
 def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float, settings: TrainSettings) -> None:
-    """Sets the learning rates after the fraction `done` of the training. Those of cameras and of what parts name in
+    """Sets the learning rates after the fraction `done` of the training. Those of exposures and of what parts name in
     `decaying` decay exponentially, and that of exposures is 0 until they start; the others are constant."""
     decay = DECAY**done
     for part, *groups in zip(model.parts, optimizers.parts, optimizers.shared, strict=True):
@@ -150,11 +150,9 @@ def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: flo
         for group in groups:
             for name in (name for name in part.decaying if name in group):
                 group[name].param_groups[0]["lr"] = rates[name] * decay
-    begins = {"exposure": settings.exposure.start, "camera_poses": 0.0}
-    for name, start in begins.items():
-        for camera, optimizer in optimizers.beside_parts.get(name, {}).items():
-            rate = model.beside_parts[name].learning_rates()[camera] if done >= start else 0.0
-            optimizer.param_groups[0]["lr"] = rate * decay
+    for camera, optimizer in optimizers.beside_parts.get("exposure", {}).items():
+        rate = model.beside_parts["exposure"].learning_rates()[camera] if done >= settings.exposure.start else 0.0
+        optimizer.param_groups[0]["lr"] = rate * decay
 
 
 def set_fine_tuning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float) -> None:

@@ -15,8 +15,8 @@ from drivesplat.errors import TrainingError
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import Provenance, canonical_json, read_record, sha256_text, write_json
 from drivesplat.kernels import triton_support
+from drivesplat.kernels.road_distance import Road
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
-from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.machine.device import choose_device, explain_out_of_memory, flush_denormals
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
@@ -33,14 +33,14 @@ from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.dropout import dropout_share
 from drivesplat.training.exposure_init import initial_gains
-from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
 from drivesplat.training.mirroring import choose_mirrored
+from drivesplat.training.probes import NO_PROBES, Probes
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
+from drivesplat.training.road import road_of
 from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.unseen import fill_unseen
-from drivesplat.training.views import Guides, TrainingView, load_views
-from drivesplat.training.visits import NO_VISITS, Visits
+from drivesplat.training.views import Supervision, TrainingView, load_views
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ class TrainingInputs:
     """The inputs of a training: the training record, the folder of masks (None: there are no images), the records of
     actors and of LiDAR depth (empty where the method does not use them), the number of semantic `classes` in the user's
     maps (0: none), the cameras that see the ego vehicle, `sky_known` (False where no sky was found, so that sky masks
-    say nothing), and the record of free space (None where the method does not use it), and the LiDAR scans of the
-    training split (empty where the method does not render LiDAR)."""
+    say nothing), and the LiDAR scans of the training split (empty where the method does not render LiDAR)."""
 
     record: TrainingRecord
     masks: Path | None
@@ -58,16 +57,15 @@ class TrainingInputs:
     classes: int = 0
     cameras_with_ego: frozenset[str] = frozenset()
     sky_known: bool = True
-    free_space: FreeSpace | None = None
     scans: list[RecordedScan] = dataclasses.field(default_factory=list)
 
-    def guides(self, job: TrainJob) -> Guides:
-        """The guides of the training images that `job` uses."""
+    def supervision(self, job: TrainJob) -> Supervision:
+        """The supervision of the training images that `job` uses."""
         images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         not_sky_wanted = self.masks is not None and not self.sky_known and job.train.horizon_weight
         moving_wanted = self.actors and (job.train.dynamic_weight or job.sky == "cubemap")
-        return Guides(
+        return Supervision(
             sky=_of_each(images, lambda i: read_sky_mask(*self._image(i))) if sky_wanted else {},
             moving=_of_each(images, self._moving) if moving_wanted else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
@@ -114,16 +112,14 @@ def read_inputs(
     masks: Sequence[str],
     actors: Sequence[str],
     lidar_depth: Sequence[str],
-    free_space: Sequence[str],
     scans: Sequence[str] = (),
 ) -> tuple[TrainingInputs, list[Provenance]]:
-    """Reads the inputs of a training from the files of the parser and, where given, of masks, actors, LiDAR depth, free
-    space and scans; returns them with the provenances of these files."""
+    """Reads the inputs of a training from the files of the parser and, where given, of masks, actors, LiDAR depth and
+    scans; returns them with the provenances of these files."""
     record, folder = read_training_record(parser), next((Path(path).parent for path in masks), None)
     made = NO_MASKS if folder is None else read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
-    spaces = [read_free_space(path) for path in free_space]
     revolutions = [read_scans(path) for path in scans]
     inputs = TrainingInputs(
         record,
@@ -133,10 +129,9 @@ def read_inputs(
         made.semantic_classes,
         frozenset(made.own_car),
         made.sky_known,
-        next(iter(spaces), None),
         [scan for it in revolutions for scan in it.of_group("train")],
     )
-    others = (*moving, *depths, *spaces, *revolutions)
+    others = (*moving, *depths, *revolutions)
     upstream = [record.provenance, *([] if folder is None else [made.provenance]), *(it.provenance for it in others)]
     return inputs, upstream
 
@@ -156,12 +151,13 @@ class TrainingFiles:
 
 @dataclass(frozen=True)
 class Prepared:
-    """What the first iteration of a training needs, the images of its PSNR curves, and its LiDAR scans."""
+    """What the first iteration of a training needs, the images of its PSNR curves, and its LiDAR scans. The `road` is
+    on the CPU, None where it is unknown or not wanted."""
 
     model: SplatModel
     views: list[TrainingView]
     settings: TrainSettings
-    priors: GeometryPriors
+    road: Road | None
     curves: CurveViews
     scans: list[TrainingScan]
 
@@ -170,7 +166,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     """Loads the training images onto the device, builds an untrained model, and resolves in the settings what
     depends on the scene."""
     with explain_out_of_memory(lambda: 0):
-        views = load_views(inputs.record, inputs.guides(job), device)
+        views = load_views(inputs.record, inputs.supervision(job), device)
     rays = sum(int(scan.measured.sum()) for scan in inputs.scans)
     record, cap = inputs.record, gaussian_cap(inputs.record, job.train, rays)
     if job.train.scans.per_image:
@@ -185,7 +181,6 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         mean_sky_color(views),
         inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
-        _times_by_camera(views) if job.train.camera_poses.corrected else {},
         initial_echo(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
     )
@@ -198,8 +193,9 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         raise TrainingError("no LiDAR scan is there to train with; set train.scans.per_image to 0")
     model = build_model(init, job.parts, job.sky, settings)
     choose_mirrored(model, record, settings)
-    priors = geometry_priors(inputs.record, inputs.free_space, settings)
-    return Prepared(model, views, settings, priors, curves, scans)
+    known = settings.road_weight and len(record.train_images)
+    road = road_of(inputs.record, settings.road) if known else None
+    return Prepared(model, views, settings, road, curves, scans)
 
 
 def curve_views(
@@ -211,7 +207,7 @@ def curve_views(
         return {}
     record = inputs.record
     held_out = evenly_spaced([int(i) for group in HELD_OUT_GROUPS for i in record.splits.get(group, ())])
-    masks = Guides(sky={}, moving={}, lidar={}, ego_mask=_of_each(inputs.with_ego(held_out), inputs.ego_mask))
+    masks = Supervision(sky={}, moving={}, lidar={}, ego_mask=_of_each(inputs.with_ego(held_out), inputs.ego_mask))
     return {
         "psnr/train": [views[i] for i in evenly_spaced(range(len(views)))],
         "psnr/held_out": load_views(record, masks, device, held_out),
@@ -225,7 +221,7 @@ def run_training(
     files: TrainingFiles,
     provenance: Provenance,
     label: str,
-    visits: Visits = NO_VISITS,
+    probes: Probes = NO_PROBES,
 ) -> None:
     """Trains and writes both files, or raises and writes neither. The resume state is kept after a failure, and where
     the parent process was killed meanwhile: Snakemake did not see this training end and will run it again."""
@@ -242,8 +238,8 @@ def run_training(
         folders = TrainingFolders(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
         model, seed = begun.model, job.random_seed
         summary = train(
-            model, begun.views, begun.settings, seed, device, folders, begun.priors,
-            curves=begun.curves, scans=begun.scans, visits=visits,
+            model, begun.views, begun.settings, seed, device, folders, begun.road,
+            curves=begun.curves, scans=begun.scans, probes=probes,
         )  # fmt: skip
         with explain_out_of_memory(lambda: len(model)):
             fill_unseen(model, begun.views)
@@ -261,14 +257,6 @@ def read_summary(path: str | Path) -> dict[str, Any]:
 def _of_each(images: Sequence[int], read: Callable[[int], np.ndarray]) -> dict[int, np.ndarray]:
     """Reads a value for each image, by its number."""
     return dict(zip(images, prefetch(read, images), strict=True))
-
-
-def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
-    """The increasing times of the training images of every camera, in seconds."""
-    times: dict[str, set[float]] = {}
-    for view in views:
-        times.setdefault(view.view.camera, set()).add(view.view.time)
-    return {camera: sorted(at) for camera, at in sorted(times.items())}
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:

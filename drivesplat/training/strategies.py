@@ -16,6 +16,9 @@ from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.cuda_graph.preallocation import activate, release_rows, reserve_rows
 
+GROWTH = 0.05
+"""Fraction by which the number of Gaussians grows at each densification step of MCMC, up to the limit."""
+
 
 class CappedDefaultStrategy(HookedDefaultStrategy):
     """gsplat's DefaultStrategy with at most `cap_max` Gaussians: beyond, only those with the largest gradients grow.
@@ -45,12 +48,11 @@ class CappedDefaultStrategy(HookedDefaultStrategy):
 
 @dataclass
 class PreallocatingMcmcStrategy(MCMCStrategy):
-    """gsplat's MCMCStrategy for a `part`. It adds noise in one compiled pass and grows by a fraction `growth` at a
-    time. New Gaussians go into preallocated rows where `preallocates`, called whenever there are too few, returns True.
+    """gsplat's MCMCStrategy for a `part`. It adds noise in one compiled pass and grows by a fraction GROWTH at a time.
+    New Gaussians go into preallocated rows where `preallocates`, called whenever there are too few, returns True.
     Unlike gsplat's it does not empty torch's memory cache after every densification."""
 
     part: Part = field(kw_only=True)
-    growth: float = 0.05
     preallocates: Callable[[], bool] = field(kw_only=True)
 
     @torch.no_grad()
@@ -81,7 +83,7 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
     @torch.no_grad()
     def add_new(self, params: Any, optimizers: dict[str, Adam], binoms: Tensor) -> int:
         count = len(self.part)
-        more = max(0, min(self.cap_max, int((1.0 + self.growth) * count)) - count)
+        more = max(0, min(self.cap_max, int((1.0 + GROWTH) * count)) - count)
         if more > self.part.preallocated:
             if self.preallocates():
                 reserve_rows(self.part, optimizers, min(self.cap_max, max(2 * count, count + more)))
@@ -108,14 +110,12 @@ def make_strategy(
             refine_start_iter=start,
             refine_stop_iter=stop,
             refine_every=settings.mcmc.refine_every,
-            growth=settings.mcmc.growth,
             part=part,
             preallocates=preallocates,
         )
     strategy = CappedDefaultStrategy(
         grow_grad2d=settings.default.grow_grad2d,
         prune_opa=settings.default.prune_opacity,
-        absgrad=settings.default.absgrad,
         refine_start_iter=start,
         refine_stop_iter=stop,
         refine_every=settings.default.refine_every,

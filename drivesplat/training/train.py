@@ -14,6 +14,7 @@ import torch
 from drivesplat.errors import TrainingError
 from drivesplat.io import checkpoint_file
 from drivesplat.kernels.cuda_graphs import capture_stream
+from drivesplat.kernels.road_distance import Road
 from drivesplat.machine.device import device_name, explain_out_of_memory
 from drivesplat.model.picture import Picture
 from drivesplat.model.reach import bound_positions, reach_of
@@ -23,13 +24,12 @@ from drivesplat.training import resume_state
 from drivesplat.training.averaging import ParameterAverage
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, SensorPath, fade_in_empty_space
-from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor, camera_figures
+from drivesplat.training.probes import NO_PROBES, Probes
 from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
 from drivesplat.training.scans import TrainingScan
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
-from drivesplat.training.visits import NO_VISITS, Visits
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class TrainingSummary:
 
     `iterations` are those that `train.iterations` counts, and `scan_iterations` those that fitted a LiDAR scan.
     `peak_gpu_memory_gb` is torch's peak reservation, None on the CPU; `seconds` includes the runs before a resume;
-    `of_cameras` are the learned gains, offsets and pose corrections of each camera, by name.
+    `of_cameras` are the learned gains and offsets of each camera, by name.
     """
 
     iterations: int
@@ -83,21 +83,22 @@ def train(
     seed: int,
     device: torch.device,
     folders: TrainingFolders,
-    priors: GeometryPriors = NO_PRIORS,
+    road: Road | None = None,
     clock: Clock = UNTIMED,
     curves: CurveViews = MappingProxyType({}),
     scans: Sequence[TrainingScan] = (),
-    visits: Visits = NO_VISITS,
+    probes: Probes = NO_PROBES,
 ) -> TrainingSummary:
     """Fits `model` in place to `views` and LiDAR `scans`, resuming an interrupted run of the same training; `clock`
-    times its stages. `curves` are the images of PSNR curves in TensorBoard; `visits` see the model during the training.
+    times its stages. `road` is the surface of the road (None: unknown or not wanted). `curves` are the images of PSNR
+    curves in TensorBoard; `probes` see the model during the training.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
-        trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock, scans)
-        run = TrainingRun.begin(trainer, folders, curves, visits)
+        trainer = Trainer.begin(model.to(device), views, settings, seed, device, road, clock, scans)
+        run = TrainingRun.begin(trainer, folders, curves, probes)
         with Monitor(folders.tensorboard, trainer.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
         return run.summary()
@@ -115,11 +116,11 @@ class TrainingRun:
     saved: float
     """When the state was last saved, or else when this run began (`time.monotonic`, as `began`)."""
     curves: CurveViews
-    visits: Visits
+    probes: Probes
     average: ParameterAverage
 
     @classmethod
-    def begin(cls, trainer: Trainer, folders: TrainingFolders, curves: CurveViews, visits: Visits) -> "TrainingRun":
+    def begin(cls, trainer: Trainer, folders: TrainingFolders, curves: CurveViews, probes: Probes) -> "TrainingRun":
         """Resumes from the state in `folders` if this training wrote it; otherwise starts at 0."""
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()
@@ -128,14 +129,14 @@ class TrainingRun:
         saved = resume_state.resumable(folders.state, folders.fingerprint)
         if saved is None:
             shutil.rmtree(folders.tensorboard, ignore_errors=True)
-            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves, visits, average)
+            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves, probes, average)
         resume_state.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
         average.restore(saved["average"], trainer.device)
         log.info("resuming at iteration %d of %d", trainer.step, trainer.iterations)
         now = time.monotonic()
         resumed_at = [*saved["resumed_at"], trainer.step]
-        return cls(trainer, folders, saved["seconds"], resumed_at, now, now, curves, visits, average)
+        return cls(trainer, folders, saved["seconds"], resumed_at, now, now, curves, probes, average)
 
     @property
     def seconds(self) -> float:
@@ -174,15 +175,15 @@ class TrainingRun:
             return {}
         return t.graphs.retry_without_graphs(lambda: curve_psnrs(t.model, self.curves, t.sh_degree()))
 
-    def visit(self) -> None:
-        """Stops for a visit where one is due. The stop does not count as training."""
+    def probe(self) -> None:
+        """Stops for a probe where one is due. The stop does not count as training."""
         t = self.trainer
-        if not self.visits.due(t.step, t.iterations):
+        if not self.probes.due(t.step, t.iterations):
             return
         if t.device.type == "cuda":
             torch.cuda.synchronize(t.device)
         seconds = self.seconds
-        stopped = t.graphs.retry_without_graphs(lambda: self.visits.stop(t.step, seconds, t.model))
+        stopped = t.graphs.retry_without_graphs(lambda: self.probes.stop(t.step, seconds, t.model))
         self.began, self.saved = self.began + stopped, self.saved + stopped
 
     @property
@@ -215,17 +216,17 @@ class TrainingRun:
 def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     sensors = trainer.sensor_positions
-    below = trainer.priors.road if settings.floaters.below_road else None
+    below = trainer.road if settings.floaters.below_road else None
     driven = SensorPath.of(sensors, settings.floaters.radius) if settings.floaters.radius else None
-    empty = EmptySpace(driven, trainer.priors.free, below)
+    empty = EmptySpace(driven, below)
     reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
     while trainer.step < trainer.iterations:
         with trainer.clock.stage(ITERATION):
             with_picture = _due(trainer.step + 1, settings.image_every, settings.iterations)
-            terms, picture, view = trainer.fit_one(with_picture)
+            terms, picture, view = trainer.training_step(with_picture)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
-                if run.average.follow(trainer.step, trainer.model):
+                if run.average.update(trainer.step, trainer.model):
                     _confine(trainer)  # in the mean, Gaussians that were faded meanwhile are visible again
                     fade_in_empty_space(trainer.model.parts, empty)
                 _bound(trainer, reach)
@@ -236,7 +237,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
             if with_picture and picture is not None and view is not None:
                 monitor.image(trainer.step, view, _without_dropout(picture, view, trainer))
             monitor.psnrs(trainer.step, run.psnrs())
-            run.visit()
+            run.probe()
             if run.save_due:
                 run.save()
     run.check()

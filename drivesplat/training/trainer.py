@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.road_distance import Road
 from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.time_states import ScanTimeStates, TimeStates
@@ -24,8 +25,7 @@ from drivesplat.training.cuda_graph.iteration_graphs import (
 from drivesplat.training.cuda_graph.scan_inputs import SharedScanInputs
 from drivesplat.training.densify import Densifier
 from drivesplat.training.dropout import with_dropout
-from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
-from drivesplat.training.losses import loss_terms
+from drivesplat.training.losses import loss_terms, surface_terms
 from drivesplat.training.mirroring import sets_with_mirrored_objects
 from drivesplat.training.monitor import FiniteGuard, readable
 from drivesplat.training.optimizers import (
@@ -56,7 +56,7 @@ class Trainer:
     optimizers: ModelOptimizers
     densifiers: list[Densifier]
     guard: FiniteGuard
-    priors: GeometryPriors
+    road: Road | None
     clock: Clock
     graphs: IterationGraphs
     schedule: DeviceSchedule
@@ -74,14 +74,14 @@ class Trainer:
         settings: TrainSettings,
         seed: int,
         device: torch.device,
-        priors: GeometryPriors = NO_PRIORS,
+        road: Road | None = None,
         clock: Clock = UNTIMED,
         scans: Sequence[TrainingScan] = (),
     ) -> "Trainer":
         torch.manual_seed(seed)
         schedule = ScanSchedule.of(settings, len(views), len(scans))
         settings = settings.model_copy(update={"iterations": schedule.fine_tuning_from})
-        optimizers, known = make_optimizers(model), priors.to(device)
+        optimizers, known = make_optimizers(model), None if road is None else road.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
         capture = clock is UNTIMED and can_capture(settings, images, device, len(scans))
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
@@ -114,7 +114,7 @@ class Trainer:
         """Whether the next iteration fine-tunes what only the LiDAR sees: it fits a scan and changes no image."""
         return self.scan_schedule.fine_tunes(self.step)
 
-    def fit_one(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView | None]:
+    def training_step(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView | None]:
         """The first half of an iteration: render a view or a scan, compare, step. Returns its loss terms, the picture
         and the view, both None after a scan. Without `with_picture` the iteration may be that of a scan or a replayed
         CUDA graph, and the picture is None; without images, and where it fine-tunes, it is that of a scan."""
@@ -124,24 +124,24 @@ class Trainer:
         if self.fits_scan and (self.fine_tunes or not (with_picture and self.images.views)):
             return self._fit_scan(step, rates), None, None
         with self.clock.stage("data"):
-            number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
+            number, view = self.images.number(self._images_done), self.images.at(self.step, self._images_done)
         if with_picture or not self.graphs.enabled:
-            return *self.graphs.retry_without_graphs(lambda: self._learn(view, step, rates)), view
+            return *self.graphs.retry_without_graphs(lambda: self._image_step(view, step, rates)), view
         return self._replay_image(number, view, step, rates), None, view
 
     def _replay_image(
         self, number: int, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
     ) -> Terms:
         """An iteration with an image, by its CUDA graph or the one for all of its shape, where there is one."""
-        factor, shared = self.images.factor(self.step), can_share(self.model, view)
+        factor, shared = self.images.factor(self.step), can_share(view)
         layout = factor, self.sh_degree(), *self._addresses()
         states = self.model.time_states(view.view.time) if shared else None
         if states is None:
-            alone = Recording("image", (factor, number, self._has_entropy))
-            return self._captured(alone, lambda: self._learn(view, step, rates)[0], layout)
+            alone = Recording("image", (factor, number))
+            return self._captured(alone, lambda: self._image_step(view, step, rates)[0], layout)
         inputs = self.graphs.retry_without_graphs(lambda: self.image_inputs.load(view, states))
-        image = Recording("image", (inputs.number, self._has_entropy), self.image_inputs.measured)
-        return self._captured(image, lambda: self._learn(inputs.view, step, rates, inputs.states)[0], layout)
+        image = Recording("image", inputs.number, self.image_inputs.measured)
+        return self._captured(image, lambda: self._image_step(inputs.view, step, rates, inputs.states)[0], layout)
 
     def _fit_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
         """An iteration with the scan whose turn it is, by its CUDA graph where there is one."""
@@ -149,11 +149,11 @@ class Trainer:
         scan = self.scans[number]
         states = self.model.scan_states(scan.view.time) if self.graphs.enabled else None
         if states is None:
-            return self.graphs.retry_without_graphs(lambda: self._learn_scan(scan, None, step, rates))
+            return self.graphs.retry_without_graphs(lambda: self._scan_step(scan, None, step, rates))
         inputs = self.graphs.retry_without_graphs(lambda: self.scan_inputs.load(scan, states))
         recording = Recording("scan", inputs.number, MEASURED_SCANS)
         layout = self.fine_tunes, *self._addresses()
-        return self._captured(recording, lambda: self._learn_scan(inputs.scan, inputs.states, step, rates), layout)
+        return self._captured(recording, lambda: self._scan_step(inputs.scan, inputs.states, step, rates), layout)
 
     def _set_learning_rates(self) -> None:
         if self.fine_tunes:
@@ -169,7 +169,7 @@ class Trainer:
         gaussians = GaussianCount(len(self.model), headroom)
         return self.graphs.run(recording, layout, gaussians, iteration)
 
-    def _learn(
+    def _image_step(
         self,
         view: TrainingView,
         step: int | Tensor,
@@ -188,26 +188,25 @@ class Trainer:
                 view.view,
                 self.sh_degree(),
                 gaussians=sets,
-                absgrad=by_gradient and self.settings.default.absgrad,
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
-                with_objects=self._has_entropy and self.settings.entropy_weight > 0 and not by_gradient,
-                road=self.priors.road,
+                with_objects=self.settings.entropy_weight > 0 and not by_gradient,
+                road=self.road,
             )
         with stage("loss"):
-            terms = loss_terms(picture, view, self.model, self._image_settings())
-            terms |= geometry_terms(picture.sets, self.model, self.priors, self.settings, picture.road_distance)
+            terms = loss_terms(picture, view, self.model, self.settings)
+            terms |= surface_terms(picture.sets, self.model, self.road, self.settings, picture.road_distance)
         if by_gradient:
             picture.info["means2d"].retain_grad()
-        return self._follow(terms, step, rates), picture
+        return self._backward_and_update(terms, step, rates), picture
 
-    def _learn_scan(
+    def _scan_step(
         self,
         scan: TrainingScan,
         states: ScanTimeStates | None,
         step: int | Tensor,
         rates: Mapping[str, Tensor] | None,
     ) -> Terms:
-        """An iteration with a scan, as `_learn`; `states` are those of its time (None: to be looked up)."""
+        """An iteration with a scan, as `_image_step`; `states` are those of its time (None: to be looked up)."""
         stage, settings = self.clock.stage, self.settings.scans
         self.model.zero_grad()
         with stage("render"):
@@ -217,10 +216,10 @@ class Trainer:
         with stage("loss"):
             terms = scan_terms(picture, scan, self.model, self.settings)
             if not self.images.views:
-                terms |= geometry_terms(picture.sets, self.model, self.priors, self.settings)
-        return self._follow(terms, step, rates, self._limit_gradients)
+                terms |= surface_terms(picture.sets, self.model, self.road, self.settings)
+        return self._backward_and_update(terms, step, rates, self._limit_gradients)
 
-    def _follow(
+    def _backward_and_update(
         self,
         terms: Terms,
         step: int | Tensor,
@@ -249,20 +248,9 @@ class Trainer:
             _scale_gradients(geometry, self.settings.scans.geometry)
 
     @property
-    def _image_step(self) -> int:
+    def _images_done(self) -> int:
         """The number of iterations so far that fitted an image."""
         return self.scan_schedule.images_before(self.step)
-
-    @property
-    def _has_entropy(self) -> bool:
-        """Whether an iteration with an image, now, has the term of the entropy of objects. True without objects."""
-        objects = any(part.has_objects for part in self.model.parts)
-        return not objects or self._image_step % self.settings.entropy_every == 0
-
-    def _image_settings(self) -> TrainSettings:
-        """The settings with the weight that the entropy of objects has in an iteration with an image, now."""
-        factor = self.settings.entropy_every if self._has_entropy else 0
-        return self.settings.model_copy(update={"entropy_weight": factor * self.settings.entropy_weight})
 
     def _addresses(self) -> tuple[tuple[int, int], ...]:
         """The addresses and sizes of all parameters. Captured iterations become invalid when they change."""

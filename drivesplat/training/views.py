@@ -48,10 +48,10 @@ class TrainingView:
 
 
 @dataclass(frozen=True)
-class Guides:
+class Supervision:
     """Data of training images beside their pixels, by image number: masks (h, w) bool of `sky`, of what cannot be sky
     (`not_sky`), of `moving` objects and of the ego vehicle (`ego_mask`), `classes` (h, w) uint8, and records of `lidar`
-    (rows, columns, depth). Mappings of unused guides are empty."""
+    (rows, columns, depth). Mappings of unused kinds are empty."""
 
     sky: Mapping[int, np.ndarray]
     moving: Mapping[int, np.ndarray]
@@ -62,7 +62,7 @@ class Guides:
 
 
 def load_views(
-    record: TrainingRecord, guides: Guides, device: torch.device, images: Sequence[int] | None = None
+    record: TrainingRecord, supervision: Supervision, device: torch.device, images: Sequence[int] | None = None
 ) -> list[TrainingView]:
     """The images of a training record, by default those of training, with all masks at training resolution; a camera's
     images share the mask of the ego vehicle."""
@@ -75,10 +75,10 @@ def load_views(
         pixels = torch.from_numpy(image.copy()).to(device)
         sky, not_sky, moving, classes = (
             torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
-            for masks in (guides.sky, guides.not_sky, guides.moving, guides.classes)
+            for masks in (supervision.sky, supervision.not_sky, supervision.moving, supervision.classes)
         )
-        body = guides.ego_mask.get(index)
-        lidar = _lidar_depth(guides.lidar[index], size[0], body, device) if index in guides.lidar else None
+        body = supervision.ego_mask.get(index)
+        lidar = _lidar_depth(supervision.lidar[index], size[0], body, device) if index in supervision.lidar else None
         ego_mask = _shared(body, known_masks, device) if body is not None and body.any() else None
         if not_sky is not None and ego_mask is not None:
             not_sky &= ~ego_mask

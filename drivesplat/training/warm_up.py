@@ -24,7 +24,6 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import RayGrid
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
-from drivesplat.training.geometry_priors import GeometryPriors
 from drivesplat.training.scans import TrainingScan
 from drivesplat.training.train import TrainingFolders, train
 from drivesplat.training.views import TrainingView
@@ -52,7 +51,7 @@ def warm_up(folder: Path) -> None:
     part = Background.from_points(points, colors, settings.gaussians, extent=5.0, echo=(0.0, 0.0))
     model = SplatModel([part], CubemapSky(settings.sky_resolution, torch.full((3,), 0.5), settings.lr_sky))
     folders = TrainingFolders(folder / "resume", folder / "tensorboard", "", "warm-up")
-    train(model, [view], settings, 0, torch.device("cpu"), folders, GeometryPriors(road=_road()), scans=[_scan()])
+    train(model, [view], settings, 0, torch.device("cpu"), folders, _road(), scans=[_scan()])
     model.render(view.view, with_surface_depth=True)
     face_coordinates(torch.ones(2, 2, 3))
     pixel = np.zeros(1, dtype=np.int64)

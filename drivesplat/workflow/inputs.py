@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.regular_file import regular_file
@@ -202,15 +202,11 @@ class Inputs:
         wanted = "discovered" in ([self.tracks(wildcards)] if alone else of_any)
         return [f"{self.config.results_dir}/{wildcards.scene}/discovered.json"] if wanted else []
 
-    def triangulated(self, stage: Literal["lidar_seed", "free_space"]) -> Callable[[Any], list[str]]:
-        """The function of wildcards that gives the points triangulated by pose refinement, if the stage uses them."""
-
-        def points(wildcards: Any) -> list[str]:
-            used = getattr(for_scene(self.config, wildcards.scene), stage).triangulated
-            made = used and refines_poses(self.config, wildcards.scene)
-            return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.npz"] if made else []
-
-        return points
+    def triangulated(self, wildcards: Any) -> list[str]:
+        """The points triangulated by pose refinement, if seeds use them."""
+        used = for_scene(self.config, wildcards.scene).lidar_seed.triangulated
+        made = used and refines_poses(self.config, wildcards.scene)
+        return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.npz"] if made else []
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, if given."""

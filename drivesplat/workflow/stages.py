@@ -17,7 +17,6 @@ from drivesplat.settings.discover import DiscoverJob
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.images import ParserJob
 from drivesplat.settings.inspection import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -56,7 +55,7 @@ OF_ONE_SCENE = (
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
 """The stages of a scene's LiDAR scans, and of the figures that methods which render them have to beat."""
-TRAINING_INPUTS = ("actors", "lidar_depth", "free_space", SCANS)
+TRAINING_INPUTS = ("actors", "lidar_depth", SCANS)
 """Stages of a scene that only some methods train on."""
 
 
@@ -112,7 +111,6 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     taken = {
         "actors": "actors" in stages_of_parts,
         "lidar_depth": train.depth_weight > 0 and has_cameras(config, scene),
-        "free_space": train.floaters.free_space,
         SCANS: train.scans.per_image > 0,
     }
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
@@ -247,7 +245,6 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "regions": (RegionJob, _nothing),
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
     "lidar_depth": (LidarDepthJob, _lidar_depth),
-    "free_space": (FreeSpaceJob, lambda at: _lidar(at, "own_car_radius", "box_margin")),
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),
     "discover": (DiscoverJob, _nothing),

@@ -15,6 +15,7 @@ import pytest
 import yaml
 from helpers import REPOSITORY
 from helpers.hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_evaluation, write_failure
+from helpers.patience import PATIENCE_S
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from benchmarks.quality.__main__ import main, measure

@@ -29,8 +29,8 @@ from benchmarks.speed.table import markdown
 from drivesplat.errors import ConfigError, DeviceError, TrainingError
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.settings.config import load, merged
+from drivesplat.training.probes import NO_PROBES
 from drivesplat.training.run import TrainingFiles, read_inputs, run_training
-from drivesplat.training.visits import NO_VISITS
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -64,8 +64,8 @@ def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_pa
     assert json.loads(run.plan.settings("train")(at)) == task.train.model_dump(mode="json")
     assert (task.code, task.stage) == (run.plan.code("train"), "street-77-seed5/train")
     files = task.files
-    assert [[*paths] for paths in (files.actors, files.lidar_depth, files.free_space, files.scans)] == [
-        run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "free_space", "scans")
+    assert [[*paths] for paths in (files.actors, files.lidar_depth, files.scans)] == [
+        run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "scans")
     ]
     assert {Path(path).name for path in targets_of(run)} == {
         "scene_refined.json", "parser.pkl", "masks.json", "actors.npz", "lidar_depth.npz"
@@ -427,7 +427,7 @@ def test_stops_do_not_count(monkeypatch):
 def test_the_packed_recipe_is_refused_on_a_cpu(tmp_path):
     _, tasks = planned(tmp_path, scene="demo", seeds=[0], iterations=[3], baselines=["plain", "plain_packed"])
     with pytest.raises(DeviceError, match=r"plain_packed: .* needs a GPU; drop it from baselines"):
-        runs.plain(tasks[1], torch.device("cpu"), [], NO_VISITS)
+        runs.plain(tasks[1], torch.device("cpu"), [], NO_PROBES)
 
 
 def test_nothing_is_trained_if_snakemake_fails_or_only_plans(tmp_path, monkeypatch):

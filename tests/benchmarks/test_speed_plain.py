@@ -32,7 +32,7 @@ from benchmarks.speed.plain_training import PlainTraining, _visible, fit
 from drivesplat.io.checkpoint_file import load
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.visits import Visits
+from drivesplat.training.probes import Probes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CPU = torch.device("cpu")
@@ -193,7 +193,7 @@ def test_the_loss_equals_that_of_the_mcmc_example(record):
     """0.8 L1 + 0.2 (1 - SSIM) + 0.01 mean opacity + 0.01 mean scale, for a black background and degree 0."""
     training = begun(record, PlainRecipe(Schedule.of(30_000), 60, 0))
     batch = next(endless(loader_of(images_of(record), 0, CPU)))
-    terms, _ = training.fit_one(iter([batch]))
+    terms, _ = training.training_step(iter([batch]))
     s = {name: value.detach() for name, value in training.splats.items()}
     scales, opacities = torch.exp(s["scales"]), torch.sigmoid(s["opacities"])
     viewmat = torch.linalg.inv(batch["camtoworld"])
@@ -222,7 +222,7 @@ def test_the_learning_rate_of_means_decays_and_the_noise_with_it(record, monkeyp
     data, first = endless(loader_of(images_of(record), 0, CPU)), 1.6e-4 * 1.1 * 0.4
     for step in range(10):
         assert training.optimizers["means"].param_groups[0]["lr"] == pytest.approx(first * 0.01 ** (step / 10))
-        training.learn(training.fit_one(data)[1])
+        training.learn(training.training_step(data)[1])
     assert [step for step, _ in actual] == list(range(10))
     assert [lr for _, lr in actual] == pytest.approx([first * 0.01 ** (step / 10) for step in range(1, 11)])
     assert training.optimizers["scales"].param_groups[0]["lr"] == 5e-3
@@ -268,7 +268,7 @@ def test_visits_see_the_training_and_take_no_time(record, tmp_path, monkeypatch)
     recipe = PlainRecipe(Schedule(40, sh_every=1, refine_start=0, refine_stop=40), 64, 0, workers=0)
     away, clock = [], time.monotonic  # a visit takes an hour
     monkeypatch.setattr(time, "monotonic", lambda: clock() + sum(away))
-    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path, visits=Visits(4, see))
+    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path, visits=Probes(4, see))
     assert [step for step, *_ in seen] == [10, 20, 30, 40]
     assert all(earlier[1] < later[1] for earlier, later in pairwise(seen)) and seen[-1][1] <= summary.seconds
     assert seen[-1][2] < seen[0][2], "it learns between visits"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.demo_worlds import FRONT
 from scipy.ndimage import binary_dilation
 
@@ -9,9 +10,7 @@ from drivesplat.demo.optics.imaging import geometry
 from drivesplat.demo.optics.raycast import RayCaster
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.tokens import instance_token
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.regions import LABELS, MIN_PIXELS, fill, hulls_in, label_image
-from drivesplat.settings.extract import SceneSource
 
 pytestmark = pytest.mark.slow
 
@@ -21,11 +20,7 @@ SIZE = (400, 225)
 
 @pytest.fixture(scope="module")
 def scene(demo_root):
-    source = SceneSource(
-        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None,
-        cameras=("CAM_FRONT",), sweeps=True, on_missing="stop",
-    )  # fmt: skip
-    return extract_scene(source, demo_root)
+    return drives.scene_at(demo_root, dataset="demo", scene="demo")
 
 
 @pytest.fixture(scope="module")

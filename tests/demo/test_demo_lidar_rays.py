@@ -242,14 +242,3 @@ def test_a_wide_beam_returns_another_range_only_at_edges():
     changed[changed] = np.abs(thin.range[changed] - wide.range[changed]) > 0.3
     assert changed.sum() > 0 and not (changed & ~edge & (thin.range < 30.0)).any()
     np.testing.assert_array_equal(thin.range[~edge & (thin.range < 12.0)], wide.range[~edge & (thin.range < 12.0)])
-
-
-def test_surfaces_close_behind_one_another_mix_at_edges_alone():
-    """Nearer than 0.3 m they are one echo: its range lies between them."""
-    thin, wide, edge = edge_scans(0.25, 0.4)
-    ahead = thin.range < 12.0
-    away = np.where(ahead, wide.measured, 0.0) - np.where(ahead, thin.measured, 0.0)
-    away = np.abs(away)
-    mixed = ahead & (away > 0.045)
-    assert mixed.sum() > 10 and not (mixed & ~edge).any()
-    assert away[mixed].max() < 0.25

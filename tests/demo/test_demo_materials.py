@@ -1,4 +1,4 @@
-"""Textures: range of reflectances, filtering by pixel size, reproducibility."""
+"""Textures keep their mean, and lose contrast, as pixels grow. Digests hold their values (test_demo_worlds.py)."""
 
 from itertools import pairwise
 
@@ -9,12 +9,8 @@ from drivesplat.demo.layout import CURB, LANE, ROAD, SIDEWALK
 from drivesplat.demo.optics.materials import facade, ground, surface
 from drivesplat.demo.optics.patterns import (
     coverage,
-    fractal,
     hash_noise,
-    plane_fractal,
-    plane_noise,
     stripes,
-    value_noise,
 )
 from drivesplat.demo.shapes.mesh import BARK, Material
 
@@ -28,11 +24,6 @@ def test_coverage_integrates_to_its_width(low, high, footprint):
     values = np.array([coverage(v, low, high, footprint) for v in x])
     assert values.min() >= 0.0 and values.max() <= 1.0
     assert values.sum() * (x[1] - x[0]) == pytest.approx(high - low, rel=1e-3)
-
-
-def test_coverage_is_one_inside_half_at_its_edge_and_none_outside():
-    values = [coverage(x, 1.0, 2.0, 0.1) for x in (1.5, 1.0, 2.0, 0.9, 2.1)]
-    assert values == pytest.approx([1.0, 0.5, 0.5, 0.0, 0.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("footprint", [0.001, 0.03, 0.4, 3.0])
@@ -52,88 +43,6 @@ def hashed(x: int, y: int, z: int) -> float:
 def test_hash_noise_is_the_same_every_time():
     for place in np.random.default_rng(0).integers(-1000, 1000, (200, 3)).tolist():
         assert hash_noise(*place) == hash_noise(*map(float, place)) == hashed(*place)
-
-
-def test_hash_noise_is_uniform_and_neighbours_differ():
-    cells = np.array([[hash_noise(x, y, 3) for x in range(-40, 40)] for y in range(-40, 40)])
-    assert cells.min() >= 0.0 and cells.max() < 1.0
-    assert cells.mean() == pytest.approx(0.5, abs=0.02) and cells.std() == pytest.approx(12**-0.5, abs=0.02)
-    for a, b in ((cells[1:], cells[:-1]), (cells[:, 1:], cells[:, :-1])):
-        assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.05
-
-
-def test_value_noise_equals_hash_noise_at_integers_and_is_smooth_between():
-    for place in ((2, 3, 4), (-5, 0, 7)):
-        assert value_noise(*map(float, place)) == pytest.approx(hash_noise(*place), abs=1e-9)
-    line = np.array([value_noise(0.01 * i, 0.3, 0.7) for i in range(1000)])
-    assert np.abs(np.diff(line)).max() < 0.02, "smoothstep's slope is at most 1.5"
-    assert line.min() >= 0.0 and line.max() < 1.0
-
-
-def test_plane_noise_is_a_slice_of_value_noise():
-    for x, y in np.random.default_rng(2).uniform(-20, 20, (50, 2)):
-        assert plane_noise(x, y, 4) == pytest.approx(value_noise(x, y, 4.0), abs=1e-9)
-
-
-def spread(footprint: float) -> float:
-    places = np.random.default_rng(0).uniform(0, 50, (3000, 3))
-    return float(np.std([fractal(*place, 1.0, footprint) for place in places]))
-
-
-def test_fractal_noise_fades_as_pixels_grow_larger_than_it():
-    spreads = [spread(footprint) for footprint in (0.001, 0.2, 0.6, 0.9, 1.1)]
-    assert spreads[0] > 0.1
-    assert all(a > b for a, b in pairwise(spreads))
-    assert spreads[-1] == 0.0, "no octave is left"
-
-
-@pytest.mark.parametrize(("noise", "dimensions"), [(fractal, 3), (plane_fractal, 2)])
-def test_fractal_noise_is_centred_and_bounded(noise, dimensions):
-    places = np.random.default_rng(1).uniform(-30, 30, (5000, dimensions))
-    values = np.array([noise(*place, 0.8, 0.01) for place in places])
-    assert abs(values.mean()) < 0.02 and np.abs(values).max() <= 0.875
-
-
-@pytest.mark.parametrize("material", list(Material))
-@pytest.mark.parametrize("footprint", [0.002, 0.1, 2.0])
-def test_reflectances_are_in_range(material, footprint):
-    random = np.random.default_rng(int(material))
-    for _ in range(400):
-        x, y, z = random.uniform((-60, -15, 0), (120, 15, 12))
-        normal = random.normal(size=3)
-        color = random.uniform(0.02, 0.8, 3)
-        r, g, b, mirror, emission = surface(int(material), *color, x, y, z, *normal / np.linalg.norm(normal), footprint)
-        assert min(r, g, b) >= 0.0 and max(r, g, b) <= 1.5
-        assert 0.0 <= mirror <= 1.0 and 0.0 <= emission <= 1.5
-
-
-def test_only_paint_glass_metal_lamps_and_panes_mirror_and_only_lamps_and_panes_emit():
-    found = {
-        material: surface(int(material), 0.3, 0.3, 0.3, 5.3, 2.0, 1.0, 0.0, 0.0, 1.0, 0.01)[3:]
-        for material in Material
-        if material != Material.FACADE
-    }
-    mirrors = {Material.PAINT, Material.GLASS, Material.METAL, Material.LAMP}
-    assert {m for m, (mirror, _) in found.items() if mirror > 0} == mirrors
-    assert found[Material.METAL][0] == 0.5
-    assert {m for m, (_, emission) in found.items() if emission > 0} == {Material.LAMP}
-    pane, wall = (facade(0.3, 0.3, 0.3, 3.2 * u, 3.0 * v, 0.01) for u, v in ((0.3, 0.5), (0.02, 0.05)))  # a shop
-    assert pane[3] == pytest.approx(1.0) and pane[4] > 0
-    assert wall[3] == 0.0 and wall[4] == 0.0
-
-
-def test_road_markings_are_lighter_than_the_road_and_the_curb_than_both_grass_and_road():
-    road = np.mean([ground(x, 1.7, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
-    line = np.mean([ground(x, LANE, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
-    curb = np.mean([ground(x, (ROAD + CURB) / 2, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
-    assert line > 4 * road and curb > 3 * road
-    red, green, blue = np.mean([ground(x, SIDEWALK + 2.5, 0.05) for x in np.arange(0.0, 40.0, 0.13)], axis=0)
-    assert green > red > blue
-
-
-def test_the_middle_line_is_dashed_three_metres_in_six():
-    tones = np.array([ground(x, 0.0, 0.02)[0] for x in np.arange(-24.0, 24.0, 0.05)])
-    assert (tones > 0.3).mean() == pytest.approx(0.5, abs=0.03)
 
 
 def sampled(evaluate, footprint: float, low, high, count: int = 5000) -> np.ndarray:
@@ -158,7 +67,7 @@ def test_near_and_far_ground_have_the_same_mean(low, high, tolerance):
     np.testing.assert_allclose(near, far, rtol=tolerance)
 
 
-@pytest.mark.parametrize("color", WALLS)
+@pytest.mark.parametrize("color", WALLS[:2])
 @pytest.mark.parametrize("floors", [(0.0, 3.0), (3.0, 15.0)], ids=["shops", "windows"])
 def test_near_and_far_facades_have_the_same_mean(color, floors):
     def wall(along, z, footprint):
@@ -197,27 +106,3 @@ def test_contrast_fades_with_the_size_of_a_pixel(evaluate, low, high):
     spreads = [sampled(evaluate, footprint, low, high)[:, 0].std() for footprint in (0.002, 0.03, 0.3, 3.0)]
     assert all(fine >= 0.99 * coarse for fine, coarse in pairwise(spreads))
     assert spreads[-1] < 0.4 * spreads[0]
-
-
-def test_near_asphalt_has_details_of_two_centimetres():
-    x = np.arange(60.0, 62.0, 0.002)
-    near, blurred = (np.array([ground(at, 1.0, footprint)[0] for at in x]) for footprint in (0.002, 0.04))
-    step = np.abs(near[10:] - near[:-10]).mean()
-    assert step > 0.05 * near.mean() and step > 4 * np.abs(blurred[10:] - blurred[:-10]).mean()
-
-
-def test_walls_of_different_colours_differ_in_style():
-    rows = {}
-    for color in WALLS:
-        tones = np.array([facade(*color, 0.3, z, 0.002)[0] for z in np.arange(3.1, 3.8, 0.005)]) / color[0]
-        rows[color] = np.abs(np.diff(tones)).max()
-    assert max(rows.values()) > 0.2, "joints between bricks"
-    assert min(rows.values()) < 0.1, "plaster has none"
-
-
-def test_a_sign_bears_symbols_in_a_contrasting_colour():
-    for color, darker in (((0.04, 0.1, 0.4), False), ((0.8, 0.8, 0.8), True)):
-        tones = [
-            surface(int(Material.SIGN), *color, 0.0, y, 0.0, 1.0, 0.0, 0.0, 0.002)[0] for y in np.arange(0, 3, 0.01)
-        ]
-        assert (min(tones) < 0.5 * color[0]) if darker else (max(tones) > 3 * color[0])

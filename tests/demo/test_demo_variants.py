@@ -50,14 +50,6 @@ def test_the_same_settings_give_the_same_bytes_with_one_worker_and_with_two(tmp_
     assert [name for name in one if one[name] != two[name]] == []
 
 
-@pytest.mark.slow
-def test_another_random_seed_gives_another_street():
-    a, b = (recorder_of(random_seed=s).image(FRONT, 0) for s in (1, 2))
-    again = Recorder(world_of(random_seed=1)).image(FRONT, 0)
-    np.testing.assert_array_equal(a, again)
-    assert (a != b).any(axis=2).mean() > 0.2
-
-
 def test_making_a_world_anew_replaces_the_old_one(tmp_path, still_street):
     root = tmp_path / "again"
     shutil.copytree(still_street, root)
@@ -71,25 +63,19 @@ def test_making_a_world_anew_replaces_the_old_one(tmp_path, still_street):
     assert table(root, "log") != table(still_street, "log"), "what is made from the tables is to be remade"
 
 
-def test_without_moving_objects_no_vehicle_leads(still_street):
+def test_where_nothing_moves_no_vehicle_leads_and_images_are_equal(still_street):
     attributes = {row["token"]: row["name"] for row in table(still_street, "attribute")}
     used = {attributes[token] for row in table(still_street, "sample_annotation") for token in row["attribute_tokens"]}
     assert used == {"vehicle.parked"}
+    poses = {json.dumps([row["translation"], row["rotation"]]) for row in table(still_street, "ego_pose")}
+    assert len(poses) == 1, "the ego vehicle stands"
+    first, last = (np.asarray(Image.open(path)) for path in sorted(still_street.glob("samples/CAM_BACK/*")))
+    np.testing.assert_array_equal(first, last)
     truth = json.loads((still_street / "truth" / "truth.json").read_text())
     assert truth["leading"] is None and not any(view["without"] for view in truth["views"])
     assert {path.name for path in (still_street / "truth").iterdir()} == {"truth.json", "CAM_FRONT"}
     views = {"recorded", "left_2m", "right_2m", "left_4m"}
     assert {path.name for path in (still_street / "truth/CAM_FRONT").iterdir()} == views
-
-
-def test_a_standing_ego_vehicle_has_one_pose(still_street):
-    poses = {json.dumps([row["translation"], row["rotation"]]) for row in table(still_street, "ego_pose")}
-    assert len(poses) == 1
-
-
-def test_images_of_a_static_street_are_equal_at_all_times(still_street):
-    first, last = (np.asarray(Image.open(path)) for path in sorted(still_street.glob("samples/CAM_BACK/*")))
-    np.testing.assert_array_equal(first, last)
 
 
 def test_the_sensors_asked_for_record_between_key_frames(still_street):
@@ -103,13 +89,6 @@ def test_the_sensors_asked_for_record_between_key_frames(still_street):
 @pytest.fixture(scope="module")
 def night() -> Recorder:
     return recorder_of(night=True)
-
-
-def test_night_is_darker_than_day(night):
-    dark, light = night.image(FRONT, 0), recorder_of().image(FRONT, 0)
-    assert dark.mean() < 0.6 * light.mean()
-    assert dark[:20].mean() < 0.4 * light[:20].mean(), "the sky most of all"
-    assert dark.max() > 150, "lamps shine"
 
 
 def without_leading(recorder: Recorder, time_us: int) -> np.ndarray:
@@ -140,11 +119,11 @@ def test_noise_differs_from_image_to_image():
     np.testing.assert_array_equal(night.image(FRONT, 0), night.image(FRONT, 0))
 
 
-@pytest.fixture(scope="module", params=[0, 1, 7])
-def noisy_and_exact(request):
+@pytest.fixture(scope="module")
+def noisy_and_exact():
     """Noisy and exact poses at 12 Hz over a drive of 20 key frames."""
     times = np.arange(0.0, 9.5, 1 / 12)
-    noisy, exact = (recorder_of(pose_noise=noise, random_seed=request.param) for noise in (True, False))
+    noisy, exact = (recorder_of(pose_noise=noise) for noise in (True, False))
     return [np.array([recorder.ego_to_global(float(t)) for t in times]) for recorder in (noisy, exact)]
 
 

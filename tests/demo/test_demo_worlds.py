@@ -7,7 +7,17 @@ import pytest
 from helpers import REPOSITORY
 from helpers.demo_worlds import pose_at
 from helpers.ground_rectangles import meetings
-from helpers.world_digests import DIGESTS, WORLDS, digest, job_of_world, recorder_of_world
+from helpers.world_digests import (
+    DIGESTS,
+    PICTURES,
+    WORLDS,
+    digest,
+    job_of_world,
+    pictures,
+    recorder_of_world,
+    shape_digests,
+    texture_digests,
+)
 from nuscenes.nuscenes import NuScenes
 
 from drivesplat.demo.placed import require_free_places
@@ -16,8 +26,7 @@ from drivesplat.demo.world import make_world
 from drivesplat.readers.truth import read_truth
 from drivesplat.workflow.edits_file import read_edits
 
-pytestmark = pytest.mark.slow
-
+STORED = json.loads(DIGESTS.read_text())
 NAMES = {"day", "dense", "lidar", "night", "slope", "six_cameras"}
 
 
@@ -32,7 +41,7 @@ def recorder(name) -> Recorder:
 
 
 def test_the_worlds_are_those_that_the_documentation_names():
-    assert set(WORLDS) == NAMES == set(json.loads(DIGESTS.read_text()))
+    assert set(WORLDS) == NAMES == set(STORED["streets"])
 
 
 def test_a_world_is_what_its_name_says():
@@ -47,10 +56,12 @@ def test_a_world_is_what_its_name_says():
     assert "CAM_FRONT_LEFT" in worlds["six_cameras"].truth.cameras, "the sixth is held out"
 
 
+@pytest.mark.slow
 def test_objects_do_not_intersect(recorder):
     assert meetings(recorder) == []
 
 
+@pytest.mark.slow
 def test_its_edits_resolve_and_place_nothing_inside_anything(name, recorder):
     path = REPOSITORY / f"benchmarks/worlds/edits/{name}.yaml"
     assert set(recorder.edits) == (set(read_edits(path)) if path.is_file() else set())
@@ -68,12 +79,29 @@ def test_its_edits_resolve_and_place_nothing_inside_anything(name, recorder):
         assert changed or moved.max() > 0.1, f"{edit} changes nothing"
 
 
-def test_its_street_is_the_one_of_the_stored_digest(name, recorder):
-    stored = json.loads(DIGESTS.read_text())[name]
-    assert digest(recorder) == stored, (
-        f"the street of {name} has changed, and with it all results on this world; if that is meant, run "
-        "PYTHONPATH=.:tests python -m helpers.world_digests and measure docs/measured.md anew"
-    )
+HOW_TO = (
+    "have changed, and with them all results on synthetic worlds; if that is meant, run "
+    "PYTHONPATH=.:tests python -m helpers.world_digests and measure docs/measured.md anew"
+)
+
+
+def test_streets_are_those_of_the_stored_digests(name):
+    assert digest(recorder_of_world(name)) == STORED["streets"][name], f"the streets of {name} {HOW_TO}"
+
+
+def test_shapes_and_textures_are_those_of_the_stored_digests():
+    assert (shape_digests(), texture_digests()) == (STORED["shapes"], STORED["textures"]), f"they {HOW_TO}"
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_recordings_are_those_that_are_stored_but_for_rounding(name):
+    """Shading, textures, shadows, haze, noise; classes; returns of each beam. Processors differ in pixels at edges."""
+    found, stored = pictures(name), STORED["pictures"][name]
+    assert found.keys() == stored.keys()
+    for kind, tolerance in (("image", 2), ("classes", 5), ("returns", 5), ("ranges", 5), ("intensities", 3)):
+        off = np.abs(np.subtract(found[kind], stored[kind]))
+        assert np.mean(off <= tolerance) > 0.96, f"{kind} {HOW_TO}"
+        assert kind != "image" or off.max() <= 6, HOW_TO
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import drives
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_street import (
     AHEAD,
@@ -42,7 +43,6 @@ from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.export import DriveJob
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.render import TrajectorySettings
 
@@ -97,10 +97,7 @@ def as_read(folder: Path) -> Scene:
 
 def tables_as_read(folder: Path, name: str) -> Scene:
     cameras = ("CAM_FRONT",)
-    source = SceneSource(
-        dataset="", reader="nuscenes", version=VERSION, scene=name, frames=None, cameras=cameras, sweeps=True,
-        lidar_sweeps=False, on_missing="stop",
-    )  # fmt: skip
+    source = drives.source(dataset="", scene=name, cameras=cameras, lidar_sweeps=False)
     return read(folder / TABLES, source)
 
 

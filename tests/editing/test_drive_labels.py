@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.drives import LIDAR_AT
 from helpers.hand_made import looking_at, motion_through, round_gaussians
 from helpers.hand_made_street import AHEAD, DRIVERS, GONE, KEY, TURNING, checkpoint_of, straight, street_actors
 from helpers.hand_made_street import street_model as model_of
-from helpers.tiny_world import LIDAR_AT
 from nuscenes.nuscenes import NuScenes
 from nuscenes.scripts.export_2d_annotations_as_json import post_process_coords
 from nuscenes.utils.geometry_utils import BoxVisibility, view_points

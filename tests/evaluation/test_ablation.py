@@ -131,7 +131,7 @@ def test_only_methods_with_actors_read_actors_and_only_methods_with_depth_loss_r
     taken = {name: training_inputs(load({}), "0061", name) for name in names(seeds=[1])}
     for name, inputs in taken.items():
         expected = {"actors": "without-actors" not in name, "lidar_depth": "without-depth" not in name}
-        expected |= {"free_space": False, "scans": False}  # asked for by no default
+        expected |= {"scans": False}  # asked for by no default
         assert {stage: stage in inputs for stage in TRAINING_INPUTS} == expected, name
 
 

@@ -4,8 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.small_drives import HELD_OUT
-from helpers.tiny_world import World
+from helpers.drives import HELD_OUT, World
 from PIL import Image
 
 from drivesplat.evaluation.drive_summary import summarize_drive

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
 from helpers.hand_made import looking_at, recording_of, round_gaussians
-from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
 
 from drivesplat.evaluation.image_metrics import evaluate_groups, held_out_depths
 from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, DepthErrors, relative_depth_errors

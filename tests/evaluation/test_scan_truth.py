@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.drives import LIDAR_AT, ORIGIN, seconds_of
 from helpers.hand_made import actors_of, round_gaussians
 from helpers.hand_made_street import AHEAD, DRIVERS, SETTINGS, straight, street_scene
 from helpers.hand_made_street import SPEED as CAR_SPEED
 from helpers.scanned_street import REVOLUTION_S, scan_records
 from helpers.scanned_street import SPEED as EGO_SPEED
-from helpers.small_drives import seconds_of
-from helpers.tiny_world import LIDAR_AT, ORIGIN
 from torch import nn
 
 from drivesplat.errors import ResultError

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, ORIGIN, World, scene_at, seconds_of, true_depths, write_world
 from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
-from helpers.hand_made_truth import LEADING, OFFSETS, aside, write_array, write_truth
+from helpers.hand_made_truth import LEADING, OFFSETS, write_array, write_truth
 from helpers.records import EMPTY_CHECKPOINT, EMPTY_MASKS
-from helpers.small_drives import scene_at, seconds_of, true_depths
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, ORIGIN, World, write_world
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
@@ -299,7 +298,7 @@ def cast_depth(known) -> Callable[[View], np.ndarray]:
 
     @functools.cache
     def cast_from(left: float, number: int) -> np.ndarray:
-        return true_depths(aside(WORLD, left), scene.frames[number])[..., 0]
+        return true_depths(dataclasses.replace(WORLD, left=left), scene.frames[number])[..., 0]
 
     def depth(view: View) -> np.ndarray:
         away = [abs(scene.seconds(frame.timestamp) - view.time) for frame in scene.frames]

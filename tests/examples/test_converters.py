@@ -15,11 +15,12 @@ import numpy as np
 import pyarrow
 import pytest
 from helpers import REPOSITORY
-from helpers.mutations import mutate_file
+from helpers.drives import TILTED_CAMERA, TIMES, World, rays_at, seconds_of, seen_from, turning_world
+from helpers.mutations import CHANCE, fresh, mutate_file
 from helpers.patience import PATIENCE_S
 from helpers.shown_drives import assert_shows, origin_of, require_refused_or_sound, world_points
 from helpers.table_files import time_limit
-from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
+from hypothesis import given, settings
 from PIL import Image
 from pyarrow import feather
 from scipy.spatial.transform import Rotation
@@ -72,18 +73,18 @@ def numbers(values: np.ndarray) -> str:
     return " ".join(f"{value:.12e}" for value in np.ravel(values))
 
 
-def write_calibration(day: Path, drive: TurningDrive) -> dict[str, np.ndarray]:
-    """The three files, such that camera 2 is mounted as CAMERA; returns the matrices of KITTI's readme."""
-    K = drive.world.intrinsics
+def write_calibration(day: Path, drive: World) -> dict[str, np.ndarray]:
+    """The three files, such that camera 2 is mounted as TILTED_CAMERA; returns the matrices of KITTI's readme."""
+    K = drive.intrinsics
     shift = np.array([0.06, -0.001, 0.003])
     rectifying = Rotation.from_euler("xyz", [0.01, -0.015, 0.02]).as_matrix()
-    rectified_to_ego = CAMERA @ rigid(np.eye(3), shift)
+    rectified_to_ego = TILTED_CAMERA @ rigid(np.eye(3), shift)
     velo_to_cam = rigid(rectifying.T, np.zeros(3)) @ inverse(rectified_to_ego) @ VELODYNE
     imu_to_velo = inverse(VELODYNE) @ IMU
     projection = K @ np.column_stack([np.eye(3), shift])
     (day / "calib_cam_to_cam.txt").write_text(
         "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\n"
-        f"S_rect_02: {numbers([drive.world.width, drive.world.height])}\n"
+        f"S_rect_02: {numbers([drive.width, drive.height])}\n"
         f"R_rect_00: {numbers(rectifying)}\nP_rect_02: {numbers(projection)}\n"
     )
     for name, matrix in (("velo_to_cam", velo_to_cam), ("imu_to_velo", imu_to_velo)):
@@ -92,10 +93,10 @@ def write_calibration(day: Path, drive: TurningDrive) -> dict[str, np.ndarray]:
     return {"P": projection, "R": rigid(rectifying, np.zeros(3)), "velo_to_cam": velo_to_cam}
 
 
-def tracklets_xml(drive: TurningDrive) -> str:
+def tracklets_xml(drive: World) -> str:
     """Boxes as boost serializes them: relative to the scanner, standing on their bottom, with a heading."""
     items = []
-    for thing in drive.world.things:
+    for thing in drive.things:
         poses = []
         for time in TIMES:
             box = inverse(drive.ego(time) @ VELODYNE) @ drive.box(thing, time)
@@ -117,7 +118,7 @@ def tracklets_xml(drive: TurningDrive) -> str:
     )
 
 
-def scan(drive: TurningDrive, time: int) -> tuple[np.ndarray, np.ndarray]:
+def scan(drive: World, time: int) -> tuple[np.ndarray, np.ndarray]:
     """A turn of the scanner that looks forward at `time`, clockwise from behind: what it writes, each point as seen at
     its own time, and where the points are in the world; (n, 3) each. Points come ring by ring, each by its azimuth from
     0 to 360 degrees."""
@@ -146,10 +147,10 @@ LOST = 4
 
 
 @pytest.fixture(scope="module")
-def kitti(tmp_path_factory) -> tuple[Path, TurningDrive, dict[str, np.ndarray]]:
+def kitti(tmp_path_factory) -> tuple[Path, World, dict[str, np.ndarray]]:
     """A day of KITTI raw with the drive 0005, of which one scan is lost, with an empty line as its time."""
     day = tmp_path_factory.mktemp("kitti") / "2011_09_26"
-    drive = TurningDrive(rigid(TILT, np.array([3.0, -7.0, 120.0])))
+    drive = turning_world(rigid(TILT, np.array([3.0, -7.0, 120.0])))
     folder = day / "2011_09_26_drive_0005_sync"
     for name in ("image_02/data", "oxts/data", "velodyne_points/data"):
         (folder / name).mkdir(parents=True)
@@ -163,7 +164,9 @@ def kitti(tmp_path_factory) -> tuple[Path, TurningDrive, dict[str, np.ndarray]]:
     (folder / "oxts/timestamps.txt").write_text(lines_of(TIMES + DELAY))
     (folder / "tracklet_labels.xml").write_text(tracklets_xml(drive))
     for i, time in enumerate(TIMES):
-        Image.fromarray(drive.image(time - 1_000)).save(folder / f"image_02/data/{i:010}.png")
+        Image.fromarray(drive.image(seconds_of(time - 1_000), TILTED_CAMERA)).save(
+            folder / f"image_02/data/{i:010}.png"
+        )
         (folder / f"oxts/data/{i:010}.txt").write_text(oxts(drive.ego(time + DELAY) @ IMU) + "\n")
         points, _ = scan(drive, int(time))
         if i != LOST:
@@ -289,16 +292,16 @@ def se3_columns(poses: list[np.ndarray]) -> dict[str, np.ndarray]:
     return columns | dict(zip(("tx_m", "ty_m", "tz_m"), np.array([pose[:3, 3] for pose in poses]).T, strict=True))
 
 
-def av2_hits(drive: TurningDrive, name: str, time: float) -> np.ndarray:
+def av2_hits(drive: World, name: str, time: float) -> np.ndarray:
     rays = np.concatenate([rays_at(azimuth, ELEVATIONS) for azimuth in AZIMUTHS])
     return drive.hits(AV2_LIDARS[name], rays, time)
 
 
 @pytest.fixture(scope="module")
-def argoverse(tmp_path_factory) -> tuple[Path, TurningDrive]:
+def argoverse(tmp_path_factory) -> tuple[Path, World]:
     """A log of Argoverse 2; returns of both LiDARs are in one table, in the ego frame of the sweep's time."""
     log = tmp_path_factory.mktemp("av2") / "01bb304d-7bd8-35f8-bbef-7086b688e35e"
-    drive = TurningDrive(rigid(TILT, np.array([747.4, 1275.3, -24.3])))
+    drive = turning_world(rigid(TILT, np.array([747.4, 1275.3, -24.3])))
 
     def vehicle(time: float) -> np.ndarray:
         """city_SE3_egovehicle"""
@@ -310,27 +313,27 @@ def argoverse(tmp_path_factory) -> tuple[Path, TurningDrive]:
         log / "city_SE3_egovehicle.feather",
         {"timestamp_ns": np.array(times), **se3_columns([vehicle(t / 1000) for t in times])},
     )
-    mounts = {"ring_front_center": CAMERA, **AV2_LIDARS}
+    mounts = {"ring_front_center": TILTED_CAMERA, **AV2_LIDARS}
     write_table(
         log / "calibration/egovehicle_SE3_sensor.feather",
         {"sensor_name": list(mounts), **se3_columns([inverse(EGO_HEIGHT) @ mount for mount in mounts.values()])},
     )
-    K, columns = drive.world.intrinsics, {"fx_px": (0, 0), "fy_px": (1, 1), "cx_px": (0, 2), "cy_px": (1, 2)}
+    K, columns = drive.intrinsics, {"fx_px": (0, 0), "fy_px": (1, 1), "cx_px": (0, 2), "cy_px": (1, 2)}
     write_table(
         log / "calibration/intrinsics.feather",
         {
             "sensor_name": ["ring_front_center", "ring_rear_left"],
             **{name: [K[at], 50.0] for name, at in columns.items()},
             "k1": [-0.27, -0.2], "k2": [-0.21, -0.1], "k3": [0.33, 0.2],
-            "height_px": [drive.world.height, 60], "width_px": [drive.world.width, 80],
+            "height_px": [drive.height, 60], "width_px": [drive.width, 80],
         },
     )  # fmt: skip
     (log / "sensors/cameras/ring_front_center").mkdir(parents=True)
     for time in TIMES:
-        image = Image.fromarray(drive.image(time + AV2_DELAY))
+        image = Image.fromarray(drive.image(seconds_of(time + AV2_DELAY), TILTED_CAMERA))
         image.save(log / f"sensors/cameras/ring_front_center/{(time + AV2_DELAY) * 1000}.jpg", quality=97)
         write_table(log / f"sensors/lidar/{time * 1000}.feather", sweep_table(drive, vehicle(time), time))
-    rows = [(time, thing) for time in TIMES for thing in drive.world.things]
+    rows = [(time, thing) for time in TIMES for thing in drive.things]
     boxes = [inverse(vehicle(time)) @ drive.box(thing, time) for time, thing in rows]
     write_table(
         log / "annotations.feather",
@@ -348,7 +351,7 @@ def argoverse(tmp_path_factory) -> tuple[Path, TurningDrive]:
     return log, drive
 
 
-def sweep_table(drive: TurningDrive, vehicle: np.ndarray, time: float) -> dict[str, np.ndarray]:
+def sweep_table(drive: World, vehicle: np.ndarray, time: float) -> dict[str, np.ndarray]:
     """Returns of both LiDARs, mixed: lasers 0 to 31 are those of the upper one."""
     parts = []
     for first, name in ((0, "up_lidar"), (32, "down_lidar")):
@@ -512,10 +515,6 @@ def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, c
     assert "egovehicle_SE3_sensor.feather cannot be read" in capsys.readouterr().err
 
 
-SEEDS = [range(first, first + 20) for first in range(0, 200, 20)]
-"""200 damaged recordings, each determined by its seed."""
-
-
 def damaged(random: Random, folder: Path) -> str:
     """Damages a file of a recording; each kind of file is as likely as another."""
     kinds: dict[tuple[str, str], list[Path]] = {}
@@ -525,24 +524,24 @@ def damaged(random: Random, folder: Path) -> str:
     return mutate_file(random, random.choice(kinds[random.choice(list(kinds))]))
 
 
-@pytest.mark.parametrize("seeds", SEEDS, ids=str)
-def test_damaged_days_of_kitti_are_refused_in_one_line_or_sound(seeds, kitti, tmp_path, capsys):
-    for seed in seeds:
-        random, day = Random(seed), tmp_path / str(seed) / "2011_09_26"
+@settings(max_examples=200)
+@given(random=CHANCE)
+def test_damaged_days_of_kitti_are_refused_in_one_line_or_sound(kitti, tmp_path, capsys, random):
+    with fresh(tmp_path) as folder:
+        day, out = folder / "2011_09_26", folder / "out"
         shutil.copytree(kitti[0], day, ignore=shutil.ignore_patterns("*[2-5].png", "*[2-5].bin"))
-        done = f"seed {seed}: {damaged(random, day)}"
-        out = day.with_name("out")
-        require_refused_or_sound(lambda day=day, out=out: kitti_raw.main([str(day), "5", str(out)]), out, capsys, done)
+        done = damaged(random, day)
+        require_refused_or_sound(lambda: kitti_raw.main([str(day), "5", str(out)]), out, capsys, done)
 
 
-@pytest.mark.parametrize("seeds", SEEDS, ids=str)
-def test_damaged_logs_of_argoverse2_are_refused_in_one_line_or_sound(seeds, argoverse, tmp_path, capsys):
-    for seed in seeds:
-        random, log = Random(seed), tmp_path / str(seed) / "log"
+@settings(max_examples=200)
+@given(random=CHANCE)
+def test_damaged_logs_of_argoverse2_are_refused_in_one_line_or_sound(argoverse, tmp_path, capsys, random):
+    with fresh(tmp_path) as folder:
+        log, out = folder / "log", folder / "out"
         shutil.copytree(argoverse[0], log, ignore=lambda _, names: sorted(n for n in names if n[0].isdigit())[2:])
-        done = f"seed {seed}: {damaged(random, log)}"
-        out = log.with_name("out")
-        require_refused_or_sound(lambda log=log, out=out: argoverse2.main([str(log), str(out)]), out, capsys, done)
+        done = damaged(random, log)
+        require_refused_or_sound(lambda: argoverse2.main([str(log), str(out)]), out, capsys, done)
 
 
 @pytest.mark.parametrize("name", ["kitti_raw", "argoverse2", "pandaset"])

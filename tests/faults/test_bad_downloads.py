@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from helpers.archive_server import Site, packed, served
-from helpers.tiny_world import World, write_world
+from helpers.drives import World, write_world
 from helpers.workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.errors import DatasetError

@@ -6,7 +6,8 @@ import subprocess
 import pytest
 from helpers import REPOSITORY
 from helpers.forked_snakemake import run_snakemake
-from helpers.killed_runs import VANILLA, only_complaint
+from helpers.killed_runs import only_complaint
+from helpers.shared_runs import VANILLA
 from helpers.workflow_copy import WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("command_lines")]

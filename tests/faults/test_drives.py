@@ -6,8 +6,8 @@ import shutil
 
 import pytest
 import yaml
+from helpers.drives import Thing, World, write_world
 from helpers.small_runs import BASE, run
-from helpers.tiny_world import Thing, World, write_world
 from helpers.workflow_copy import REPOSITORY
 
 from drivesplat.settings.config import load

@@ -21,7 +21,6 @@ from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.point_cloud import read_ply
 from drivesplat.io.storage import read_json
 from drivesplat.lidar.depth_record import read_lidar_depth
-from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.provenance.file_digests import checked_digest, record_output
@@ -56,7 +55,6 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "parser.pkl": (read_training_record, "parser"),
     "actors.npz": (read_actors, "actors"),
     "lidar_depth.npz": (read_lidar_depth, "lidar_depth"),
-    "free_space.npz": (read_free_space, "free_space"),
     "scans.npz": (read_scans, "scans"),
     "triangulated.npz": (read_triangulated, "refine_poses"),
     "checkpoint.npz": (read_checkpoint, "train"),
@@ -172,7 +170,6 @@ def test_no_script_reads_results_but_by_a_reader_that_is_tested():
         "read_training_record",
         "read_actors",
         "read_lidar_depth",
-        "read_free_space",
         "read_scans",
         "read_triangulated",
         "read_summary",

@@ -6,8 +6,9 @@ import subprocess
 from collections.abc import Iterator
 
 import pytest
-from helpers.killed_runs import VANILLA, only_complaint, training_process
+from helpers.killed_runs import only_complaint, training_process
 from helpers.patience import PATIENCE_S, wait_until
+from helpers.shared_runs import VANILLA
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("killed")]

@@ -13,9 +13,10 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
-from helpers.killed_runs import VANILLA, only_complaint, training_process
+from helpers.drives import World
+from helpers.killed_runs import only_complaint, training_process
 from helpers.patience import PATIENCE_S, wait_until
-from helpers.tiny_world import World
+from helpers.shared_runs import EDITS, TWO_METHODS, VANILLA
 from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
@@ -30,9 +31,6 @@ def untouched(tmp_path_factory) -> WorkflowCopy:
 @pytest.fixture
 def copy(untouched, tmp_path) -> WorkflowCopy:
     return untouched.again(tmp_path / "workflow")
-
-
-TWO_METHODS = {**VANILLA, "street": {"parts": ["background", "actors"]}}
 
 
 def with_edits(copy: WorkflowCopy, text: str) -> WorkflowCopy:
@@ -88,11 +86,6 @@ def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy, ta
     assert not (copy.folder / "results/0001").exists()
 
 
-EDITS = (
-    "edits:\n  stop:\n    - stop: {track: 0001 instance 0, at: 2}\n  gone:\n    - remove: {track: 0001 instance 0}\n"
-)
-
-
 @pytest.mark.parametrize(
     ("target", "words"),
     [
@@ -102,21 +95,21 @@ EDITS = (
         ),
         pytest.param(
             "street/edits/halt.mp4",
-            ["no edit called 'halt'", "there are: stop, gone", "datasets.<name>.edits"],
+            ["no edit called 'halt'", "there are: gone, stop", "datasets.<name>.edits"],
             marks=pytest.mark.slow,
         ),
         pytest.param(
             "vanilla/quad/stop.mp4", ["'vanilla' knows no actors", "those do: street"], marks=pytest.mark.slow
         ),
         pytest.param(
-            "street/quad/halt.mp4", ["no edit called 'halt'", "there are: stop, gone"], marks=pytest.mark.slow
+            "street/quad/halt.mp4", ["no edit called 'halt'", "there are: gone, stop"], marks=pytest.mark.slow
         ),
         pytest.param(
-            "street/edits/halt.json", ["no edit called 'halt'", "there are: stop, gone"], marks=pytest.mark.slow
+            "street/edits/halt.json", ["no edit called 'halt'", "there are: gone, stop"], marks=pytest.mark.slow
         ),
         pytest.param(
             "street/edits/halt/drive/drive.json",
-            ["no edit called 'halt'", "there are: stop, gone"],
+            ["no edit called 'halt'", "there are: gone, stop"],
             marks=pytest.mark.slow,
         ),
         pytest.param(
@@ -159,7 +152,7 @@ def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, targ
 @pytest.mark.parametrize(
     ("broken", "target", "words"),
     [
-        (EDITS.replace("at: 2", "at: soon"), (), ["edit 'stop', step 1 (stop)", "'at' is 'soon'"]),
+        (EDITS.replace("at: 2", "at: soon"), (), ["edit 'stop', step 2 (stop)", "'at' is 'soon'"]),
         (EDITS.replace("- remove", "- vanish"), ("edits/stop.mp4",), ["edit 'gone', step 1", "no step 'vanish'"]),
         (EDITS.replace("edits:", "edits"), ("train.json",), ["not YAML"]),
         (None, ("edits/stop.mp4",), ["cannot be read"]),
@@ -296,12 +289,17 @@ FFMPEG_THAT_DIES = "#!/bin/sh\nhead -c 10000 > /dev/null\necho 'x264: no space f
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> WorkflowCopy:
-    """Two finished trainings, to be looked at."""
-    training = TINY_TRAINING | {"iterations": 20}
-    copy = WorkflowCopy.make(tmp_path_factory.mktemp("trained"), methods=TWO_METHODS, train=training)
-    done = with_edits(copy, EDITS).run(*(f"results/0001/{method}/train.json" for method in TWO_METHODS))
-    assert done.returncode == 0, done.stdout
+def trained(finished_run, tmp_path_factory) -> WorkflowCopy:
+    """Two finished trainings without what is made from them, to be looked at."""
+    copy = finished_run.again(tmp_path_factory.mktemp("trained") / "workflow")
+    for method in TWO_METHODS:
+        for path in (copy.folder / "results/0001" / method).iterdir():
+            if path.name not in ("train.json", "checkpoint.npz", "tensorboard", ".digests"):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in (copy.folder / "results/0001" / method / ".digests").iterdir():
+            if path.stem not in ("train.json", "checkpoint.npz"):
+                path.unlink()
+    assert copy.planned(*(f"results/0001/{method}/train.json" for method in TWO_METHODS)) == {}
     return copy
 
 
@@ -412,11 +410,11 @@ import torch
 from drivesplat.training.trainer import Trainer
 
 
-def fit_one(self, shown=True):
+def training_step(self, shown=True):
     raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
 
-Trainer.fit_one = fit_one
+Trainer.training_step = training_step
 """
 
 

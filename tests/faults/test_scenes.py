@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from helpers.tiny_world import World
+from helpers.drives import World
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("scenes")]

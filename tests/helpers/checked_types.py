@@ -1,17 +1,62 @@
-"""The checks of types and shapes that the tests switch on, made once for each nested function."""
+"""The checks of types and shapes that the tests switch on: of the first calls of a function in each test, and made once
+for each nested function."""
 
 from collections.abc import Callable
+from functools import wraps
+from types import FunctionType
 from typing import Any
 
+import jaxtyping
 from beartype import beartype
-from jaxtyping import install_import_hook
 
+CHECKED_CALLS = 25
+"""Of each function in each test. Further calls, which are those of loops, would take a third of the suite's time."""
 _CHECKED: dict[tuple, Callable[..., Any]] = {}
+_calls: dict[int, int] = {}
+"""The calls in this test, by the id of the function's code, which nested functions share."""
 
 
 def check_types_of(package: str) -> None:
     """Checks arguments and results of all functions of a package that is not imported yet."""
-    install_import_hook(package, f"{__name__}.{checked.__name__}")
+    jaxtyping.install_import_hook(package, f"{__name__}.{checked.__name__}")
+    jaxtyping.jaxtyped = _in_first_calls(jaxtyping.jaxtyped)
+
+
+def begin_test() -> None:
+    """Calls count from here."""
+    _calls.clear()
+
+
+def _in_first_calls(jaxtyped: Callable) -> Callable:
+    """jaxtyping's decorator, whose functions check their first calls. Others have letters of their own for lengths:
+    the library compares fields of records with such types, too."""
+    own_letters = jaxtyped("context")
+
+    def decorator(function: Any = None, *, typechecker: Any = None) -> Any:
+        if function is not None:
+            return jaxtyped(function, typechecker=typechecker)
+        return lambda found: decorate(found, typechecker)
+
+    def decorate(function: Any, typechecker: Any) -> Any:
+        if not isinstance(function, FunctionType):
+            return jaxtyped(function, typechecker=typechecker)
+        code, whole = id(function.__code__), None
+
+        @wraps(function)
+        def called(*args: Any, **kwargs: Any) -> Any:
+            nonlocal whole
+            __tracebackhide__ = True
+            count = _calls.get(code, 0)
+            if count >= CHECKED_CALLS:
+                with own_letters:
+                    return function(*args, **kwargs)
+            _calls[code] = count + 1
+            whole = whole or jaxtyped(function, typechecker=typechecker)
+            return whole(*args, **kwargs)
+
+        return called
+
+    return decorator
 
 
 def checked(signature: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,6 +1,6 @@
 """The truth of a tiny world, cast ray by ray: recorded views, views from beside the path, and without the car ahead."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,27 +9,12 @@ from PIL import Image
 from drivesplat.readers.truth import TRUTH_FILE, Truth, TruthFrame, TruthView, write_truth_file
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene
-from helpers.small_drives import seconds_of, true_depths
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, ORIGIN, World, cast_image
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, ORIGIN, World, seconds_of, true_depths
 
 LEADING = "0001 instance 0"
 """The car ahead, the first thing of a tiny world."""
 OFFSETS = (2.0, -2.0, 4.0)
 UNMADE = "not made.png"
-
-
-@dataclass
-class Aside(World):
-    """A world seen from `left` metres to the left of the path."""
-
-    left: float = 0.0
-
-    def ego_at(self, seconds: float) -> np.ndarray:
-        return super().ego_at(seconds) + np.array([0.0, self.left, 0.0])
-
-
-def aside(world: World, left: float) -> Aside:
-    return Aside(**vars(world), left=left)
 
 
 def write_truth(root: Path, world: World, scene: Scene) -> Path:
@@ -38,8 +23,8 @@ def write_truth(root: Path, world: World, scene: Scene) -> Path:
     Images of instances and classes are not made, nor those of a view of an edited drive and of one by another camera.
     """
     empty = replace(world, things=world.things[1:])
-    views = [_view(root, aside(world, left), scene, f"lateral {left}") for left in (0.0, *OFFSETS)]
-    views.append(replace(_view(root, aside(empty, 0.0), scene, "empty"), without=LEADING))
+    views = [_view(root, replace(world, left=left), scene, f"lateral {left}") for left in (0.0, *OFFSETS)]
+    views.append(replace(_view(root, empty, scene, "empty"), without=LEADING))
     recorded = views[0]
     views.append(replace(recorded, left_m=2.0, edit="stop", frames=tuple(map(_unmade, recorded.frames))))
     others = tuple(replace(_unmade(frame), token=f"back {frame.key_frame}") for frame in recorded.frames)
@@ -57,15 +42,15 @@ def _unmade(frame: TruthFrame) -> TruthFrame:
     return replace(frame, image=UNMADE, depth=UNMADE)
 
 
-def _view(root: Path, world: Aside, scene: Scene, folder: str) -> TruthView:
+def _view(root: Path, world: World, scene: Scene, folder: str) -> TruthView:
     frames = [frame for frame in scene.frames if frame.is_key_frame]
     return TruthView("CAM_FRONT", world.left, None, None, tuple(_frame(root, world, frame, folder) for frame in frames))
 
 
-def _frame(root: Path, world: Aside, frame: Frame, folder: str) -> TruthFrame:
+def _frame(root: Path, world: World, frame: Frame, folder: str) -> TruthFrame:
     image, depth = (f"{folder}/{kind}/{frame.sample_index:04}.png" for kind in ("image", "depth"))
     seconds = seconds_of(frame.timestamp)
-    write_array(root / "truth" / image, cast_image(world, seconds))
+    write_array(root / "truth" / image, world.image(seconds))
     write_array(root / "truth" / depth, depth_values(true_depths(world, frame)[..., 0]))
     pose = rigid(CAMERA_TO_EGO, ORIGIN + world.ego_at(seconds) + CAMERA_AT)
     return TruthFrame(frame.token, frame.sample_index, pose.tolist(), image, depth, UNMADE, UNMADE)

@@ -15,9 +15,6 @@ def only_complaint(done: subprocess.CompletedProcess) -> str:
     return lines.pop()
 
 
-VANILLA = {"vanilla": {}}
-
-
 def training_process(copy: WorkflowCopy) -> int | None:
     """The process id of the running train.py of this copy."""
     for entry in Path("/proc").iterdir():

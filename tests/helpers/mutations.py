@@ -1,13 +1,21 @@
-"""Random damage to the files of a dataset: JSON tables, and files of bytes. The generator's seed determines it."""
+"""Damage to the files of a dataset, chosen by hypothesis: JSON tables, texts, packed files and files of bytes."""
 
 import gzip
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from random import Random
+from tempfile import TemporaryDirectory
 from typing import Any
+
+from hypothesis import strategies as st
+
+CHANCE = st.randoms(use_true_random=False)
+"""A generator whose every choice is hypothesis' own, so that it shortens damage that a test finds."""
 
 JUNK: list[Any] = [
     None, True, False, 0, 1, -1, 2**31, 2**63, -(2**63) - 1, 10**30, 10**400, 0.5, -0.0, 1e-300, 1e300, math.nan,
@@ -18,13 +26,48 @@ JUNK: list[Any] = [
 Rows = list[dict[str, Any]]
 
 
+@contextmanager
+def fresh(parent: Path) -> Iterator[Path]:
+    """An empty folder in `parent` for one example, removed afterwards."""
+    with TemporaryDirectory(dir=parent) as name:
+        yield Path(name)
+
+
+def likely(random: Random, tenths: int) -> bool:
+    """True in so many of ten cases."""
+    return random.randrange(10) < tenths
+
+
+def some_bytes(random: Random, size: int) -> bytes:
+    """Arbitrary bytes, of which hypothesis chooses the seed alone."""
+    return Random(random.getrandbits(32)).randbytes(size)
+
+
+def mutate_json(random: Random, content: Any, inwards: int = 8) -> Any:
+    """A copy of a JSON object with a value at some place replaced, removed or repeated; `inwards` of ten steps lead on
+    to a value within."""
+    changed = deepcopy(content)
+    holder, key = changed, random.choice(list(changed))
+    while isinstance(holder[key], dict | list) and holder[key] and likely(random, inwards):
+        holder = holder[key]
+        key = random.choice(list(holder)) if isinstance(holder, dict) else random.randrange(len(holder))
+    kind = random.randrange(4)
+    if kind == 0:
+        del holder[key]
+    elif kind == 1 and isinstance(holder, list):
+        holder.append(deepcopy(holder[key]))
+    else:
+        holder[key] = deepcopy(random.choice([*JUNK, 3, 2**80, -(2**80), "9" * 5000]))
+    return changed
+
+
 def _leaf(random: Random, row: dict[str, Any]) -> tuple[Any, Any]:
     """A random place within a row: its container and its key or index."""
     container: Any = row
     key: Any = random.choice(list(row)) if row else "token"
     while isinstance(container.get(key) if isinstance(container, dict) else container[key], list):
         inner = container[key]
-        if not inner or random.random() < 0.3:
+        if not inner or likely(random, 3):
             break
         container, key = inner, random.randrange(len(inner))
     return container, key
@@ -61,7 +104,7 @@ def resize_a_list(random: Random, rows: Rows) -> None:
     lists = [key for key, value in row.items() if isinstance(value, list) and value]
     if lists:
         value = row[random.choice(lists)]
-        value.append(value[0]) if random.random() < 0.5 else value.pop()
+        value.append(value[0]) if likely(random, 5) else value.pop()
 
 
 def delete_a_column(random: Random, rows: Rows) -> None:
@@ -77,7 +120,7 @@ def delete_a_row(random: Random, rows: Rows) -> None:
 def repeat_a_row(random: Random, rows: Rows) -> None:
     """With the same token, or with a new one."""
     row = json.loads(json.dumps(random.choice(rows)))
-    if random.random() < 0.5:
+    if likely(random, 5):
         row["token"] = "another"
     rows.insert(random.randrange(len(rows) + 1), row)
 
@@ -110,7 +153,7 @@ ROW_MUTATIONS: list[Callable[[Random, Rows], None]] = [
 
 def mutate_table(random: Random, path: Path) -> str:
     """Damages a table in place; returns what was done."""
-    if random.random() < 0.15:
+    if random.randrange(7) == 0:
         return f"{path.name}: {mutate_text(random, path)}"
     rows, done = json.loads(path.read_text()), []
     for _ in range(random.choice([1, 1, 2])):
@@ -132,7 +175,7 @@ def mutate_text(random: Random, path: Path) -> str:
     elif kind == "deep":
         deep = "[" * 200_000 + "]" * 200_000
         path.write_text(
-            text.replace("[", deep, 1) if random.random() < 0.5 else text.replace('": ', f'": {deep}, "x": ', 1)
+            text.replace("[", deep, 1) if likely(random, 5) else text.replace('": ', f'": {deep}, "x": ', 1)
         )
     else:
         flip_bytes(random, path)
@@ -154,7 +197,7 @@ def mutate_bytes(random: Random, path: Path) -> str:
     if kind == "cut":
         path.write_bytes(path.read_bytes()[: random.randrange(size)])
     elif kind == "random":
-        path.write_bytes(random.randbytes(size))
+        path.write_bytes(some_bytes(random, size))
     elif kind == "flip":
         flip_bytes(random, path)
     else:
@@ -163,23 +206,8 @@ def mutate_bytes(random: Random, path: Path) -> str:
 
 
 WORDS = [
-    "nan",
-    "inf",
-    "-1",
-    "0",
-    "1e300",
-    "1e30",
-    "99999999999999999999",
-    "x",
-    "",
-    "\0",
-    "ä",
-    "null",
-    "{",
-    "]",
-    "<a>",
-    "'",
-]
+    "nan", "inf", "-1", "0", "1e300", "1e30", "99999999999999999999", "x", "", "\0", "ä", "null", "{", "]", "<a>", "'",
+]  # fmt: skip
 
 
 def mutate_words(random: Random, path: Path) -> str:
@@ -208,9 +236,9 @@ def mutate_words(random: Random, path: Path) -> str:
 
 def mutate_file(random: Random, path: Path) -> str:
     """Damages a file as what it is: a text, a packed file, or bytes; returns what was done."""
-    if path.suffix in (".txt", ".json", ".xml") and random.random() < 0.7:
+    if path.suffix in (".txt", ".json", ".xml") and likely(random, 7):
         return mutate_words(random, path)
-    if path.suffix == ".gz" and random.random() < 0.8:
+    if path.suffix == ".gz" and likely(random, 8):
         path.write_bytes(gzip.decompress(path.read_bytes()))
         done = mutate_bytes(random, path)
         path.write_bytes(gzip.compress(path.read_bytes(), 1))

@@ -12,17 +12,17 @@ from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.images import read_image
 from drivesplat.scene.rigid import apply, rigid
 from drivesplat.scene.scene import Scene
+from helpers.drives import TILTED_CAMERA, TIMES, World, seconds_of
 from helpers.table_files import time_limit
-from helpers.turning_drive import CAMERA, TIMES, TurningDrive
 
 
-def origin_of(scene: Scene, drive: TurningDrive) -> np.ndarray:
+def origin_of(scene: Scene, drive: World) -> np.ndarray:
     """The scene's origin in the drive's world, by the first image."""
     first = scene.frames[0]
     return drive.ego(first.timestamp)[:3, 3] - first.ego_to_world[:3, 3]
 
 
-def assert_shows(scene: Scene, drive: TurningDrive, delay: int, lidars: dict[str, np.ndarray], atol: float) -> None:
+def assert_shows(scene: Scene, drive: World, delay: int, lidars: dict[str, np.ndarray], atol: float) -> None:
     """Poses, calibration, images and boxes of a scene are those of a drive whose images are `delay` microseconds after
     its key frames, up to the origin, which is near the first ego position."""
     origin = origin_of(scene, drive)
@@ -33,24 +33,24 @@ def assert_shows(scene: Scene, drive: TurningDrive, delay: int, lidars: dict[str
 
     assert [frame.timestamp for frame in scene.frames] == (TIMES + delay).tolist()
     for frame in scene.frames:
-        np.testing.assert_allclose(frame.intrinsics, drive.world.intrinsics, atol=1e-9)
+        np.testing.assert_allclose(frame.intrinsics, drive.intrinsics, atol=1e-9)
         np.testing.assert_allclose(frame.ego_to_world, here(drive.ego(frame.timestamp)), atol=atol)
-        np.testing.assert_allclose(frame.camera_to_world, here(drive.ego(frame.timestamp) @ CAMERA), atol=atol)
-        expected = drive.image(frame.timestamp)
+        np.testing.assert_allclose(frame.camera_to_world, here(drive.ego(frame.timestamp) @ TILTED_CAMERA), atol=atol)
+        expected = drive.image(seconds_of(frame.timestamp), TILTED_CAMERA)
         assert np.abs(read_image(frame.image_path).astype(int) - expected).mean() < 3.0
     for sweep in scene.sweeps:
         np.testing.assert_allclose(
             sweep.sensor_to_world, here(drive.ego(sweep.timestamp) @ lidars[sweep.lidar]), atol=atol
         )
-    assert len(scene.tracks) == len(drive.world.things)
-    for track, thing in zip(scene.tracks, drive.world.things, strict=True):
+    assert len(scene.tracks) == len(drive.things)
+    for track, thing in zip(scene.tracks, drive.things, strict=True):
         np.testing.assert_allclose(track.size, thing.size, atol=1e-6)
         assert len(track.timestamps) >= 5
         for time, box in zip(track.timestamps, track.object_to_world, strict=True):
             np.testing.assert_allclose(box, here(drive.box(thing, time)), atol=atol)
 
 
-def world_points(scene: Scene, number: int, drive: TurningDrive) -> np.ndarray:
+def world_points(scene: Scene, number: int, drive: World) -> np.ndarray:
     """The returns of a sweep in the drive's world."""
     sweep = scene.sweeps[number]
     return apply(sweep.sensor_to_world, read_returns(sweep).points) + origin_of(scene, drive)

@@ -9,10 +9,8 @@ from pathlib import Path
 
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.extract import SceneSource
+from helpers.drives import VERSION, source
 from helpers.patience import PATIENCE_S
-
-VERSION = "v1.0-mini"
 
 
 class Hang(BaseException):
@@ -59,9 +57,5 @@ def row(rows: list[dict], token: str) -> dict:
 
 def extracted(root: Path, **changes) -> Scene:
     """Scene 0001 with its images and sweeps between key frames. Raises Hang where it does not end."""
-    plain = {
-        "dataset": "tiny", "reader": "nuscenes", "version": VERSION, "scene": "0001", "frames": None,
-        "cameras": ("CAM_FRONT",), "sweeps": True, "lidar_sweeps": True, "on_missing": "stop",
-    }  # fmt: skip
     with time_limit():
-        return extract_scene(SceneSource(**{**plain, **changes}), root)
+        return extract_scene(source(**{"lidar_sweeps": True, **changes}), root)

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scene import Scene
-from helpers.small_drives import scene_at, seconds_of
-from helpers.tiny_world import CAMERA_AT, LIDAR_AT, World, cast
+from helpers.drives import CAMERA_AT, LIDAR_AT, World, cast, scene_at, seconds_of
 
 NAME = "1234567890123456789_100_000_120_000"
 TYPES = {

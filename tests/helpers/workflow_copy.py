@@ -16,8 +16,8 @@ from typing import Any
 import yaml
 
 from helpers import REPOSITORY
+from helpers.drives import World, write_world
 from helpers.forked_snakemake import run_snakemake
-from helpers.tiny_world import World, write_world
 
 PARTS = (
     "Snakefile",

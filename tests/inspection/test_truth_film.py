@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.drives import World, scene_at, write_world
 from helpers.hand_made import recording_of
 from helpers.hand_made_street import Reels, checkpoint_of, street_model
 from helpers.hand_made_truth import write_truth
-from helpers.small_drives import scene_at
-from helpers.tiny_world import World, write_world
 
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.synthetic import DriveTruth

@@ -491,7 +491,7 @@ def test_a_training_with_triton_agrees_with_one_without(body, monkeypatch):
         before = {name: value.clone() for name, value in model.state_dict().items()}
         trainer = Trainer.begin(model.to(DEVICE), views, settings, 0, DEVICE)
         for _ in range(2):
-            terms, picture, _ = trainer.fit_one()
+            terms, picture, _ = trainer.training_step()
             trainer.densify(picture)
         ends.append((terms, model.state_dict()))
     (terms, mine), (their_terms, theirs) = ends

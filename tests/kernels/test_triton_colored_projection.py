@@ -24,7 +24,7 @@ from drivesplat.kernels.view_colors import view_colors
 from drivesplat.model.view import RollingShutter
 from drivesplat.rasterization import rasterize_projected
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.geometry_priors import GeometryPriors, geometry_terms
+from drivesplat.training.losses import surface_terms
 
 WIDTH, HEIGHT = 64, 48
 
@@ -199,7 +199,7 @@ def test_pictures_of_a_model_and_their_gradients_are_those_of_separate_kernels(m
     assert [picture.road_distance is None for picture in pictures] == [False, True]
     settings, shown = TrainSettings(road_weight=2.0), []
     for it in pictures:
-        terms = geometry_terms(it.sets, model, GeometryPriors(road=road), settings, it.road_distance)
+        terms = surface_terms(it.sets, model, road, settings, it.road_distance)
         shown.append([it.image, it.depth, *it.mean_opacity_and_scale(), terms["road"]])
     assert float(shown[1][-1].detach()) > 0.01
     assert shown[1][0].std() > 0.01

@@ -133,10 +133,10 @@ def test_any_number_of_channels_agrees(channels):
 
 def test_lists_of_planned_capacity_give_the_same_scan():
     """Those of a CUDA graph, with room for more Gaussians and entries than there are."""
-    scene = random_scan(6, n=300, rays=uneven_rays(6, 4, 41))
+    scene = random_scan(6, n=120, rays=uneven_rays(6, 4, 21))
     with capacity.exact() as needs:
         expected = by_triton(scene, MOTION)
-    assert len(needs) == 4 and 0 < needs[0] < 300, "Gaussians and entries of either half"
+    assert len(needs) == 4 and 0 < needs[0] < 120, "Gaussians and entries of either half"
     with capacity.planned(needs) as lists:
         found = by_triton(scene, MOTION)
     assert [int(needed) for needed, _ in lists] == needs
@@ -147,7 +147,7 @@ def test_lists_of_planned_capacity_give_the_same_scan():
 def test_lists_that_overflow_give_a_part_of_the_scan_and_say_what_they_need(monkeypatch):
     monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
     monkeypatch.setattr(capacity, "MARGIN", 1.0)
-    scene = random_scan(6, n=300, rays=uneven_rays(6, 4, 41))
+    scene = random_scan(6, n=120, rays=uneven_rays(6, 4, 21))
     with capacity.exact() as needs:
         expected = by_triton(scene, MOTION)["alpha"]
     for planned in ([need // 2 for need in needs], [0, 0, 0, 0]):

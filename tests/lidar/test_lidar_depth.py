@@ -7,13 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.demo_worlds import job_of as world_job_of
 from helpers.demo_worlds import world_of
-from helpers.records import write_invalid
-from helpers.small_drives import (
+from helpers.drives import (
+    CAMERA_AT,
     HELD_OUT,
+    LIDAR_AT,
     NOTHING_HELD_OUT,
-    Speeding,
+    Thing,
+    World,
+    cast_lidar,
     depths_at,
     drive,
     scene_at,
@@ -21,7 +25,7 @@ from helpers.small_drives import (
     shows,
     true_depths,
 )
-from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
+from helpers.records import write_invalid
 from PIL import Image
 
 from drivesplat.demo.world import make_world
@@ -32,20 +36,18 @@ from drivesplat.lidar.depth import split_sweep
 from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.occlusion import patches, unoccluded
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
 
 CAR, TRUCK = World().things[:2]
 AHEAD = Thing("vehicle.truck", (4.0, 2.0, 2.6), (8.5, 0.0, 1.3), (4.2, 0.0))
 """A leading truck with its rear initially 4.8 m from the camera, too tall for LiDAR and camera to see its roof."""
-SPEEDING = Speeding("vehicle.truck", (4.0, 2.0, 2.6), (9.0, 0.5, 1.3), (1.0, 0.0), gain=(3.0, 0.0))
+SPEEDING = Thing("vehicle.truck", (4.0, 2.0, 2.6), (9.0, 0.5, 1.3), (1.0, 0.0), gain=(3.0, 0.0))
 CROSSING = Thing("vehicle.truck", (4.0, 2.0, 2.6), (24.0, -9.0, 1.3), (0.0, 4.0), heading=np.pi / 2)
 """It crosses the road in front of the ego vehicle from right to left."""
 
@@ -358,11 +360,7 @@ def test_an_invalid_file_is_refused_with_its_name_and_rule(tmp_path, content):
 
 
 def demo_scene(root: Path) -> Scene:
-    source = SceneSource(
-        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None, cameras=("CAM_FRONT",),
-        sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    return extract_scene(source, root)
+    return drives.scene_at(root, dataset="demo", scene="demo", sweeps=False)
 
 
 @pytest.fixture(scope="module")

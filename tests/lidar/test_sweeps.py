@@ -13,15 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.small_drives import scene_at, seconds_of
+from helpers.drives import LIDAR_AT, START_US, World, cast_lidar, scene_at, seconds_of, write_world
 from helpers.small_runs import S, settings_of
-from helpers.tiny_world import LIDAR_AT, START_US, World, cast_lidar, write_world
 from PIL import Image
 
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.ego_mask import ego_mask_record
-from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import lidar_points, seed_points
 from drivesplat.preprocess.masks import make_masks
@@ -31,7 +29,6 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, load
-from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.images import HoldoutSettings, ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
@@ -146,7 +143,6 @@ def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
         "seed": seed,
         "actors": actors_record(scene, job("actors", ActorSeedJob)),
         "lidar_depth": lidar_depths(scene, job("lidar_depth", LidarDepthJob)),
-        "free_space": free_space_record(scene, job("free_space", FreeSpaceJob)),
         "own_car": ego_mask_record(scene, job("own_car", EgoMaskJob)),
         "sky": [read_sky_mask(folder, f.camera, f.timestamp, (f.width, f.height)) for f in training],
         "images": [Path(parser.image_paths[i]).read_bytes() for i in parser.splits["train"]],
@@ -171,7 +167,7 @@ def test_recordings_just_beyond_the_excluded_ones_reach_a_training(case, tmp_pat
     scene = scene_at(root, frames=frames, **EVERYTHING)
     images, sweeps = [f.image_path for f in scene.frames], [s.path for s in scene.sweeps]
     random = np.random.default_rng(0)
-    for paths, reached in ((sweeps, {"seed", "lidar_depth", "free_space", "sky"}), (images, {"seed", "images"})):
+    for paths, reached in ((sweeps, {"seed", "lidar_depth", "sky"}), (images, {"seed", "images"})):
         beside = {
             path for other, path in [*pairwise(paths), *pairwise(reversed(paths))] if other in near and path not in near
         }

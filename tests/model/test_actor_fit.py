@@ -98,7 +98,7 @@ def fit(actors: Actors, views: list[TrainingView], iterations: int = 200) -> Non
     )  # fmt: skip
     trainer = Trainer.begin(SplatModel([actors], None), views, settings, 0, torch.device("cpu"))
     for _ in range(iterations):
-        trainer.fit_one()
+        trainer.training_step()
         trainer.step += 1
 
 

@@ -12,14 +12,13 @@ from helpers.records import training_record_of
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.model.build import ModelInit, build_model, definitions, rebuild_model
 from drivesplat.model.deformable import Deformable
-from drivesplat.model.deformation import Undeformed
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.harmonics import rotated
-from drivesplat.model.lattice import LatticeField, roughness
+from drivesplat.model.lattice import Lattice, Undeformed, roughness
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.motion import HALF_STEP
-from drivesplat.settings.deformable import GaitSettings, LatticeSettings, NetworkSettings
+from drivesplat.settings.deformable import GaitSettings, LatticeSettings
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.settings.train_objects import DeformableSettings
 
@@ -56,8 +55,8 @@ def in_box(part: Deformable, time: float) -> torch.Tensor:
 
 def moved_by(nodes: torch.Tensor, basis: torch.Tensor, gaussians: Undeformed) -> torch.Tensor:
     """The shifts and turns (n, 6) of Gaussians by lattices."""
-    field = LatticeField(LATTICE, np.ones(nodes.shape[1]))
-    return torch.cat(field.deformation({"lattice": nodes}, gaussians, basis), dim=1)
+    lattice = Lattice(LATTICE, np.ones(nodes.shape[1]))
+    return torch.cat(lattice.deformation(nodes, gaussians, basis), dim=1)
 
 
 def points_and_owners(n: int = 20) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -297,21 +296,6 @@ def test_penalties_grow_with_displacements_and_their_order():
     np.testing.assert_allclose(np.array(sizes) / sizes[0], squared_orders, rtol=1e-5)
 
 
-def test_leaving_the_box_is_penalised_where_the_object_is_present():
-    """By the mean distance, over the axes, beyond the box and its margin; of two objects, one is absent early."""
-    late = track_of(motion_through(TIMES[4:], [[t, 5.0, 0.9] for t in TIMES[4:]], 0.0 * TIMES[4:]), "late", SIZE)
-    part = people_of(walker(), late, out_of_box_weight=2.0, gait=GaitSettings(harmonics=3))
-    for time, rows in ((0.5, slice(0, 40)), (3.0, slice(0, 80))):
-        places = in_box(part, time)[rows].abs().numpy()
-        beyond = np.clip(places - (0.5 * np.array(SIZE) + part._settings.box_margin), 0.0, None).sum(axis=1)
-        found = part.penalties_at(time)["out_of_box"]
-        assert float(found.detach()) == pytest.approx(2.0 * beyond.mean(), rel=1e-4) and beyond.max() > 0.02
-    found.backward()
-    assert float(part.shared["lattice"].grad.abs().max()) > 0.0
-    assert float(part.penalties_at(50.0)["out_of_box"].detach()) == 0.0, "nobody is there"
-    assert people_of(walker(), out_of_box_weight=0.0).penalties_at(0.5) == {}
-
-
 def test_a_part_is_built_of_its_own_objects_and_survives_a_checkpoint():
     tracks = {"car": ("actors",), "rider": ("deformable", "actors"), "walker": ("deformable",)}
     records = [
@@ -368,28 +352,9 @@ def test_tracks_with_a_value_that_is_not_finite_are_named(owner, name, row):
     assert part.broken_tracks() == ["second"]
 
 
-def test_a_network_deforms_nothing_at_first_and_each_object_in_its_own_way_later():
-    network = NetworkSettings(layers=2, width=32, frequencies=2)
-    part = people_of(walker(), walker("other"), field="network", network=network)
-    assert "lattice" not in part.shared and part.learning_rates()["weight0"] == network.learning_rate
-    assert torch.equal(in_box(part, 1.0), part.params["means"].detach())
-    with torch.no_grad():
-        part.shared["weight2"].normal_(0.0, 0.1, generator=torch.Generator().manual_seed(6))
-        part.params["means"][40:] = part.params["means"][:40]
-    first, second = in_box(part, 1.0).split(40)
-    assert (first - second).norm(dim=1).median() > 1e-3, "embeddings differ"
-    loss = part.at(1.0).means.sum()
-    loss.backward()
-    learned = [name for name in part.learning_rates() if name in part.shared and part.shared[name].requires_grad]
-    assert {"embedding", "weight0", "bias1", "weight2"} <= set(learned)
-    assert all(part.shared[name].grad is not None for name in learned)
-
-
-@pytest.mark.parametrize("field", ["lattice", "network"])
-def test_a_swinging_leg_is_learned(field):
+def test_a_swinging_leg_is_learned():
     """From where its points are at 40 times; between them it swings on."""
-    network = NetworkSettings(layers=2, width=64, frequencies=3)
-    track, settings = walker(), DeformableSettings(field=field, lattice=LATTICE, network=network, fourier=1)
+    track, settings = walker(), DeformableSettings(lattice=LATTICE, fourier=1)
     rng = np.random.default_rng(5)
     points = rng.uniform([-0.05, 0.05, -0.9], [0.05, 0.15, 0.0], (60, 3))
     part = Deformable.from_points([track], [points], [np.full((60, 3), 0.5)], settings, GaussianSettings())
@@ -398,8 +363,7 @@ def test_a_swinging_leg_is_learned(field):
         angle = 0.5 * math.sin(2.0 * math.pi * SPEED * time / STRIDE)
         return torch.from_numpy(points + np.array([1.0, 0.0, 0.0]) * -angle * points[:, 2:]).float()
 
-    names = ["lattice"] if field == "lattice" else [name for name in part.shared if name.startswith(("weight", "bias"))]
-    optimizer = torch.optim.Adam([part.shared[name] for name in names], lr=0.01 if field == "lattice" else 2e-3)
+    optimizer = torch.optim.Adam([part.shared["lattice"]], lr=0.01)
     times = rng.uniform(0.0, 4.0, 40)
     for step in range(400):
         optimizer.zero_grad()

@@ -21,6 +21,7 @@ from drivesplat.rasterization import rasterize
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.drifting import DriftingSeedSettings, DriftingSettings
 from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainJob, TrainSettings
+from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.trainer import Trainer
@@ -139,19 +140,6 @@ def test_what_scans_may_not_change_freely_is_all_that_places_and_opacities_follo
     assert {name for name, value in part.params.items() if value.grad is not None} == set(part.geometry)
 
 
-def test_opacity_is_penalised_at_the_time_of_an_image_alone():
-    """What is absent then keeps its opacity, since the image could not counteract."""
-    part = drifting(DriftingSettings(opacity_weight=0.5))
-    part.params["peaks"].data[:2] = 90.0
-    (penalty,) = part.penalties_at(3.0).values()
-    _, opacities = expected_at(part, 3.0, part._settings.min_span)
-    assert float(penalty.detach()) == pytest.approx(0.5 * opacities.mean())
-    penalty.backward()
-    gradient = part.params["opacities"].grad
-    assert not gradient[:2].any() and (gradient[2:] > 0.0).any() and (gradient >= 0.0).all()
-    assert drifting(DriftingSettings(opacity_weight=0.0)).penalties_at(3.0) == {} == part.penalties()
-
-
 # ---- the seed
 
 
@@ -234,7 +222,7 @@ def test_without_images_nothing_drifts():
 
 @pytest.mark.parametrize("echo", [None, (0.3, 0.9)])
 def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(echo, tmp_path):
-    settings = TrainSettings(cap_max=100, drifting=DriftingSettings(min_span=0.7, opacity_weight=0.3))
+    settings = TrainSettings(cap_max=100, drifting=DriftingSettings(min_span=0.7))
     model = an_untrained_model(settings, echo=echo)
     with torch.no_grad():
         for value in (value for value in model.parameters() if value.requires_grad):
@@ -248,13 +236,13 @@ def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(echo, tmp_path):
         assert all(torch.equal(values, again.tensors[name]) for name, values in ours.tensors.items())
     part, again = model.parts[1], rebuilt.parts[1]
     assert again.definition() == part.definition() and again.learning_rates() == part.learning_rates()
-    assert again.penalties_at(1.3) == part.penalties_at(1.3)
 
 
-def test_densification_copies_motion_and_life_with_each_gaussian():
+def test_densification_copies_motion_and_life_with_each_gaussian(monkeypatch):
     """Where Gaussians are relocated and added, the rows of all parameters remain those of one of the Gaussians before;
     only opacities and scales change."""
-    mcmc = McmcSettings(growth=0.5, refine_every=1, noise_lr=0.0)
+    monkeypatch.setattr(strategies, "GROWTH", 0.5)
+    mcmc = McmcSettings(refine_every=1, noise_lr=0.0)
     settings = TrainSettings(iterations=10, refine_start=0.0, refine_stop=1.0, mcmc=mcmc)
     part = drifting(count=40)
     part.params["opacities"].data[:10] = -20.0
@@ -315,9 +303,7 @@ def test_what_moves_is_learned_with_its_velocity_and_shown_between_the_images():
     gaussians = GaussianSettings(sh_degree=0, lr_means=2e-3, lr_sh0=2e-2)
     seed = DriftingSeed(places, np.zeros((40, 3)), (places[:, 0] + 1.8) / 1.2, colors, np.full(40, 0.2))
     parts = {
-        "drifting": Drifting.from_seed(
-            seed, DriftingSettings(opacity_weight=0.0, lr_velocities=0.05), gaussians, 4.0, (0.0, 3.0)
-        ),
+        "drifting": Drifting.from_seed(seed, DriftingSettings(lr_velocities=0.05), gaussians, 4.0, (0.0, 3.0)),
         "static": Background.from_points(places, colors, gaussians, 4.0),
     }
     train, between = np.linspace(0.0, 3.0, 13), np.linspace(0.125, 2.875, 12)
@@ -326,7 +312,7 @@ def test_what_moves_is_learned_with_its_velocity_and_shown_between_the_images():
         settings = TrainSettings(iterations=200, opacity_reg=0, scale_reg=0, entropy_weight=0, sh_every=0)
         trainer = Trainer.begin(model, recorded(looking_on(train)), settings, 0, torch.device("cpu"))
         for _ in range(200):
-            trainer.fit_one()
+            trainer.training_step()
             trainer.step += 1
         with torch.no_grad():
             shown = [

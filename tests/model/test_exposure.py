@@ -43,7 +43,7 @@ from drivesplat.training.exposure_init import DISTANCE_STEP, Sightings, initial_
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
-from drivesplat.training.views import Guides, TrainingView, load_views
+from drivesplat.training.views import Supervision, TrainingView, load_views
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -255,7 +255,7 @@ def rig(tmp_path_factory) -> TrainingInputs:
 
 def test_the_gains_of_the_demo_rig_are_estimated_before_the_training(rig):
     """Images are gamma encoded: a gain of light becomes its 2.2th root."""
-    views = load_views(rig.record, Guides({}, {}, {}), CPU)
+    views = load_views(rig.record, Supervision({}, {}, {}), CPU)
     found = initial_gains(rig.record, views, ["CAM_BACK"], "CAM_FRONT")
     np.testing.assert_allclose(found["CAM_BACK"], np.power([1.4, 1.1, 0.75], 1 / 2.2), rtol=0.03)
     hidden = [dataclasses.replace(v, ego_mask=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.classed import classed
 from helpers.demo_worlds import FRONT, pose_at
-from helpers.tiny_world import World
+from helpers.drives import World
 from helpers.workflow_copy import WorkflowCopy
 from PIL import Image
 from scipy.spatial.transform import Rotation

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from helpers import drives
 from helpers.hand_made_views import FRONT, HEADINGS, Drive, Seen, drive_of, error_at, views, write_database
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +23,6 @@ from drivesplat.poses.rig import RigImages
 from drivesplat.readers.drive.reader import read
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob
 
 pytestmark = pytest.mark.usefixtures("quiet")
@@ -164,10 +164,7 @@ def write_unposed(folder: Path, case: Case) -> Path:
 
 def test_a_drive_folder_without_poses_is_recovered_in_metres(unlocated, tmp_path):
     """Read with its poses to be estimated, it gets those of a drive whose recorded poses are the identity."""
-    source = SceneSource(
-        dataset="mine", reader="drive", version="", scene="it", frames=None, cameras=("CAM_FRONT",), sweeps=False,
-        on_missing="stop", poses_from_images=True,
-    )  # fmt: skip
+    source = drives.source(dataset="mine", reader="drive", version="", scene="it", sweeps=False, poses_from_images=True)
     scene = read(write_unposed(tmp_path, unlocated), source)
     assert scene.poses == "none"
     np.testing.assert_array_equal([frame.ego_to_world for frame in scene.frames], [np.eye(4)] * 10)

@@ -5,8 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, TRAINING, scene_at
-from helpers.tiny_world import CAMERA_AT, World, cast
+from helpers.drives import CAMERA_AT, HELD_OUT, NOTHING_HELD_OUT, TRAINING, World, cast, scene_at
 from PIL import Image
 
 from drivesplat.errors import ResultError

@@ -8,18 +8,22 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from helpers.records import write_invalid
-from helpers.small_drives import (
+from helpers import drives
+from helpers.drives import (
+    CAMERA_AT,
     HELD_OUT,
+    LIDAR_AT,
     NOTHING_HELD_OUT,
     TRAINING,
-    Speeding,
+    Thing,
+    World,
+    cast_lidar,
     drive,
     scene_at,
     seconds_of,
     shows,
 )
-from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
+from helpers.records import write_invalid
 from PIL import Image
 from pydantic import ValidationError
 
@@ -28,7 +32,6 @@ from drivesplat.io.array_file import write_arrays
 from drivesplat.io.storage import no_provenance
 from drivesplat.io.typed_record import field_values
 from drivesplat.preprocess.actor_seed import actors_record
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.motion import Motion
@@ -36,7 +39,6 @@ from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, ObjectClassName
-from drivesplat.settings.extract import SceneSource
 
 CAR = World().things[0]
 """A car ahead of the ego vehicle: 4 x 2 x 1.6 m, its rear initially 4.8 m from the camera."""
@@ -348,7 +350,7 @@ def test_colours_match_the_surface_of_the_car(tmp_path):
     assert (off < 25).mean() > 0.85
 
 
-SPEEDING = Speeding("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0), gain=(1.0, 0.0))
+SPEEDING = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0), gain=(1.0, 0.0))
 
 
 def test_occluders_do_not_colour_an_actor(tmp_path):
@@ -528,11 +530,8 @@ def test_an_invalid_record_is_named_with_its_rule(tmp_path, content):
 
 
 def test_visible_dynamic_vehicles_of_the_real_scene_become_actors(real_scene_root):
-    source = SceneSource(
-        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
-        sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    found = actors_of(extract_scene(source, real_scene_root), job({}, min_points=2000))
+    scene = drives.scene_at(real_scene_root, dataset="nuscenes", scene="0061", sweeps=False)
+    found = actors_of(scene, job({}, min_points=2000))
     assert 4 <= len(found) <= 7 and all(actor.category.startswith("vehicle.") for actor in found)
     for actor in found:
         assert len(actor.points) == 8000 and actor.lidar_points < 100, "all but one of its sweeps are missing"

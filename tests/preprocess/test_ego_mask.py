@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.rig_drives import KEY_FRAMES, rig_drive, true_body
 from PIL import Image
 
@@ -20,12 +21,10 @@ from drivesplat.preprocess.ego_mask import (
     find_outlines,
     outlines_of,
 )
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.ego_mask import EgoMask, enclosed, read_ego_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.config import load
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch
 from drivesplat.workflow.stages import stage_settings
@@ -289,11 +288,8 @@ def test_each_of_two_bodies_has_its_outline():
 
 def test_no_body_is_found_in_the_front_camera_of_a_real_drive(real_scene_root, monkeypatch):
     """This holds even without any LiDAR returns: the road varies too much to be detected as a body."""
-    source = SceneSource(
-        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
-        sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    drive = ComparedImages.of(extract_scene(source, real_scene_root), "CAM_FRONT", LOOKING)
+    scene = drives.scene_at(real_scene_root, dataset="nuscenes", scene="0061", sweeps=False)
+    drive = ComparedImages.of(scene, "CAM_FRONT", LOOKING)
     assert "images have LiDAR" in find_outlines(drive)[1]
     nothing = np.zeros((drive.size[1], drive.size[0]), dtype=bool)
     monkeypatch.setattr(search_module, "lidar_images", lambda drive: [nothing] * len(drive.compared))

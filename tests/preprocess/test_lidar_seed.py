@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.classed import classed
-from helpers.tiny_world import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar
+from helpers.drives import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar, scene_at
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
@@ -19,17 +19,14 @@ from drivesplat.lidar import coloring
 from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility
 from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
 from drivesplat.preprocess import lidar_seed
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import color_view, far_points, lidar_points, seed_points, uncovered
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import project
 from drivesplat.scene.regions import fill, hull_of
 from drivesplat.scene.rigid import inverse, rigid
-from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.scene.tracks import Box, box_at, moving_tracks
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 
@@ -53,14 +50,6 @@ def job(holdout=HELD_OUT, width=None, random_seed=0, **settings) -> SeedJob:
 def root(tiny_root, tmp_path) -> Path:
     """A copy of the tiny drive that a test may damage."""
     return Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
-
-
-def scene_at(root: Path) -> Scene:
-    source = SceneSource(
-        dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None, cameras=("CAM_FRONT",),
-        sweeps=True, on_missing="stop",
-    )  # fmt: skip
-    return extract_scene(source, root)
 
 
 def returns_at(seconds: float) -> np.ndarray:
@@ -595,11 +584,7 @@ def test_returns_that_are_not_finite_are_left_out(root):
 
 
 def test_the_real_scene_is_seeded_from_its_only_sweep_and_a_file(real_scene_root):
-    source = SceneSource(
-        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
-        sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    scene = extract_scene(source, real_scene_root)
+    scene = scene_at(real_scene_root, dataset="nuscenes", scene="0061", sweeps=False)
     with pytest.raises(DatasetError, match=r"LIDAR_TOP.*on_missing"):
         seed_points(scene, job(holdout={}))
     cloud = str(real_scene_root / "sfm_points_global.ply")

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import REPOSITORY
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
+from helpers import REPOSITORY, drives
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 from PIL import Image
 
 from drivesplat.errors import ConfigError, DatasetError, ResultError
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.masks import NO_SKY, make_masks, sky_mask, users_file
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
@@ -23,7 +22,6 @@ from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import LABELS, fill, hulls_in, label_image, region_mask
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Track, write_scene
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.masks import MaskJob
 
 SIZE = (96, 54)
@@ -212,11 +210,7 @@ def test_the_sky_of_training_images_is_independent_of_held_out_sweeps(tiny_scene
 
 
 def extracted(root: Path) -> Scene:
-    source = SceneSource(
-        dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=(0, 2), cameras=("CAM_FRONT",),
-        sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    return extract_scene(source, root)
+    return drives.scene_at(root, frames=(0, 2), sweeps=False)
 
 
 def users_masks(scene: Scene, folder: Path, of: np.ndarray) -> Path:

@@ -5,6 +5,7 @@ import logging
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.scan_drives import (
     AZIMUTHS,
     BEAMS,
@@ -33,7 +34,8 @@ from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import NO_OBJECT, read_scans
 from drivesplat.scene.sensors import Lidar, LidarReturns
 from drivesplat.settings.config import load
-from drivesplat.settings.extract import SceneSource
+
+pytestmark = pytest.mark.usefixtures("uncompared")
 
 
 def test_key_frames_are_resolved_and_all_sweeps_on_request_each_in_its_group(tmp_path):
@@ -246,10 +248,7 @@ def test_a_drive_without_lidar_is_refused_in_a_sentence():
 def range_images(tiny_root, tmp_path_factory):
     """The tiny drive as Waymo records it, and its scene."""
     drive, _ = tiny_drive(tiny_root)
-    source = SceneSource(
-        dataset="mine", reader="waymo", version="", scene=NAME, frames=None, cameras=("FRONT",), sweeps=False,
-        on_missing="stop",
-    )  # fmt: skip
+    source = drives.source(dataset="mine", reader="waymo", version="", scene=NAME, cameras=("FRONT",), sweeps=False)
     root = write_v2(tmp_path_factory.mktemp("v2"), drive)
     return drive, extract_scene(source, root, None, tmp_path_factory.mktemp("results"))
 

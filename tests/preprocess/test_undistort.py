@@ -13,6 +13,8 @@ from drivesplat.scene.images import read_image
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.sensors import Camera
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 SIZE = (320, 180)
 K = np.array([[210.0, 0.0, 158.0], [0.0, 205.0, 91.0], [0.0, 0.0, 1.0]])
 LENSES = {

@@ -11,21 +11,21 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from helpers import REPOSITORY
+from helpers import REPOSITORY, drives
 from helpers.archive_server import Site, packed, served
+from helpers.drives import World, write_world
 from helpers.patience import wait_until
-from helpers.tiny_world import World, write_world
 
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.nuscenes.download import console, nuscenes_mini
 from drivesplat.readers.nuscenes.download import fetch as fetching
 from drivesplat.readers.nuscenes.download.destination import download_job, is_present
 from drivesplat.readers.nuscenes.download.fetch import fetch
 from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
 from drivesplat.settings.config import load
-from drivesplat.settings.extract import SceneSource
 from drivesplat.workflow.plan import Plan
+
+pytestmark = pytest.mark.usefixtures("uncompared")
 
 CONTENT = bytes(range(256)) * 4000
 
@@ -76,11 +76,7 @@ def test_a_valid_archive_becomes_the_dataset_and_leaves_no_other_files(site, wor
     download(site.job(root))
     assert files(root) == files(world)
     assert [path.name for path in root.parent.iterdir()] == [root.name]
-    source = SceneSource(
-        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None,
-        cameras=("CAM_FRONT",), sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    assert len(extract_scene(source, root).frames) == 3
+    assert len(drives.scene_at(root, dataset="nuscenes", sweeps=False).frames) == 3
 
 
 def test_an_empty_folder_and_a_link_to_one_are_filled(site, world, tmp_path):

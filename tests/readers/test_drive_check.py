@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers.small_drives import scene_at
+from helpers.drives import scene_at
 from PIL import Image
 
 from drivesplat.readers.drive.__main__ import main

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from helpers import REPOSITORY
-from helpers.small_drives import scene_at
+from helpers.drives import scene_at
 from scipy.spatial.transform import Rotation
 
 from drivesplat.readers.drive.check import whole_scene

@@ -5,12 +5,23 @@ import logging
 import shutil
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, KEY_FRAME_US, LIDAR_AT, ORIGIN, START_US, World, write_world
+from helpers import drives
+from helpers.drives import (
+    CAMERA_AT,
+    CAMERA_TO_EGO,
+    KEY_FRAME_US,
+    LIDAR_AT,
+    ORIGIN,
+    START_US,
+    World,
+    seconds_of,
+    write_world,
+)
+from helpers.table_files import edit, row
 from pyquaternion import Quaternion
 
 from drivesplat.errors import DatasetError
@@ -22,34 +33,23 @@ from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_seed import SeedJob
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 
 def source(**changes) -> SceneSource:
-    plain = {
-        "dataset": "tiny", "reader": "nuscenes", "version": "v1.0-mini", "scene": "0001", "frames": None,
-        "cameras": ("CAM_FRONT",), "sweeps": False, "on_missing": "stop",
-    }  # fmt: skip
-    return SceneSource(**{**plain, **changes})
+    return drives.source(**{"sweeps": False, **changes})
 
 
 @pytest.fixture
-def root(tiny_root, tmp_path) -> Path:
-    """A copy of the tiny drive that a test may damage."""
-    return Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+def root(small_root, tmp_path) -> Path:
+    """A copy of a small drive that a test may damage."""
+    return Path(shutil.copytree(small_root, tmp_path / "nuscenes"))
 
 
-def edit(root: Path, table: str, change: Callable[[list[dict]], list[dict] | None]) -> None:
-    """Changes the records of a table in place, or replaces them by what `change` returns."""
-    path = root / "v1.0-mini" / f"{table}.json"
-    records = json.loads(path.read_text())
-    path.write_text(json.dumps(change(records) or records))
-
-
-def record(records: list[dict], token: str) -> dict:
-    return next(r for r in records if r["token"] == token)
-
-
-def seconds(timestamp: int) -> float:
-    return (timestamp - START_US) * 1e-6
+@pytest.fixture(scope="module")
+def scene(tiny_root) -> Scene:
+    """The tiny drive's key frames."""
+    return extract_scene(source(), tiny_root)
 
 
 def pose_of(translation, rotation) -> np.ndarray:
@@ -58,12 +58,11 @@ def pose_of(translation, rotation) -> np.ndarray:
     return pose
 
 
-def test_key_frame_images_have_the_camera_poses_of_the_tiny_drive(tiny_root):
-    scene = extract_scene(source(), tiny_root)
+def test_key_frame_images_have_the_camera_poses_of_the_tiny_drive(scene):
     assert [frame.sample_index for frame in scene.frames] == list(range(10))
     for i, frame in enumerate(scene.frames):
         assert frame.timestamp == START_US + i * KEY_FRAME_US - 35_000
-        expected = World().ego_at(seconds(frame.timestamp))
+        expected = World().ego_at(seconds_of(frame.timestamp))
         np.testing.assert_allclose(frame.ego_to_world[:3, 3], expected, atol=1e-6)
         np.testing.assert_allclose(frame.camera_to_world[:3, 3], expected + CAMERA_AT, atol=1e-6)
         np.testing.assert_allclose(frame.camera_to_world[:3, :3], CAMERA_TO_EGO, atol=1e-9)
@@ -72,11 +71,10 @@ def test_key_frame_images_have_the_camera_poses_of_the_tiny_drive(tiny_root):
         assert Path(frame.image_path).is_file()
 
 
-def test_lidar_sweeps_have_the_lidar_poses_of_the_tiny_drive(tiny_root):
-    scene = extract_scene(source(), tiny_root)
+def test_lidar_sweeps_have_the_lidar_poses_of_the_tiny_drive(scene):
     assert [sweep.timestamp for sweep in scene.sweeps] == [START_US + i * KEY_FRAME_US for i in range(10)]
     for sweep in scene.sweeps:
-        expected = World().ego_at(seconds(sweep.timestamp)) + LIDAR_AT
+        expected = World().ego_at(seconds_of(sweep.timestamp)) + LIDAR_AT
         np.testing.assert_allclose(sweep.sensor_to_world[:3, 3], expected, atol=1e-6)
         assert sweep.is_key_frame and Path(sweep.path).is_file()
 
@@ -90,8 +88,7 @@ def test_without_cameras_a_scene_has_its_sweeps_and_boxes_alone(tiny_root):
     np.testing.assert_array_equal(alone.key_frame_timestamps, with_images.key_frame_timestamps)
 
 
-def test_names_and_times_of_the_scene_match_the_tables(tiny_root):
-    scene = extract_scene(source(), tiny_root)
+def test_names_and_times_of_the_scene_match_the_tables(scene):
     assert (scene.name, scene.dataset, scene.version, scene.poses) == ("0001", "tiny", "v1.0-mini", "nuscenes")
     assert (scene.description, scene.key_frame_range, scene.missing_images) == ("tiny", None, 0)
     np.testing.assert_array_equal(scene.key_frame_timestamps, START_US + KEY_FRAME_US * np.arange(10))
@@ -99,9 +96,8 @@ def test_names_and_times_of_the_scene_match_the_tables(tiny_root):
 
 
 def test_the_origin_is_the_first_ego_position(root):
-    scene = extract_scene(source(), root)
-    np.testing.assert_array_equal(scene.origin, ORIGIN)
-    edit(root, "ego_pose", lambda poses: record(poses, "0001 LIDAR_TOP 0").update(translation=[1.5, -2.5, 3.5]))
+    np.testing.assert_array_equal(extract_scene(source(), root).origin, ORIGIN)
+    edit(root, "ego_pose", lambda poses: row(poses, "0001 LIDAR_TOP 0").update(translation=[1.5, -2.5, 3.5]))
     np.testing.assert_array_equal(extract_scene(source(), root).origin, [1.5, -2.5, 3.5])
 
 
@@ -126,7 +122,7 @@ def test_every_image_and_sweep_uses_its_own_ego_pose_and_calibration(root):
     scene = extract_scene(source(sweeps=True), root)
     shift = np.eye(4)
     shift[:3, 3] = -expected["0001 LIDAR_TOP 0"][:3, 3]
-    assert len(scene.frames) == 19 and len(scene.sweeps) == 10
+    assert len(scene.frames) == 5 and len(scene.sweeps) == 3
     for frame in scene.frames:
         np.testing.assert_allclose(frame.ego_to_world, shift @ expected[frame.token], atol=1e-9)
         global_pose = expected[frame.token] @ expected["calibrated CAM_FRONT"]
@@ -141,7 +137,7 @@ def test_sweeps_adds_the_images_between_key_frames_with_their_own_poses(tiny_roo
     assert [frame.is_key_frame for frame in scene.frames] == [True, False] * 9 + [True]
     for i, frame in enumerate(scene.frames):
         assert frame.timestamp == START_US + i * KEY_FRAME_US // 2 - 35_000
-        expected = World().ego_at(seconds(frame.timestamp)) + CAMERA_AT
+        expected = World().ego_at(seconds_of(frame.timestamp)) + CAMERA_AT
         np.testing.assert_allclose(frame.camera_to_world[:3, 3], expected, atol=1e-6)
         assert ("sweeps" in frame.image_path) == (not frame.is_key_frame)
 
@@ -185,21 +181,19 @@ def test_an_unknown_camera_is_refused_with_the_available_sensors(tiny_root):
         extract_scene(source(cameras=("CAM_FRONT", "CAM_BACK")), tiny_root)
 
 
-def test_box_sizes_are_converted_from_width_length_height_to_length_width_height(tiny_root):
-    scene = extract_scene(source(), tiny_root)
+def test_box_sizes_are_converted_from_width_length_height_to_length_width_height(scene):
     sizes = {track.category: track.size.tolist() for track in scene.tracks}
     assert sizes == {thing.category: list(thing.size) for thing in World().things}
 
 
-def test_tracks_match_the_objects_of_the_tiny_drive(tiny_root):
-    scene = extract_scene(source(), tiny_root)
+def test_tracks_match_the_objects_of_the_tiny_drive(scene):
     things = {thing.category: thing for thing in World().things}
     assert len(scene.tracks) == len(things)
     for track in scene.tracks:
         np.testing.assert_array_equal(track.timestamps, scene.key_frame_timestamps)
         np.testing.assert_array_equal(track.sample_indices, np.arange(10))
         np.testing.assert_array_equal(track.visibility, np.full(10, 4))
-        expected = [things[track.category].at(seconds(time)) for time in track.timestamps]
+        expected = [things[track.category].at(seconds_of(time)) for time in track.timestamps]
         np.testing.assert_allclose(track.object_to_world[:, :3, 3], expected, atol=1e-9)
 
 
@@ -213,21 +207,21 @@ def test_a_box_turned_to_the_left_points_to_the_left(root):
 
 def test_a_track_with_one_box_is_kept(root):
     def keep_one(boxes):
-        return [box for box in boxes if "annotation 0 " not in box["token"] or box["token"].endswith(" 4")]
+        return [box for box in boxes if "annotation 0 " not in box["token"] or box["token"].endswith(" 2")]
 
     edit(root, "sample_annotation", keep_one)
     edit(
         root,
         "instance",
         lambda instances: instances[0].update(
-            first_annotation_token="0001 annotation 0 4", last_annotation_token="0001 annotation 0 4", nbr_annotations=1
+            first_annotation_token="0001 annotation 0 2", last_annotation_token="0001 annotation 0 2", nbr_annotations=1
         ),
     )
-    edit(root, "sample_annotation", lambda boxes: record(boxes, "0001 annotation 0 4").update(prev="", next=""))
+    edit(root, "sample_annotation", lambda boxes: row(boxes, "0001 annotation 0 2").update(prev="", next=""))
     (track,) = [t for t in extract_scene(source(), root).tracks if t.category == "vehicle.car"]
-    assert track.sample_indices.tolist() == [4]
+    assert track.sample_indices.tolist() == [2]
     (car,) = [thing for thing in World().things if thing.category == "vehicle.car"]
-    np.testing.assert_allclose(track.object_to_world[0, :3, 3], car.at(4 * KEY_FRAME_US * 1e-6), atol=1e-9)
+    np.testing.assert_allclose(track.object_to_world[0, :3, 3], car.at(2 * KEY_FRAME_US * 1e-6), atol=1e-9)
 
 
 @pytest.mark.parametrize("token", ["1", "2", "3", "4"])
@@ -295,13 +289,6 @@ def test_the_table_files_are_all_tables_of_the_version(root):
     assert {file.stem for file in (root / "v1.0-mini").iterdir()} == set(TABLES)
 
 
-@pytest.mark.parametrize("content", ["", "[{", "nothing"])
-def test_a_damaged_table_is_refused_without_a_traceback(root, content):
-    (root / "v1.0-mini" / "sample_data.json").write_text(content)
-    with pytest.raises(DatasetError, match=str(root)):
-        extract_scene(source(), root)
-
-
 def image_of(root: Path, index: int) -> Path:
     return root / "samples" / "CAM_FRONT" / f"0001__{2 * index:04}.jpg"
 
@@ -325,13 +312,13 @@ def empty(path: Path) -> None:
 def shrink(path: Path) -> None:
     from PIL import Image
 
-    Image.new("RGB", (48, 27)).save(path)
+    Image.new("RGB", (24, 13)).save(path)
 
 
 def deepen(path: Path) -> None:
     from PIL import Image
 
-    Image.fromarray(np.full((54, 96), 40_000, np.uint16)).save(path, format="PNG")
+    Image.fromarray(np.full((27, 48), 40_000, np.uint16)).save(path, format="PNG")
 
 
 def inflate(path: Path) -> None:
@@ -345,28 +332,28 @@ FAULTS = [remove, truncate, scramble, empty, shrink, deepen, inflate]
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_image_stops_the_extraction_naming_key_frame_token_and_path(root, fault):
-    fault(image_of(root, 3))
+    fault(image_of(root, 1))
     with pytest.raises(DatasetError) as failure:
         extract_scene(source(), root)
-    for part in ("key frame 3", "0001 CAM_FRONT 6", str(image_of(root, 3)), "on_missing"):
+    for part in ("key frame 1", "0001 CAM_FRONT 2", str(image_of(root, 1)), "on_missing"):
         assert part in str(failure.value)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_image_is_skipped_and_counted_with_on_missing_warn(root, fault, caplog):
-    fault(image_of(root, 3))
-    fault(image_of(root, 5))
+    fault(image_of(root, 0))
+    fault(image_of(root, 1))
     with caplog.at_level(logging.WARNING):
         scene = extract_scene(source(on_missing="warn"), root)
     assert scene.missing_images == 2
-    assert [frame.sample_index for frame in scene.frames] == [0, 1, 2, 4, 6, 7, 8, 9]
-    assert len(scene.key_frame_timestamps) == 10
-    assert str(image_of(root, 3)) in caplog.text and "0001 CAM_FRONT 10" in caplog.text
+    assert [frame.sample_index for frame in scene.frames] == [2]
+    assert len(scene.key_frame_timestamps) == 3
+    assert str(image_of(root, 1)) in caplog.text and "0001 CAM_FRONT 0" in caplog.text
 
 
 def test_a_drive_without_a_readable_image_is_an_error_even_with_on_missing_warn(root):
     shutil.rmtree(root / "samples" / "CAM_FRONT")
-    with pytest.raises(DatasetError, match=r"0001.*10 images"):
+    with pytest.raises(DatasetError, match=r"0001.*3 images"):
         extract_scene(source(on_missing="warn"), root)
 
 
@@ -392,29 +379,24 @@ def no_number(path: Path) -> None:
 
 
 def seed_job(on_missing: str) -> SeedJob:
-    return SeedJob.model_validate(
-        {
-            "lidar_seed": {"on_missing": on_missing, "far_points": 100},
-            "holdout": {},
-            "images": {},
-            "random_seed": 0,
-        }
-    )
+    seed = {"on_missing": on_missing, "far_points": 100}
+    holdout = {"every_nth": 0, "last_block": 0}
+    return SeedJob.model_validate({"lidar_seed": seed, "holdout": holdout, "images": {}, "random_seed": 0})
 
 
 @pytest.mark.parametrize("fault", [remove, empty, cut_off, random_bytes, far, no_number])
 def test_a_bad_lidar_file_stops_the_seeding_naming_key_frame_token_and_path(root, fault):
-    fault(sweep_of(root, 3))
+    fault(sweep_of(root, 1))
     scene = extract_scene(source(), root)
     with pytest.raises(DatasetError) as failure:
         seed_points(scene, seed_job("stop"))
-    for part in ("key frame 3", "0001 LIDAR_TOP 3", str(sweep_of(root, 3)), "on_missing"):
+    for part in ("key frame 1", "0001 LIDAR_TOP 1", str(sweep_of(root, 1)), "on_missing"):
         assert part in str(failure.value)
 
 
 @pytest.mark.parametrize("fault", [remove, empty, cut_off, random_bytes, far, no_number])
 def test_a_bad_lidar_file_is_counted_with_on_missing_warn(root, fault, caplog):
-    for index in (0, 3):
+    for index in (0, 1):
         fault(sweep_of(root, index))
     scene = extract_scene(source(), root)
     with caplog.at_level(logging.WARNING):
@@ -425,127 +407,11 @@ def test_a_bad_lidar_file_is_counted_with_on_missing_warn(root, fault, caplog):
     assert "restore it" not in caplog.text, "what has been decided is not asked again"
 
 
-def refusal(root: Path, **changes) -> str:
-    with pytest.raises(DatasetError) as failure:
-        extract_scene(source(**changes), root)
-    return str(failure.value)
-
-
-@pytest.mark.parametrize("sensor", ["CAM_FRONT", "LIDAR_TOP"])
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"translation": [float("nan"), 0.0, 0.0]},
-        {"translation": [0.0, float("inf"), 0.0]},
-        {"translation": [0.0, 0.0]},
-        {"rotation": [float("nan"), 0.0, 0.0, 0.0]},
-        {"rotation": [0.9, 0.0, 0.0, 0.0]},
-        {"rotation": [0.0, 0.0, 0.0, 0.0]},
-        {"rotation": [1.0, 0.1, 0.0, 0.0]},
-        {"rotation": [1.0, 0.0, 0.0]},
-    ],
-    ids=str,
-)
-def test_a_pose_that_is_not_finite_or_not_a_rotation_is_refused_naming_it(root, sensor, change):
-    edit(root, "ego_pose", lambda poses: record(poses, f"0001 {sensor} 2").update(change))
-    assert f"ego_pose 0001 {sensor} 2" in refusal(root, sweeps=True)
-
-
 def test_a_quaternion_of_nearly_unit_length_is_accepted(root):
     """The tables are rounded: lengths deviate by up to about 1e-4."""
     edit(root, "ego_pose", lambda poses: [{**pose, "rotation": [1.0002, 0.0, 0.0, 0.0]} for pose in poses])
     scene = extract_scene(source(), root)
     np.testing.assert_allclose(scene.frames[0].ego_to_world[:3, :3], np.eye(3), atol=1e-9)
-
-
-def test_a_bad_calibration_is_refused_naming_it(root):
-    edit(
-        root,
-        "calibrated_sensor",
-        lambda sensors: record(sensors, "calibrated CAM_FRONT").update(rotation=[2.0, 0.0, 0.0, 0.0]),
-    )
-    assert "calibrated_sensor calibrated CAM_FRONT" in refusal(root)
-
-
-@pytest.mark.parametrize(
-    "change", [{"translation": [float("nan"), 0.0, 0.0]}, {"rotation": [0.5, 0.0, 0.0, 0.0]}], ids=str
-)
-def test_a_bad_box_pose_is_refused_naming_it(root, change):
-    edit(root, "sample_annotation", lambda boxes: record(boxes, "0001 annotation 1 4").update(change))
-    assert "sample_annotation 0001 annotation 1 4" in refusal(root)
-
-
-@pytest.mark.parametrize("size", [[0.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, float("nan")]])
-def test_boxes_without_a_finite_positive_size_are_refused_naming_the_instance(root, size):
-    def flatten(boxes):
-        return [{**box, "size": size} if box["instance_token"] == "0001 instance 1" else box for box in boxes]
-
-    edit(root, "sample_annotation", flatten)
-    assert "instance 0001 instance 1" in refusal(root)
-
-
-@pytest.mark.parametrize(
-    "matrix",
-    [
-        [],
-        [[0.0, 0.0, 0.0], [0.0, 60.0, 27.0], [0.0, 0.0, 1.0]],
-        [[60.0, 0.0, 48.0], [0.0, 0.0, 27.0], [0.0, 0.0, 1.0]],
-        [[60.0, 0.0, 48.0], [0.0, -60.0, 27.0], [0.0, 0.0, 1.0]],
-        [[60.0, 0.0, 48.0], [0.0, 60.0, 27.0], [0.0, 0.0, 0.0]],
-        [[60.0, 0.0, float("nan")], [0.0, 60.0, 27.0], [0.0, 0.0, 1.0]],
-        [[60.0, 0.0], [0.0, 60.0]],
-        [[60.0, 0.0, 48.0], [0.0, 60.0], [0.0, 0.0, 1.0]],
-        [[60.0, 0.0, 48.0], [60.0, 0.0, 27.0], [0.0, 0.0, 1.0]],
-        [[60.0, 60.0, 48.0], [60.0, 60.0, 27.0], [0.0, 0.0, 1.0]],
-    ],
-    ids=str,
-)
-def test_singular_intrinsics_are_refused_naming_the_sensor(root, matrix):
-    edit(root, "calibrated_sensor", lambda s: record(s, "calibrated CAM_FRONT").update(camera_intrinsic=matrix))
-    assert "calibrated_sensor calibrated CAM_FRONT" in refusal(root)
-
-
-@pytest.mark.parametrize("size", [(0, 54), (96, 0), (-96, 54)])
-def test_an_image_without_a_size_is_refused_naming_it(root, size):
-    edit(root, "sample_data", lambda data: record(data, "0001 CAM_FRONT 4").update(width=size[0], height=size[1]))
-    assert "sample_data 0001 CAM_FRONT 4" in refusal(root)
-
-
-@pytest.mark.parametrize("delay", [-KEY_FRAME_US, -2 * KEY_FRAME_US, -START_US])
-def test_key_frames_out_of_order_are_refused_naming_the_sample(root, delay):
-    edit(root, "sample", lambda samples: samples[4].update(timestamp=samples[4]["timestamp"] + delay))
-    assert "sample 0001 sample 4" in refusal(root)
-
-
-@pytest.mark.parametrize("sensor", ["CAM_FRONT", "LIDAR_TOP"])
-@pytest.mark.parametrize("sweeps", [False, True])
-def test_a_sensors_records_out_of_order_are_refused_naming_one(root, sensor, sweeps):
-    token = f"0001 {sensor} {4 if sensor == 'LIDAR_TOP' else 8}"
-    edit(root, "sample_data", lambda data: record(data, token).update(timestamp=START_US - 10 * KEY_FRAME_US))
-    assert f"sample_data {token}" in refusal(root, sweeps=sweeps)
-
-
-def test_an_image_between_key_frames_out_of_order_is_refused_naming_it(root):
-    edit(root, "sample_data", lambda data: record(data, "0001 CAM_FRONT 5").update(timestamp=START_US))
-    assert "sample_data 0001 CAM_FRONT 5" in refusal(root, sweeps=True)
-
-
-def test_a_chain_of_images_that_ends_early_is_refused_naming_its_end(root):
-    edit(root, "sample_data", lambda data: record(data, "0001 CAM_FRONT 5").update(next=""))
-    assert "sample_data 0001 CAM_FRONT 5" in refusal(root, sweeps=True)
-
-
-@pytest.mark.parametrize(
-    ("table", "token", "key"),
-    [
-        ("sample_data", "0001 CAM_FRONT 4", "ego_pose_token"),
-        ("sample_data", "0001 CAM_FRONT 4", "next"),
-        ("sample", "0001 sample 4", "next"),
-    ],
-)
-def test_a_token_without_a_row_is_refused_naming_it(root, table, token, key):
-    edit(root, table, lambda records: record(records, token).update({key: "nowhere"}))
-    assert "nowhere" in refusal(root, sweeps=True)
 
 
 @pytest.fixture(scope="module")
@@ -590,8 +456,7 @@ def camera_pose(tables: dict, frame: Frame) -> np.ndarray:
     return pose_of(ego["translation"], ego["rotation"]) @ pose_of(sensor["translation"], sensor["rotation"])
 
 
-def test_the_scene_describes_the_sensors_of_the_tiny_drive(tiny_root):
-    scene = extract_scene(source(), tiny_root)
+def test_the_scene_describes_the_sensors_of_the_tiny_drive(scene):
     (camera,), (lidar,) = scene.cameras, scene.lidars
     assert (camera.name, camera.width, camera.height) == ("CAM_FRONT", 96, 54)
     np.testing.assert_array_equal(camera.intrinsics, World().intrinsics)
@@ -601,7 +466,7 @@ def test_the_scene_describes_the_sensors_of_the_tiny_drive(tiny_root):
 
 
 def test_the_returns_of_a_sweep_have_their_intensity_and_ring(root):
-    sweep = extract_scene(source(), root).sweeps[3]
+    sweep = extract_scene(source(), root).sweeps[1]
     file = np.array([[1.0, 2.0, 3.0, 51.0, 7.0], [np.nan, 0.0, 0.0, 1.0, 1.0], [4.0, 5.0, -6.0, 255.0, 31.0]])
     file.astype(np.float32).tofile(sweep.path)
     returns = read_returns(sweep)

@@ -8,18 +8,14 @@ import numpy as np
 import pytest
 from helpers import REPOSITORY
 from helpers.table_files import VERSION, copy_of, edit, extracted
-from helpers.tiny_world import World, write_world
 from PIL import Image
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.nuscenes.object_classes import object_class
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 LIKE_NUSCENES = REPOSITORY / "../shared/data/nuscenes-like-tables"
-
-
-@pytest.fixture(scope="module")
-def small_root(tmp_path_factory) -> Path:
-    return write_world(tmp_path_factory.mktemp("small"), World(key_frames=3, width=48, height=27))
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.small_drives import scene_at
+from helpers.drives import scene_at
 from scipy.spatial.transform import Rotation
 
 from drivesplat.poses import lens

@@ -2,19 +2,21 @@
 
 import json
 import os
-import shutil
 import tracemalloc
 from pathlib import Path
 
 import pytest
-from helpers.tiny_world import World, write_world
+from helpers import drives
+from helpers.drives import World, write_world
+from helpers.table_files import copy_of
 from nuscenes.nuscenes import NuScenes
 
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.nuscenes import scene_tables
 from drivesplat.readers.nuscenes.scene_tables import index_tables, read_scene_tables, rows, scene_file
-from drivesplat.settings.extract import SceneSource
+
+pytestmark = pytest.mark.usefixtures("uncompared")
 
 VERSION, SCENES = "v1.0-mini", ("0001", "0002", "0003")
 
@@ -22,13 +24,13 @@ VERSION, SCENES = "v1.0-mini", ("0001", "0002", "0003")
 @pytest.fixture(scope="module")
 def three_scenes(tmp_path_factory) -> Path:
     """A tiny dataset of three scenes, read only."""
-    return write_world(tmp_path_factory.mktemp("three"), World(scenes=SCENES))
+    return write_world(tmp_path_factory.mktemp("three"), World(scenes=SCENES, key_frames=5, width=48, height=27))
 
 
 @pytest.fixture
 def root(three_scenes, tmp_path) -> Path:
     """A copy of it that a test may change."""
-    return Path(shutil.copytree(three_scenes, tmp_path / "nuscenes"))
+    return copy_of(three_scenes, tmp_path / "nuscenes")
 
 
 def edit(root: Path, table: str, token: str, **changes) -> None:
@@ -89,10 +91,7 @@ def test_rows_keep_the_content_and_order_of_the_tables(root, tmp_path):
 def test_a_scene_read_from_its_rows_equals_the_one_read_from_the_tables(root, tmp_path):
     index_tables(root, VERSION, SCENES, tmp_path)
     for name in SCENES:
-        source = SceneSource(
-            dataset="tiny", reader="nuscenes", version=VERSION, scene=name, frames=None, cameras=("CAM_FRONT",),
-            sweeps=True, lidar_sweeps=True, on_missing="stop",
-        )  # fmt: skip
+        source = drives.source(scene=name, lidar_sweeps=True)
         assert repr(extract_scene(source, root, scene_file(tmp_path, name))) == repr(extract_scene(source, root))
 
 

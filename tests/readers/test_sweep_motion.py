@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import drives
 from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.corrections import Corrections, apply_corrections
@@ -16,16 +17,13 @@ from drivesplat.readers.drive.reader import scene_of as drive_scene
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, read_scene, write_scene
-from drivesplat.settings.extract import SceneSource
 
 SPEED, YAW_RATE = 12.0, 0.4
 """Metres and radians per second."""
 BEGIN = 1_700_000_000_000_000
 SWEEPS = (BEGIN + 200_000, BEGIN + 300_000)
 MOUNT = rigid(Rotation.from_euler("xyz", [0.02, -0.05, 1.5]).as_matrix(), np.array([1.2, -0.4, 1.8]))
-SOURCE = SceneSource(
-    dataset="", reader="drive", version="", scene="it", frames=None, cameras=(), sweeps=False, on_missing="stop"
-)
+SOURCE = drives.source(dataset="", reader="drive", version="", scene="it", cameras=(), sweeps=False)
 
 
 def ego_at(seconds: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import drives
 from helpers.waymo_drive import GLOBAL, NAME, READOUT_S, Drive, panoptic, tiny_drive
 from helpers.waymo_files import write_v1, write_v2
 from PIL import Image
@@ -24,22 +25,23 @@ from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.masks import MaskJob
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 VERSIONS = ("v2", "v1")
+KEY_FRAMES = 6
 WRITERS = {"v2": write_v2, "v1": write_v1}
 
 
 def source(**changes: Any) -> SceneSource:
-    given = {
-        "dataset": "mine", "reader": "waymo", "version": "", "scene": NAME, "frames": None,
-        "cameras": ("FRONT", "SIDE_LEFT"), "sweeps": True, "lidar_sweeps": True, "on_missing": "stop",
-    }  # fmt: skip
-    return SceneSource(**{**given, **changes})
+    given = {"dataset": "mine", "reader": "waymo", "version": "", "scene": NAME, "lidar_sweeps": True}
+    return drives.source(**{**given, "cameras": ("FRONT", "SIDE_LEFT"), **changes})
 
 
 @pytest.fixture(scope="module")
-def recorded(tiny_root) -> tuple[Drive, Scene]:
-    """The tiny drive as Waymo records it, and as nuScenes' tables give it."""
-    return tiny_drive(tiny_root)
+def recorded(tmp_path_factory) -> tuple[Drive, Scene]:
+    """A tiny drive as Waymo records it, and as nuScenes' tables give it."""
+    world = drives.World(key_frames=KEY_FRAMES)
+    return tiny_drive(drives.write_world(tmp_path_factory.mktemp("tables"), world), world)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +163,7 @@ def test_points_of_range_images_are_where_the_rays_end(version, scenes, recorded
     assert [lidar.name for lidar in scene.lidars] == ["TOP", "FRONT", "REAR"]
     by_token = {sweep.token: sweep for sweep in scene.sweeps}
     names = {1: "TOP", 2: "FRONT", 5: "REAR"}
-    assert len(by_token) == len(drive.sweeps) == 30
+    assert len(by_token) == len(drive.sweeps) == 3 * KEY_FRAMES
     for recording in drive.sweeps:
         sweep = by_token[f"{names[recording.laser]}/{recording.frame}"]
         returns = read_returns(sweep)
@@ -224,7 +226,7 @@ def test_a_second_extraction_writes_the_same_bytes_and_leaves_nothing_old(roots,
 def test_floats_of_single_precision_and_keys_as_text_are_read(recorded, scenes, tmp_path):
     root = write_v2(tmp_path / "data", recorded[0], single=True, text_keys=True)
     scene = extract_scene(source(), root, None, tmp_path / "results")
-    assert len(scene.sweeps) == 30
+    assert len(scene.sweeps) == 3 * KEY_FRAMES
     for mine, theirs in zip(scene.frames, scenes["v2"].frames, strict=True):
         np.testing.assert_allclose(
             apply(mine.camera_to_world, np.zeros((1, 3))) + scene.origin,
@@ -245,7 +247,7 @@ def test_labelled_images_give_sky_masks_and_class_maps(version, recorded, tmp_pa
     root = WRITERS[version](tmp_path / "data", replace(recorded[0], labels=[panoptic(frame, 1, classes)]))
     scene = extract_scene(source(cameras=("FRONT",)), root, None, tmp_path / "results")
     assert scene.sky_class == SKY
-    assert [bool(f.classes_path) for f in scene.frames] == [i == 3 for i in range(10)]
+    assert [bool(f.classes_path) for f in scene.frames] == [i == 3 for i in range(KEY_FRAMES)]
     with Image.open(scene.frames[3].classes_path) as image:
         np.testing.assert_array_equal(np.asarray(image), np.where(classes == UNDEFINED, NONE, classes))
     job = MaskJob.model_validate({"masks": {}, "holdout": {}, "images": {}})
@@ -258,7 +260,7 @@ def test_labelled_images_give_sky_masks_and_class_maps(version, recorded, tmp_pa
     np.testing.assert_array_equal(sky[3] == 255, classes == SKY)
     assert (sky[2] == 255)[:20].mean() > 0.2 and not (sky[2] == 255)[40:].any()
     np.testing.assert_array_equal(semantic[3], np.where(classes == ROAD, ROAD, NONE))
-    assert all((semantic[i] == NONE).all() for i in range(10) if i != 3)
+    assert all((semantic[i] == NONE).all() for i in range(KEY_FRAMES) if i != 3)
 
 
 def test_class_maps_of_distorted_images_are_resampled_as_the_images(recorded, tmp_path):

@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers import drives
 from helpers.table_files import time_limit
-from helpers.tiny_world import World, write_world
 from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
 from helpers.waymo_files import tfrecord, write_v1, write_v2
 
@@ -23,7 +23,8 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.waymo.layout import camera_names, find_root, segment_files, table_files
 from drivesplat.readers.waymo.tfrecord import masked_crc
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.extract import SceneSource
+
+pytestmark = pytest.mark.usefixtures("uncompared")
 
 WRITERS = {"v2": write_v2, "v1": write_v1}
 V1_FILE = f"segment-{NAME}_with_camera_labels.tfrecord"
@@ -31,9 +32,8 @@ OTHER = "1234567890123456789_900_000_920_000"
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory) -> Drive:
-    world = World(key_frames=3, width=48, height=27)
-    return tiny_drive(write_world(tmp_path_factory.mktemp("small"), world), world, lasers=(1, 2))[0]
+def drive(small_root) -> Drive:
+    return tiny_drive(small_root, drives.SMALL, lasers=(1, 2))[0]
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +48,8 @@ def written(tmp_path) -> Callable[..., Path]:
 
 
 def extracted(root: Path, folder: Path, **changes: Any) -> Scene:
-    given = {
-        "dataset": "mine", "reader": "waymo", "version": "v1.0-mini", "scene": NAME, "frames": None,
-        "cameras": ("FRONT",), "sweeps": False, "on_missing": "stop",
-    }  # fmt: skip
-    return extract_scene(SceneSource(**{**given, **changes}), root, None, folder)
+    given = {"dataset": "mine", "reader": "waymo", "scene": NAME, "cameras": ("FRONT",), "sweeps": False}
+    return extract_scene(drives.source(**{**given, **changes}), root, None, folder)
 
 
 def refusal(root: Path, folder: Path, **changes: Any) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import REPOSITORY
-from helpers.tiny_world import World, write_world
+from helpers.drives import World, write_world
 from helpers.waymo_drive import NAME, ImageRecording, tiny_drive
 from helpers.waymo_files import write_v1, write_v2
 

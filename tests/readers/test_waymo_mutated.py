@@ -1,4 +1,4 @@
-"""200 damaged Waymo drives, each determined by its seed: read as a sound scene or refused in one line, in time."""
+"""200 damaged Waymo drives: read as a sound scene or refused in one line, in time."""
 
 import math
 import shutil
@@ -13,27 +13,26 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from helpers.mutations import flip_bytes, mutate_bytes
+from helpers import drives
+from helpers.mutations import CHANCE, flip_bytes, fresh, likely, mutate_bytes
 from helpers.table_files import time_limit
-from helpers.tiny_world import World, write_world
 from helpers.waymo_drive import NAME, Drive, tiny_drive
 from helpers.waymo_files import components, frame_message, tfrecord, write_v1, write_v2
+from hypothesis import assume, given, settings
 
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.readers.waymo.names import COMPONENTS
 from drivesplat.scene.scene import Scene, read_scene, write_scene
-from drivesplat.settings.extract import SceneSource
 
 V1_FILE = f"segment-{NAME}_with_camera_labels.tfrecord"
 NUMBERS = [0.0, -1.0, 1e-30, 1e9, 1e30, 1e300, math.nan, math.inf, -math.inf]
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory) -> Drive:
-    world = World(key_frames=3, width=48, height=27)
-    whole = tiny_drive(write_world(tmp_path_factory.mktemp("small"), world), world, lasers=(1, 2))[0]
+def drive(small_root) -> Drive:
+    whole = tiny_drive(small_root, drives.SMALL, lasers=(1, 2))[0]
     return replace(whole, images=[image for image in whole.images if image.camera == 1])
 
 
@@ -47,12 +46,12 @@ def roots(drive, tmp_path_factory) -> dict[str, Path]:
 
 def require_sound_or_one_line(root: Path, folder: Path, random: Random, done: object) -> bool:
     """Reads a drive and its sweeps; whether it was refused."""
-    source = SceneSource(
-        dataset="mine", reader="waymo", version="", scene=NAME, frames=None, cameras=("FRONT",), sweeps=True,
-        lidar_sweeps=True, on_missing=random.choice(["stop", "warn"]),
+    source = drives.source(
+        dataset="mine", reader="waymo", version="", scene=NAME, cameras=("FRONT",), lidar_sweeps=True,
+        on_missing=random.choice(["stop", "warn"]),
     )  # fmt: skip
     try:
-        with time_limit():
+        with time_limit(), drives.uncompared(unless=likely(random, 2)):
             scene = extract_scene(source, root, None, folder)
     except DatasetError as error:
         message = str(error)
@@ -87,16 +86,13 @@ def require_sound(scene: Scene, folder: Path) -> None:
     assert len(read_scene(folder / "scene.json").tracks) == len(scene.tracks)
 
 
-def copied(root: Path, folder: Path) -> Path:
-    return Path(shutil.copytree(root, folder))
-
-
-@pytest.mark.parametrize("seed", range(50))
-def test_damaged_bytes_of_v2(seed, roots, tmp_path):
-    random = Random(seed)
-    root = copied(roots["v2"], tmp_path / "data")
-    done = mutate_bytes(random, root / random.choice(COMPONENTS) / f"{NAME}.parquet")
-    require_sound_or_one_line(root, tmp_path / "out", random, done)
+@settings(max_examples=50)
+@given(random=CHANCE)
+def test_damaged_bytes_of_v2(roots, tmp_path, random):
+    with fresh(tmp_path) as folder:
+        root = Path(shutil.copytree(roots["v2"], folder / "data"))
+        done = mutate_bytes(random, root / random.choice(COMPONENTS) / f"{NAME}.parquet")
+        require_sound_or_one_line(root, folder / "out", random, done)
 
 
 def mutate_rows(random: Random, rows: list[dict[str, Any]]) -> str:
@@ -130,23 +126,27 @@ def mutate_rows(random: Random, rows: list[dict[str, Any]]) -> str:
     return f"{kind} {name}"
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_damaged_values_of_v2(seed, drive, roots, tmp_path):
-    random = Random(seed)
+@settings(max_examples=60)
+@given(random=CHANCE)
+def test_damaged_values_of_v2(drive, roots, tmp_path, random):
     component = random.choice(COMPONENTS)
     rows = components(drive)[component]
     done = f"{component}: {mutate_rows(random, rows)}"
-    root = copied(roots["v2"], tmp_path / "data")
-    pq.write_table(pa.Table.from_pylist(rows), root / component / f"{NAME}.parquet")
-    require_sound_or_one_line(root, tmp_path / "out", random, done)
+    with fresh(tmp_path) as folder:
+        root = Path(shutil.copytree(roots["v2"], folder / "data"))
+        pq.write_table(pa.Table.from_pylist(rows), root / component / f"{NAME}.parquet")
+        require_sound_or_one_line(root, folder / "out", random, done)
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_damaged_bytes_of_v1(seed, roots, tmp_path):
-    random = Random(seed)
-    root = copied(roots["v1"], tmp_path / "data")
-    done = mutate_bytes(random, root / V1_FILE)
-    assert require_sound_or_one_line(root, tmp_path / "out", random, done), "a checksum covers every byte"
+@settings(max_examples=30)
+@given(random=CHANCE)
+def test_damaged_bytes_of_v1(roots, tmp_path, random):
+    with fresh(tmp_path) as folder:
+        root = Path(shutil.copytree(roots["v1"], folder / "data"))
+        whole = (root / V1_FILE).read_bytes()
+        done = mutate_bytes(random, root / V1_FILE)
+        assume((root / V1_FILE).read_bytes() != whole)
+        assert require_sound_or_one_line(root, folder / "out", random, done), "a checksum covers every byte"
 
 
 def mutate_message(random: Random, message: bytes, path: Path) -> bytes:
@@ -159,23 +159,24 @@ def mutate_message(random: Random, message: bytes, path: Path) -> bytes:
         return path.read_bytes()
     if kind == "head":  # of calibrations and poses, which come first
         place = random.randrange(3000)
-        return message[:place] + random.randbytes(1) + message[place + 1 :]
+        return message[:place] + bytes([random.randrange(256)]) + message[place + 1 :]
     if kind == "double":
         place = random.randrange(3000)
         return message[:place] + struct.pack("<d", random.choice(NUMBERS)) + message[place + 8 :]
     return message[:place] if kind == "cut" else message[:place] + message[place // 2 :]
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_damaged_messages_of_v1_with_sound_checksums(seed, drive, tmp_path):
-    random = Random(seed)
+@settings(max_examples=60)
+@given(random=CHANCE)
+def test_damaged_messages_of_v1_with_sound_checksums(drive, tmp_path, random):
     messages = [frame_message(drive, time) for time in drive.frames]
     number = random.randrange(len(messages))
-    messages[number] = mutate_message(random, messages[number], tmp_path / "message")
-    root = tmp_path / "data"
-    root.mkdir()
-    (root / V1_FILE).write_bytes(b"".join(map(tfrecord, messages)))
-    require_sound_or_one_line(root, tmp_path / "out", random, f"frame {number}")
+    with fresh(tmp_path) as folder:
+        messages[number] = mutate_message(random, messages[number], folder / "message")
+        root = folder / "data"
+        root.mkdir()
+        (root / V1_FILE).write_bytes(b"".join(map(tfrecord, messages)))
+        require_sound_or_one_line(root, folder / "out", random, f"frame {number}")
 
 
 def test_most_damage_is_refused_and_undamaged_drives_are_read(roots, tmp_path):

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers import REPOSITORY
+from helpers import REPOSITORY, drives
 from PIL import Image
 
 from drivesplat.preprocess.extract import extract_scene
@@ -20,17 +20,13 @@ from drivesplat.readers.waymo.reader import read
 from drivesplat.readers.waymo.tfrecord import records
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import boxes_at
-from drivesplat.settings.extract import SceneSource
 
 NAME = "1024360143612057520_3580_000_3600_000"
 FILE = Path(
     os.environ.get("WAYMO_ONE_FRAME", REPOSITORY.parent / "shared/data/waymo-one-frame/pvps_data_one_frame.tfrecord")
 )
 pytestmark = pytest.mark.skipif(not FILE.is_file(), reason="the real frame is not there: set WAYMO_ONE_FRAME to it")
-SOURCE = SceneSource(
-    dataset="real", reader="waymo", version="v1", scene=NAME[:19], frames=None, cameras=tuple(CAMERAS.values()),
-    sweeps=True, on_missing="stop",
-)  # fmt: skip
+SOURCE = drives.source(dataset="real", reader="waymo", version="v1", scene=NAME[:19], cameras=tuple(CAMERAS.values()))
 
 
 @pytest.fixture(scope="module")

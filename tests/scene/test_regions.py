@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.classed import classed
-from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World, cast, write_world
+from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, Thing, World, cast, scene_at, seconds_of, write_world
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import LABELS, REGIONS, fill, hull_of, label_image, region_mask, visibility_source
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.tracks import Box
-from drivesplat.settings.extract import SceneSource
 
 SIZE = (384, 216)
 """Four times the size of the tiny drive's images."""
@@ -32,10 +32,9 @@ def inside_by_crossing_number(polygon: np.ndarray, size: tuple[int, int]) -> np.
     return inside
 
 
-@pytest.mark.parametrize("seed", range(20))
-@pytest.mark.parametrize(("middle", "spread"), [((24, 16), 10), ((0, 0), 15), ((48, 30), 20), ((24, 16), 200)])
-def test_fill_selects_the_pixels_with_centres_in_the_polygon(seed, middle, spread):
-    points = np.random.default_rng(seed).normal(middle, spread, (8, 2))
+@given(st.integers(0, 2**32), st.sampled_from([((24, 16), 10), ((0, 0), 15), ((48, 30), 20), ((24, 16), 200)]))
+def test_fill_selects_the_pixels_with_centres_in_the_polygon(seed, place):
+    points = np.random.default_rng(seed).normal(*place, (8, 2))
     polygon = points[ConvexHull(points).vertices]
     for outline in (polygon, polygon[::-1]):
         np.testing.assert_array_equal(fill(outline, (48, 32)), inside_by_crossing_number(polygon, (48, 32)))
@@ -131,24 +130,12 @@ def test_the_hull_moves_with_the_camera():
     np.testing.assert_allclose(hull_of(it, world_to_camera, K), hull_of(moved, np.eye(4), K), atol=1e-2)
 
 
-def scene_of(world: World, folder) -> Scene:
-    source = SceneSource(
-        dataset="tiny", reader="nuscenes", version=world.version, scene="0001", frames=None, cameras=("CAM_FRONT",),
-        sweeps=True, on_missing="stop",
-    )  # fmt: skip
-    return extract_scene(source, write_world(folder, world))
-
-
-def seconds_of(frame: Frame) -> float:
-    return (frame.timestamp - START_US) * 1e-6
-
-
 def rays_of(frame: Frame, world: World) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and rays (h * w, 3) of the frame's camera in the drive, at SIZE, one a pixel centre."""
     focal = 0.62 * SIZE[0]
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5 - SIZE[0] / 2, np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2)
     rays = np.stack([x / focal, y / focal, np.ones_like(x)], axis=-1).reshape(-1, 3) @ CAMERA_TO_EGO.T
-    return world.ego_at(seconds_of(frame)) + CAMERA_AT, rays
+    return world.ego_at(seconds_of(frame.timestamp)) + CAMERA_AT, rays
 
 
 def cast_mask(frame: Frame, world: World, category: str, alone: bool = False) -> np.ndarray:
@@ -158,8 +145,8 @@ def cast_mask(frame: Frame, world: World, category: str, alone: bool = False) ->
     others = [thing for thing in world.things if thing.category != category]
     present = dataclasses.replace(world, things=mine if alone else world.things)
     absent = dataclasses.replace(world, things=[] if alone else others)
-    with_it, _ = cast(present, origin, rays, seconds_of(frame))
-    without, _ = cast(absent, origin, rays, seconds_of(frame))
+    with_it, _ = cast(present, origin, rays, seconds_of(frame.timestamp))
+    without, _ = cast(absent, origin, rays, seconds_of(frame.timestamp))
     return (with_it < without).reshape(SIZE[1], SIZE[0])
 
 
@@ -200,7 +187,7 @@ def test_an_object_between_key_frames_is_labelled_at_its_interpolated_position(t
 
 
 def labels_at_start(things: list[Thing], tmp_path, size=SIZE) -> np.ndarray:
-    scene = scene_of(World(key_frames=2, things=things, sweeps_between=0), tmp_path)
+    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=things, sweeps_between=0)))
     return label_image(scene, scene.frames[0], size)
 
 
@@ -295,7 +282,7 @@ def test_boxes_beyond_80_metres_are_left_out(tmp_path, distance, expected):
 
 
 def test_boxes_under_100_pixels_are_left_out(tmp_path):
-    scene = scene_of(World(key_frames=2, things=[CAR_AHEAD], sweeps_between=0), tmp_path)
+    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=[CAR_AHEAD], sweeps_between=0)))
     seen_as = {}
     for width in range(32, 97, 4):
         labels = label_image(scene, scene.frames[0], (width, width * 9 // 16))
@@ -306,7 +293,7 @@ def test_boxes_under_100_pixels_are_left_out(tmp_path):
 
 
 def test_a_box_of_exactly_100_pixels_is_kept(tmp_path):
-    scene = scene_of(World(key_frames=2, things=[CAR_AHEAD], sweeps_between=0), tmp_path)
+    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=[CAR_AHEAD], sweeps_between=0)))
     sizes = ((width, height) for width in range(40, 80) for height in range(24, 48))
     labelled = (label_image(scene, scene.frames[0], size) for size in sizes)
     exactly = next(labels for labels in labelled if (labels > 0).sum() == 100)
@@ -316,7 +303,7 @@ def test_a_box_of_exactly_100_pixels_is_kept(tmp_path):
 def test_the_nearer_box_wins_whatever_the_order_of_tracks(tmp_path):
     near = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8))
     far = Thing("vehicle.truck", (6.0, 6.0, 4.0), (25.0, 0.0, 2.0))
-    scene = scene_of(World(key_frames=2, things=[near, far], sweeps_between=0), tmp_path)
+    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=[near, far], sweeps_between=0)))
     for tracks in (scene.tracks, scene.tracks[::-1]):
         labels = label_image(dataclasses.replace(scene, tracks=tracks), scene.frames[0], SIZE)
         alone = label_image(dataclasses.replace(scene, tracks=only(scene, "vehicle.car")), scene.frames[0], SIZE)

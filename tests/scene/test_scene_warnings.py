@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from helpers.small_drives import scene_at
-from helpers.tiny_world import World, write_world
+from helpers.drives import World, scene_at, write_world
 from PIL import Image
 
 from drivesplat.scene.scene import Scene

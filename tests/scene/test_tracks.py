@@ -190,7 +190,7 @@ def test_corners_are_half_the_size_from_the_centre_along_the_objects_axes():
 
 
 def test_the_boxes_of_the_tiny_drive_match_its_objects(tiny_scene):
-    from helpers.tiny_world import ORIGIN, START_US, World
+    from helpers.drives import ORIGIN, START_US, World
 
     seconds = 1.1
     boxes = {box.category: box for box in boxes_at(tiny_scene, START_US + round(seconds * 1e6))}

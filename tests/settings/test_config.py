@@ -372,11 +372,12 @@ def test_the_shipped_methods_are_first_whatever_order_snakemake_merges_files_in(
 
 
 def test_overrides_of_a_method_reach_its_own_stages_only():
-    values = {"methods": {"vanilla": {}, "no_sky": {"overrides": {"sky": "none", "train": {"iterations": 5}}}}}
+    methods = {"vanilla": {}, "no_sky": {"overrides": {"sky": "none", "train": {"iterations": 5}}}}
+    values, defaults = load({"methods": methods}), load({})
     assert stage_record(values, "train", method="no_sky")["sky"] == "none"
     assert stage_record(values, "train", method="no_sky")["train"]["iterations"] == 5
     for stage in STAGES:
-        expected = stage_record({}, stage)
+        expected = stage_record(defaults, stage)
         if stage == "export_viewer":  # its page switches to those of all methods
             expected["methods"] = ["no_sky", "vanilla"]
         assert stage_record(values, stage, method="vanilla") == expected
@@ -431,14 +432,22 @@ def reversed_keys(value: Any) -> Any:
     return {key: reversed_keys(value[key]) for key in reversed(value)} if isinstance(value, dict) else value
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stage(defaults, stage):
-    plain = spelled({}, stage)
+@pytest.fixture(scope="module")
+def plain() -> dict[str, str]:
+    """The settings of all stages without any given one."""
+    return spelled_stages({})
+
+
+def spelled_stages(values: dict[str, Any]) -> dict[str, str]:
+    config = load(values)
+    return {stage: spelled(config, stage) for stage in STAGES}
+
+
+def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_any_stage(defaults, plain):
     for values in (defaults, reversed_keys(defaults), {"train": {"iterations": defaults["train"]["iterations"]}}):
-        assert spelled(values, stage) == plain
+        assert spelled_stages(values) == plain
     written_out = {"sky": defaults["sky"], "train": {"iterations": defaults["train"]["iterations"]}}
-    of_methods = merged(defaults, at("methods.vanilla.overrides", written_out))
-    assert spelled(of_methods, stage) == plain
+    assert spelled_stages(merged(defaults, at("methods.vanilla.overrides", written_out))) == plain
 
 
 @pytest.mark.parametrize(
@@ -452,31 +461,29 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate film"),
-        (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
-        (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
+        (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth scans evaluate film"),
+        (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth scans evaluate film"),
         (
             at("cameras", ["CAM_FRONT", "CAM_BACK"]) | at("holdout.cameras", ["CAM_BACK"]),
-            "extract own_car lidar_seed parser masks actors lidar_depth free_space scans train evaluate film",
+            "extract own_car lidar_seed parser masks actors lidar_depth scans train evaluate film",
         ),
-        (at("holdout.last_block", 0), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
+        (at("holdout.last_block", 0), "lidar_seed parser masks actors lidar_depth scans evaluate film"),
         (at("extract.on_missing", "warn"), "extract"),
         (at("lidar_seed.on_missing", "warn"), "lidar_seed scans"),
         (at("lidar_seed.sweeps", True), "extract lidar_seed"),
         (at("lidar_seed.points_file", "a.ply"), "lidar_seed"),
         (at("lidar_seed.voxel_size", 0.2), "lidar_seed"),
-        (at("lidar_seed.own_car_radius", 3), "lidar_seed actors lidar_depth free_space scans evaluate"),
-        (at("lidar_seed.box_margin", 0.3), "lidar_seed lidar_depth free_space evaluate"),
+        (at("lidar_seed.own_car_radius", 3), "lidar_seed actors lidar_depth scans evaluate"),
+        (at("lidar_seed.box_margin", 0.3), "lidar_seed lidar_depth evaluate"),
         (at("actors.humans", True), "actors tracks"),
         (at("datasets.nuscenes.overrides", {"actors": {"max_points": 9}}), "actors tracks"),
         (at("masks.sky_folder", "sky"), "masks"),
         (at("masks.own_car_polygons", {"CAM_FRONT": [[0, 0], [1, 1], [0, 1]]}), "own_car masks"),
         (at("masks.own_car", "auto_measured"), "own_car masks"),
         (at("lidar_depth.ray_spacing", [1, 1]), "lidar_depth evaluate"),
-        (at("free_space.voxel", 1), "free_space"),
         (at("scans.azimuth_steps", 1042), "scans"),
         (at("scans.spin", None), "scans"),
         (at("discover.lidar", "LIDAR_TOP"), "discover"),
-        (at("train.floaters.free_space", True), "train"),
         (at("train.road.reach", 0.2), "train"),
         (at("sky", "none"), "train"),
         (at("train.iterations", 9), "train"),
@@ -519,9 +526,9 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
     ],
     ids=str,
 )
-def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, change, readers):
-    before, after = load(defaults), load(merged(defaults, with_methods_kept(change)))
-    assert {stage for stage in STAGES if spelled(before, stage) != spelled(after, stage)} == set(readers.split())
+def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, plain, change, readers):
+    after = spelled_stages(merged(defaults, with_methods_kept(change)))
+    assert {stage for stage in STAGES if plain[stage] != after[stage]} == set(readers.split())
 
 
 def test_for_a_synthetic_world_the_evaluation_gets_the_settings_of_removal(defaults):

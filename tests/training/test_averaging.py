@@ -21,13 +21,13 @@ from drivesplat.training.train import TrainingRun
 
 def averages(monkeypatch) -> list[dict[str, torch.Tensor]]:
     """The parameters of a model when each iteration of later trainings ends, before a mean is written."""
-    recorded, follow = [], ParameterAverage.follow
+    recorded, update = [], ParameterAverage.update
 
     def recording(average, step, model):
         recorded.append({name: value.detach().clone() for name, value in model.named_parameters()})
-        return follow(average, step, model)
+        return update(average, step, model)
 
-    monkeypatch.setattr(ParameterAverage, "follow", recording)
+    monkeypatch.setattr(ParameterAverage, "update", recording)
     return recorded
 
 
@@ -82,7 +82,7 @@ def test_gaussians_in_empty_space_are_faded_in_the_mean_too(monkeypatch, tmp_pat
             model.parts[0].params["opacities"].data.fill_(3.0)
         return step == average.last
 
-    monkeypatch.setattr(ParameterAverage, "follow", opaque)
+    monkeypatch.setattr(ParameterAverage, "update", opaque)
     settings = settings_of(floaters=FloaterSettings(radius=4.5, every=100))
     model, _ = trained(tmp_path, settings, model=untrained(settings))
     opacities, near = model.parts[0].params["opacities"], model.parts[0].params["means"].norm(dim=1) < 4.0

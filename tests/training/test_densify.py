@@ -20,6 +20,7 @@ from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import CoarseToFineSettings, DefaultSettings, McmcSettings
 from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier, coarse_cap
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.trainer import Trainer
@@ -130,23 +131,19 @@ def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
     assert counts == [100, 100, 105, 105, 110, 110, 115, 115, 118, 118, 118, 118]
 
 
-def test_mcmc_grows_by_the_configured_fraction():
-    counts = densified("mcmc", 8, cap_max=170, mcmc=McmcSettings(refine_every=2, growth=0.25))
-    assert counts == [100, 100, 125, 125, 156, 156, 170, 170]
-
-
 def test_there_are_coarse_cap_in_time_to_become_all():
     """A third more needs six times a twentieth, and another for what is rounded away."""
     coarse = CoarseToFineSettings(fraction=0.75)
     overrides = {"coarse_to_fine": coarse, "refine_stop": 0.8, "mcmc": McmcSettings(refine_every=20)}
     assert coarse_cap(1000, settings_of("mcmc", **overrides)) == (750, 800 - 7 * 20)
-    for left_alone in ({"mcmc": McmcSettings(growth=0.0)}, {"coarse_to_fine": CoarseToFineSettings(fraction=1.0)}):
-        assert coarse_cap(1000, settings_of("mcmc", **{**overrides, **left_alone})) == (1000, 0)
+    alike = {**overrides, "coarse_to_fine": CoarseToFineSettings(fraction=1.0)}
+    assert coarse_cap(1000, settings_of("mcmc", **alike)) == (1000, 0)
     assert coarse_cap(1000, settings_of("default", **overrides)) == (1000, 0)
 
 
-def test_while_images_are_reduced_the_cap_is_lower():
-    model, settings = a_model(100), settings_of("mcmc", cap_max=200, mcmc=McmcSettings(refine_every=1, growth=0.5))
+def test_while_images_are_reduced_the_cap_is_lower(monkeypatch):
+    monkeypatch.setattr(strategies, "GROWTH", 0.5)
+    model, settings = a_model(100), settings_of("mcmc", cap_max=200, mcmc=McmcSettings(refine_every=1))
     densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
     counts = []
     for step, coarse in enumerate([True, True, True, False, False], start=2):

@@ -41,7 +41,7 @@ from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, MaskSe
 from drivesplat.settings.train import TrainJob
 from drivesplat.training import run
 from drivesplat.training.run import TrainingInputs, read_inputs, run_training
-from drivesplat.training.views import Guides, TrainingView, load_views
+from drivesplat.training.views import Supervision, TrainingView, load_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -84,8 +84,8 @@ def test_a_body_before_the_camera_is_not_learned_and_what_it_hides_is(tmp_path):
 def test_images_of_a_camera_share_the_mask_of_the_body_and_have_no_depth_there(tmp_path):
     depth = PixelDepths(np.array([2, 20], np.int32), np.array([3, 4], np.int32), np.array([5.0, 6.0]))
     none = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    guides = Guides({}, {}, dict.fromkeys(range(5), depth), ego_mask={0: CORNER, 1: CORNER.copy(), 3: none})
-    first, second, empty, unknown = load_views(parser_record(tmp_path, recorded_views()), guides, CPU)
+    supervision = Supervision({}, {}, dict.fromkeys(range(5), depth), ego_mask={0: CORNER, 1: CORNER.copy(), 3: none})
+    first, second, empty, unknown = load_views(parser_record(tmp_path, recorded_views()), supervision, CPU)
     assert first.ego_mask.data_ptr() == second.ego_mask.data_ptr() and first.ego_mask.dtype == torch.bool
     np.testing.assert_array_equal(first.ego_mask.numpy(), CORNER)
     assert empty.ego_mask is None and unknown.ego_mask is None, "a mask without pixels costs nothing"
@@ -120,15 +120,15 @@ def views_given(monkeypatch, folder: Path, inputs: TrainingInputs, job: TrainJob
 )
 def test_the_device_holds_sky_masks_where_a_loss_looks_at_them(tmp_path, monkeypatch, sky, changes, held):
     inputs = inputs_in(tmp_path, actors=True)
-    assert inputs.guides(job_of(sky=sky, **changes)).sky
+    assert inputs.supervision(job_of(sky=sky, **changes)).sky
     views = views_given(monkeypatch, tmp_path, inputs, job_of(sky=sky, **changes))
     assert [view.sky is not None for view in views] == [held] * 4
 
 
 def test_only_cameras_that_see_the_body_are_asked_for_it(tmp_path):
     inputs = inputs_in(tmp_path, actors=True)
-    assert inputs.guides(job_of()).ego_mask == {}
-    asked = dataclasses.replace(inputs, cameras_with_ego=frozenset({"CAM_FRONT"})).guides(job_of()).ego_mask
+    assert inputs.supervision(job_of()).ego_mask == {}
+    asked = dataclasses.replace(inputs, cameras_with_ego=frozenset({"CAM_FRONT"})).supervision(job_of()).ego_mask
     assert list(asked) == [0, 1, 3, 4] and not any(mask.any() for mask in asked.values())
 
 

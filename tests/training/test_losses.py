@@ -26,7 +26,6 @@ from drivesplat.training.losses import (
     loss_terms,
     sky_alpha_loss,
 )
-from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import LidarDepth, TrainingView
 
 WIDTH, HEIGHT = 20, 14
@@ -509,20 +508,6 @@ def test_entropy_has_gradients_for_actors_only():
     still, actors = (part.params for part in model.parts)
     assert all(value.grad is None or not value.grad.any() for value in still.values())
     assert actors["opacities"].grad[actors["owner"] == 0].any()
-
-
-def test_iterations_without_the_entropy_of_objects_are_made_up_for():
-    """Every third iteration has the term, three times as large; without objects all are alike."""
-    model, _, view = street()
-    settings = TrainSettings(entropy_every=3, iterations=10, coarse_to_fine={"quarter_until": 0, "half_until": 0})
-    trainer = Trainer.begin(model, [view], settings, 0, torch.device("cpu"))
-    expected = loss_terms(model.render(view.view, 0), view, model, TrainSettings())["entropy"].detach()
-    found = []
-    for _ in range(5):
-        found.append(trainer.fit_one()[0])
-        trainer.step += 1
-    assert ["entropy" in terms for terms in found] == [True, False, False, True, False]
-    torch.testing.assert_close(found[0]["entropy"], 3.0 * expected)
 
 
 # ---- what the ego vehicle hides

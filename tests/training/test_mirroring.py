@@ -14,7 +14,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train_objects import ActorSettings, DeformableSettings
+from drivesplat.settings.train_objects import DeformableSettings
 from drivesplat.training.mirroring import choose_mirrored, mirrored_shares, sets_with_mirrored_objects
 from drivesplat.training.trainer import Trainer
 
@@ -80,7 +80,7 @@ def test_a_rolling_shutter_has_the_velocities_of_what_is_shown(mirrored):
 def test_an_iteration_leaves_out_static_gaussians_and_mirrors_objects():
     model, views = street(1.0), recorded_views()
     trainer = Trainer.begin(model, views, settings_of(dropout=0.5), 0, torch.device("cpu"))
-    _, picture, view = trainer.fit_one()
+    _, picture, view = trainer.training_step()
     recorded = street(0.0).sets_in(view.view)[1]
     static, objects = picture.sets
     assert 0.2 < float((static.opacities == 0.0).float().mean()) < 0.8
@@ -130,9 +130,7 @@ def test_the_images_count_in_which_an_object_is_present():
     assert (model.parts[1].mirrored == 0.4).all(), "without images, as a LiDAR alone"
 
 
-def test_each_part_has_its_own_probability():
+def test_vehicles_are_not_mirrored():
     rigid = untrained_street(settings_of())
-    choose_mirrored(rigid, images_of(10), settings_of(actors=ActorSettings(mirrored=0.3)))
-    torch.testing.assert_close(rigid.parts[1].mirrored, torch.full((2,), 0.3))
     choose_mirrored(rigid, images_of(10), settings_of())
-    assert rigid.parts[1].mirrored is None and rigid.parts[0].mirrored is None, "vehicles are not mirrored by default"
+    assert all(part.mirrored is None for part in rigid.parts)

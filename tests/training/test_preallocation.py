@@ -17,17 +17,21 @@ from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training import strategies
 from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier
-from drivesplat.training.geometry_priors import NO_PRIORS, geometry_terms, road_loss
-from drivesplat.training.losses import loss_terms
+from drivesplat.training.losses import loss_terms, road_loss, surface_terms
 from drivesplat.training.optimizers import Optimizers, make_optimizers
 from drivesplat.training.road import driven_road
+
+
+@pytest.fixture(autouse=True)
+def half_at_a_time(monkeypatch):
+    monkeypatch.setattr(strategies, "GROWTH", 0.5)
 
 
 def grown(preallocates: bool, steps: int, **changes: Any) -> tuple[SplatModel, Densifier, Optimizers, list[float]]:
     """A training that grows by half at a time, and the mean opacity and scale after every
     iteration."""
     torch.manual_seed(0)
-    growing = {"mcmc": McmcSettings(refine_every=2, noise_lr=0.0, growth=0.5), "cap_max": 400}
+    growing = {"mcmc": McmcSettings(refine_every=2, noise_lr=0.0), "cap_max": 400}
     model, settings = a_model(), settings_of("mcmc", **{**growing, **changes})
     densifier = Densifier(model.parts[0], settings, lambda: preallocates)
     (optimizers,) = make_optimizers(model).parts
@@ -53,7 +57,7 @@ def test_preallocated_rows_do_not_change_growth(monkeypatch):
 
 def test_preallocated_rows_learn_nothing():
     """Neither by the loss nor by MCMC's noise."""
-    noisy = McmcSettings(refine_every=2, noise_lr=5e5, growth=0.5)
+    noisy = McmcSettings(refine_every=2, noise_lr=5e5)
     model, densifier, optimizers, _ = grown(True, 4, mcmc=noisy)
     part = model.parts[0]
     rows, moved = slice(len(part), None), part.params["means"].detach().clone()
@@ -69,8 +73,9 @@ def test_preallocated_rows_learn_nothing():
         assert not optimizers[name].state[values]["exp_avg_sq"][rows].any(), name
 
 
-def test_tensors_keep_their_addresses_while_rows_are_preallocated():
-    model, densifier, optimizers, _ = grown(True, 3, mcmc=McmcSettings(refine_every=2, noise_lr=0.0, growth=0.2))
+def test_tensors_keep_their_addresses_while_rows_are_preallocated(monkeypatch):
+    monkeypatch.setattr(strategies, "GROWTH", 0.2)
+    model, densifier, optimizers, _ = grown(True, 3)
     part = model.parts[0]
     places, counts = {name: values.data_ptr() for name, values in part.params.items()}, [len(part)]
     for step in range(3, 5):
@@ -80,8 +85,9 @@ def test_tensors_keep_their_addresses_while_rows_are_preallocated():
     assert {name: values.data_ptr() for name, values in part.params.items()} == places
 
 
-def test_dead_gaussians_are_relocated_and_preallocated_rows_are_not():
-    model, densifier, optimizers, _ = grown(True, 3, mcmc=McmcSettings(refine_every=2, noise_lr=0.0, growth=0.05))
+def test_dead_gaussians_are_relocated_and_preallocated_rows_are_not(monkeypatch):
+    monkeypatch.setattr(strategies, "GROWTH", 0.05)
+    model, densifier, optimizers, _ = grown(True, 3)
     part, count = model.parts[0], len(model)
     with torch.no_grad():
         part.params["opacities"][:30] = -9.0
@@ -139,7 +145,7 @@ def test_preallocated_rows_do_not_change_the_loss():
 def test_preallocated_rows_do_not_change_flatness():
     model, _, _, _ = grown(True, 4)
     part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
-    found = geometry_terms(model.render(a_view()).sets, model, NO_PRIORS, settings)
+    found = surface_terms(model.render(a_view()).sets, model, None, settings)
     expected = part.at(0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
     assert part.preallocated and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
 
@@ -148,7 +154,8 @@ def test_a_training_with_preallocated_rows_resumes_and_leaves_none(tmp_path, mon
     """With every term, and actors, of whom new Gaussians have to belong to someone."""
     reserved = []
     monkeypatch.setattr(IterationGraphs, "invalidate", lambda _: not reserved.append(1))
-    growing = McmcSettings(refine_every=4, growth=0.2)
+    monkeypatch.setattr(strategies, "GROWTH", 0.2)
+    growing = McmcSettings(refine_every=4)
     settings = settings_of_training(iterations=30, checkpoint_every=12, mcmc=growing, refine_start=0.0, **ALL_TERMS)
 
     def done(name: str, views: list) -> tuple[SplatModel, list[int]]:

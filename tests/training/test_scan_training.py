@@ -122,7 +122,7 @@ def test_every_image_is_taken_once_an_epoch_whatever_the_share():
     numbers = []
     for trainer.step in range(16):
         if not trainer.fits_scan:
-            numbers.append(trainer.images.number(trainer._image_step))
+            numbers.append(trainer.images.number(trainer._images_done))
     assert len(numbers) == 8 and sorted(numbers[:4]) == sorted(numbers[4:]) == [0, 1, 2, 3]
 
 
@@ -225,7 +225,7 @@ def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[
     before = {part.name: {k: v.detach().clone() for k, v in learnable(part).items()} for part in model.parts}
     trainer.step = step
     assert trainer.fits_scan
-    terms, picture, view = trainer.fit_one(with_picture=trainer.fine_tunes)
+    terms, picture, view = trainer.training_step(with_picture=trainer.fine_tunes)
     assert picture is None and view is None and "scan_range" in terms
     trainer.densify(picture)
     changed = {
@@ -299,11 +299,11 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
         return model.render(views[0].view).image, float((picture.range - scan.range)[scan.returned].abs().median())
 
     while not trainer.fine_tunes:
-        _, picture, _ = trainer.fit_one(with_picture=False)
+        _, picture, _ = trainer.training_step(with_picture=False)
         trainer.densify(picture)
     image, error = image_and_error()
     while trainer.step < trainer.iterations:
-        _, picture, _ = trainer.fit_one(with_picture=True)
+        _, picture, _ = trainer.training_step(with_picture=True)
         trainer.densify(picture)
     again, better = image_and_error()
     assert torch.equal(again, image) and better < 0.7 * error
@@ -346,7 +346,7 @@ def test_each_kind_of_iteration_learns_its_own_parameters(step, learned):
     before = {name: parameter.detach().clone() for name, parameter in params.items()}
     trainer.step = step
     assert trainer.fits_scan == (step > 0) and trainer.fine_tunes == (step == 600)
-    trainer.fit_one(with_picture=False)
+    trainer.training_step(with_picture=False)
     assert {name for name, parameter in params.items() if not torch.equal(parameter, before[name])} == learned
 
 
@@ -383,7 +383,7 @@ def test_an_iteration_whose_picture_is_wanted_fits_an_image():
         with_echoes(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
     )
     trainer.step = 1
-    terms, picture, view = trainer.fit_one(with_picture=True)
+    terms, picture, view = trainer.training_step(with_picture=True)
     assert picture is not None and view is not None and "l1" in terms
 
 
@@ -460,8 +460,8 @@ def test_without_images_iterations_with_scans_flatten_surfaces():
 
     def terms(inputs: TrainingInputs, **changes: float) -> set[str]:
         begun = prepare(inputs, job_of(iterations=10, **changes, scans=scans), CPU)
-        trainer = Trainer.begin(begun.model, begun.views, begun.settings, 0, CPU, begun.priors, scans=begun.scans)
-        return set(trainer.fit_one()[0])
+        trainer = Trainer.begin(begun.model, begun.views, begun.settings, 0, CPU, begun.road, scans=begun.scans)
+        return set(trainer.training_step()[0])
 
     surfaces = {"flatness_weight": 0.1, "road_weight": 0.1}
     assert terms(without_images(), **surfaces) - terms(without_images()) == {"flatness"}

@@ -52,9 +52,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.io import checkpoint_file
-from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.lidar.depth_record import PixelDepths
-from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
@@ -70,19 +68,18 @@ from drivesplat.settings.train import (
 )
 from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.training import resume_state
-from drivesplat.training.geometry_priors import GeometryPriors
 from drivesplat.training.monitor import NEVER, FiniteGuard, Monitor
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
+from drivesplat.training.probes import Probes
 from drivesplat.training.road import driven_road
 from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
 from drivesplat.training.train import TrainingSummary, train
 from drivesplat.training.trainer import Trainer
-from drivesplat.training.views import Guides, TrainingView, load_views, view_index
-from drivesplat.training.visits import Visits
+from drivesplat.training.views import Supervision, TrainingView, load_views, view_index
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-NO_GUIDES = Guides(sky={}, moving={}, lidar={})
+NO_SUPERVISION = Supervision(sky={}, moving={}, lidar={})
 
 
 def train_whole_and_until_killed(folder: str) -> None:
@@ -154,9 +151,9 @@ def test_visits_see_the_model_and_neither_change_it_nor_count_as_training(tmp_pa
         away.append(3600.0)
 
     visited, plain = untrained(settings), untrained(settings)
-    away, clock = [], time.monotonic  # a visit takes an hour
+    away, clock = [], time.monotonic  # a probe takes an hour
     monkeypatch.setattr(time, "monotonic", lambda: clock() + sum(away))
-    summary = train(visited, views, settings, 0, CPU, folders_of(tmp_path / "a", ""), visits=Visits(4, see))
+    summary = train(visited, views, settings, 0, CPU, folders_of(tmp_path / "a", ""), probes=Probes(4, see))
     assert summary.seconds < 3600.0
     assert [step for step, *_ in seen] == [3, 5, 8, 10]
     assert all(0.0 < earlier[1] < later[1] < summary.seconds + 0.1 for earlier, later in pairwise(seen))
@@ -185,7 +182,7 @@ def test_actors_learn_with_the_background_but_for_those_that_are_absent():
     trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU)
     before = {name: value.detach().clone() for name, value in model.named_parameters()}
     for _ in range(15):
-        trainer.fit_one()
+        trainer.training_step()
         trainer.step += 1
     moved = {name: (value.detach() - before[name]).abs() for name, value in model.named_parameters()}
     first, second = (model.parts[1].params["owner"] == i for i in (0, 1))
@@ -204,7 +201,7 @@ def test_a_degree_that_is_not_shown_as_yet_does_not_learn():
     model = untrained_street(settings)
     trainer = Trainer.begin(model, recorded_views(), settings, 0, CPU)
     for _ in range(5):
-        trainer.fit_one()
+        trainer.training_step()
         trainer.step += 1
     assert all(part.params["shN"].numel() and not part.params["shN"].any() for part in model.parts)
 
@@ -229,21 +226,6 @@ def test_actors_are_no_floaters(tmp_path):
     assert (still < 1e-3).any() and not (actors < 1e-3).any()
 
 
-def all_around(lower: float = -10.0, edge: float = 20.0) -> SparseGrid:
-    """A grid of one cell that holds everything."""
-    return SparseGrid.from_numpy(np.full(3, lower), edge, np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64))
-
-
-@pytest.mark.parametrize("free", [None, all_around()], ids=["unknown", "all free"])
-def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
-    settings = settings_of(iterations=7, refine_start=1.0, floaters=FloaterSettings(every=7, radius=0))
-    model = untrained_street(settings)
-    folders = folders_of(tmp_path, "of this training")
-    train(model, recorded_views(), settings, 0, CPU, folders, GeometryPriors(free=free))
-    still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
-    assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
-
-
 @pytest.mark.parametrize("fades", [False, True])
 def test_gaussians_below_the_road_fade_where_wanted(tmp_path, fades):
     """The road lies above all Gaussians."""
@@ -251,10 +233,10 @@ def test_gaussians_below_the_road_fade_where_wanted(tmp_path, fades):
     poses[0, 2, 3] = 4.5
     floaters = FloaterSettings(every=7, radius=0, below_road=fades)
     settings = settings_of(iterations=7, refine_start=1.0, floaters=floaters, road_weight=0.1)
-    model, priors = untrained_street(settings), GeometryPriors(road=driven_road(poses, wide))
-    low = priors.road.is_above(model.parts[0].params["means"].detach())
+    model, road = untrained_street(settings), driven_road(poses, wide)
+    low = road.is_above(model.parts[0].params["means"].detach())
     assert low.any()
-    train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "of this training"), priors)
+    train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "of this training"), road)
     still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
     assert bool((still[low] < 1e-3).all()) == fades and not (actors < 1e-3).any()
 
@@ -265,7 +247,7 @@ def test_an_iteration_with_dropout_leaves_out_static_gaussians_and_others_next_t
     still, _ = trainer.model.rows
     left_out = []
     for _ in range(2):
-        _, picture, _ = trainer.fit_one()
+        _, picture, _ = trainer.training_step()
         left_out.append(picture.shapes.opacities[still] == 0.0)
     assert all(0.1 < float(mask.float().mean()) < 0.5 for mask in left_out) and not torch.equal(*left_out)
     assert (trainer.model.gaussians_at(0.0).opacities[still] > 0.0).all()
@@ -291,14 +273,14 @@ def test_a_training_applies_the_flatness_and_road_losses():
     settings = settings_of(flatness_weight=0.2, road_weight=0.3)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, 2, 3], poses[:, 0, 3] = 4.5, [-1.0, 1.0]
-    priors = GeometryPriors(road=driven_road(poses, settings.road))
-    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, priors)
+    road = driven_road(poses, settings.road)
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, road)
     before = trainer.model.gaussians_at(0.0)
-    terms, *_ = trainer.fit_one()
+    terms, *_ = trainer.training_step()
     torch.testing.assert_close(terms["flatness"], 0.2 * before.scales.amin(dim=1).mean())
     assert float(terms["road"].detach()) > 0.0
     plain = Trainer.begin(untrained(settings_of()), recorded_views(), settings_of(), 0, CPU)
-    assert plain.fit_one()[0].keys() == terms.keys() - {"flatness", "road"}
+    assert plain.training_step()[0].keys() == terms.keys() - {"flatness", "road"}
 
 
 def test_static_methods_have_no_settings_of_dynamic_parts():
@@ -369,7 +351,7 @@ def test_the_order_of_views_depends_on_the_seed():
 
 def test_views_are_the_training_images_and_no_others(tmp_path):
     recorded = recorded_views()
-    loaded = load_views(parser_record(tmp_path, recorded), NO_GUIDES, CPU)
+    loaded = load_views(parser_record(tmp_path, recorded), NO_SUPERVISION, CPU)
     assert len(loaded) == 4
     for view, expected in zip(loaded, [recorded[i] for i in (0, 1, 3, 4)], strict=True):
         assert torch.equal(view.pixels, expected.pixels) and view.sky is None
@@ -385,8 +367,10 @@ def test_views_know_what_guides_say_of_their_image(tmp_path):
         mask[i] = True
     depths = {3: PixelDepths(np.array([0, 2], np.int32), np.array([7, 1], np.int32), np.array([4.5, 9.0]))}
     none = PixelDepths(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
-    guides = Guides(sky=masks, moving={i: masks[4 - i] for i in masks}, lidar={**depths, 4: none})
-    loaded = dict(zip((0, 1, 3, 4), load_views(parser_record(tmp_path, recorded_views()), guides, CPU), strict=True))
+    supervision = Supervision(sky=masks, moving={i: masks[4 - i] for i in masks}, lidar={**depths, 4: none})
+    loaded = dict(
+        zip((0, 1, 3, 4), load_views(parser_record(tmp_path, recorded_views()), supervision, CPU), strict=True)
+    )
     for i, view in loaded.items():
         assert view.sky.nonzero()[:, 0].unique().tolist() == [i]
         assert view.moving.nonzero()[:, 0].unique().tolist() == [4 - i]
@@ -755,24 +739,6 @@ def test_views_that_show_no_gaussian_are_no_error(tmp_path):
     assert summary.iterations == 10
 
 
-@pytest.mark.parametrize(
-    ("strategy", "absgrad", "asked"), [("mcmc", True, False), ("default", True, True), ("default", False, False)]
-)
-def test_absolute_gradients_are_asked_for_by_the_default_strategy_alone(monkeypatch, strategy, absgrad, asked):
-    settings = settings_of(strategy, default=DefaultSettings(absgrad=absgrad))
-    trainer = Trainer.begin(untrained(settings), recorded_views(1), settings, 0, CPU)
-    render, rendered = trainer.model.render, []
-    monkeypatch.setattr(trainer.model, "render", lambda *a, **k: rendered.append(k["absgrad"]) or render(*a, **k))
-    trainer.fit_one()
-    assert rendered == [asked]
-
-
-def test_absolute_gradients_grow_gaussians_on_the_cpu(tmp_path):
-    settings = settings_of("default", default=DefaultSettings(absgrad=True, grow_grad2d=1e-3, refine_every=5))
-    _, summary = trained(tmp_path, settings)
-    assert summary.gaussians > len(untrained(settings))
-
-
 # ---- what it tells
 
 
@@ -832,18 +798,6 @@ def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
     assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
 
 
-EVERYWHERE = FreeSpace(np.full(3, -10.0), np.ones(3, np.int64), 20.0, np.zeros(1, np.int64))
-"""Free space that holds all there is."""
-
-
-def test_a_training_keeps_gaussians_out_of_the_free_space_that_it_is_given(tmp_path):
-    """Where that is everywhere, none is left."""
-    inputs = dataclasses.replace(inputs_in(tmp_path), free_space=EVERYWHERE)
-    job = job_of(floaters=FloaterSettings(every=7, radius=0, free_space=True))
-    with pytest.raises(TrainingError, match="no Gaussian is left"):
-        run_training(inputs, job, DeviceSettings(kind="cpu"), files_in(tmp_path / "vanilla"), PROVENANCE, "train")
-
-
 def test_the_terms_about_surfaces_are_logged(tmp_path):
     files = run(tmp_path, job_of(flatness_weight=0.1, road_weight=0.1))
     board = EventAccumulator(str(files.checkpoint.parent / "tensorboard"))
@@ -872,18 +826,18 @@ def test_a_finished_training_of_actors_can_be_rendered_from_its_checkpoint_alone
 )
 def test_only_what_a_training_asks_for_is_read(tmp_path, parts, changes, known):
     """Masks are read by the training images; of people that move, too, is known that they do."""
-    guides = inputs_in(tmp_path, actors=True).guides(job_of(parts, **changes))
-    by_kind = {name: getattr(guides, name) for name in ("sky", "moving", "lidar")}
+    supervision = inputs_in(tmp_path, actors=True).supervision(job_of(parts, **changes))
+    by_kind = {name: getattr(supervision, name) for name in ("sky", "moving", "lidar")}
     assert {name for name, images in by_kind.items() if images} == known
     assert all(list(images) == [0, 1, 3, 4] for images in by_kind.values() if images)
     if "moving" in known:
-        assert guides.moving[3][HEIGHT // 2 :].all() and not guides.moving[3][: HEIGHT // 2].any()
+        assert supervision.moving[3][HEIGHT // 2 :].all() and not supervision.moving[3][: HEIGHT // 2].any()
     if "sky" in known:
-        np.testing.assert_array_equal(guides.sky[3], np.eye(HEIGHT, WIDTH, 3, dtype=bool))
+        np.testing.assert_array_equal(supervision.sky[3], np.eye(HEIGHT, WIDTH, 3, dtype=bool))
 
 
 def test_a_sky_that_is_modelled_is_read(tmp_path):
-    assert inputs_in(tmp_path, actors=True).guides(job_of(sky="cubemap")).sky
+    assert inputs_in(tmp_path, actors=True).supervision(job_of(sky="cubemap")).sky
 
 
 def test_where_no_sky_is_known_what_is_below_the_horizon_cannot_be_sky(tmp_path):
@@ -893,9 +847,9 @@ def test_where_no_sky_is_known_what_is_below_the_horizon_cannot_be_sky(tmp_path)
     record = dataclasses.replace(inputs.record, camtoworlds=np.stack([level] * 5))
     inputs = dataclasses.replace(inputs, record=record, sky_known=False)
     losses = {"sky_bce_weight": 0.1, "horizon_weight": 0.1, "dynamic_weight": 0.1}
-    guides = inputs.guides(job_of(("background", "actors"), sky="cubemap", **losses))
-    assert not guides.sky and guides.moving and list(guides.not_sky) == [0, 1, 3, 4]
-    for view, i in zip(load_views(inputs.record, guides, CPU), guides.not_sky, strict=True):
+    supervision = inputs.supervision(job_of(("background", "actors"), sky="cubemap", **losses))
+    assert not supervision.sky and supervision.moving and list(supervision.not_sky) == [0, 1, 3, 4]
+    for view, i in zip(load_views(inputs.record, supervision, CPU), supervision.not_sky, strict=True):
         expected = below_horizon(record.Ks[i], level, (WIDTH, HEIGHT))
         assert view.sky is None and 0 < expected.sum() < expected.size
         np.testing.assert_array_equal(view.not_sky.numpy(), expected)
@@ -904,7 +858,7 @@ def test_where_no_sky_is_known_what_is_below_the_horizon_cannot_be_sky(tmp_path)
 @pytest.mark.parametrize(("sky_known", "weight"), [(True, 0.1), (False, 0.0)])
 def test_the_horizon_is_not_asked_for_where_the_sky_is_known_or_nothing_uses_it(tmp_path, sky_known, weight):
     inputs = dataclasses.replace(inputs_in(tmp_path, actors=True), sky_known=sky_known)
-    assert not inputs.guides(job_of(sky="cubemap", horizon_weight=weight)).not_sky
+    assert not inputs.supervision(job_of(sky="cubemap", horizon_weight=weight)).not_sky
 
 
 def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):

@@ -1,17 +1,15 @@
-"""What some methods train on and others do not: the stages `actors`, `lidar_depth` and `free_space` run for those that
-take them."""
+"""What some methods train on and others do not: the stages `actors` and `lidar_depth` run for those that take them."""
 
 import pytest
 from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.lidar.depth_record import read_lidar_depth
-from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.scene.actor_record import read_actors
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("inputs")]
 
 ACTORS = ["background", "actors"]
-HELD = {"train": {"depth_weight": 0.01, "road_weight": 0.1, "floaters": {"free_space": True}}}
+HELD = {"train": {"depth_weight": 0.01, "road_weight": 0.1}}
 TRAININGS = [f"results/0001/{method}/train.json" for method in ("vanilla", "mine")]
 
 
@@ -32,10 +30,8 @@ def test_the_stages_leave_records_that_know_where_they_come_from(trained):
     assert sum(len(image) > 0 for image in depth.images) == 5
     assert actors.provenance["stages"].keys() == {"extract", "own_car", "actors"}
     assert depth.provenance["stages"].keys() == {"extract", "own_car", "lidar_depth"}
-    free = read_free_space(folder / "free_space.npz")
-    assert len(free.keys) > 1000 and free.provenance["stages"].keys() == {"extract", "free_space"}
     made_from = [trained.read(training)["provenance"]["stages"].keys() for training in TRAININGS]
-    assert made_from[1] - made_from[0] == {"actors", "lidar_depth", "free_space", "mine/train"}
+    assert made_from[1] - made_from[0] == {"actors", "lidar_depth", "mine/train"}
 
 
 @pytest.mark.parametrize(
@@ -44,8 +40,7 @@ def test_the_stages_leave_records_that_know_where_they_come_from(trained):
         ({}, {}),
         ({"actors": {"random_points": 300}}, {"actors": 1, "train": 1}),
         ({"lidar_seed": {"own_car_radius": 3.0}},
-         {"lidar_seed": 1, "parser": 1, "actors": 1, "lidar_depth": 1, "free_space": 1, "train": 2}),
-        ({"free_space": {"voxel": 0.5}}, {"free_space": 1, "train": 1}),
+         {"lidar_seed": 1, "parser": 1, "actors": 1, "lidar_depth": 1, "train": 2}),
         ({"random_seed": 1}, {"lidar_seed": 1, "parser": 1, "actors": 1, "train": 2}),
         ({"methods": {"mine": {"parts": ACTORS}}}, {"train": 1}),
     ],
@@ -69,7 +64,6 @@ def test_a_changed_setting_reruns_its_stage_and_the_trainings_that_take_it(train
     [
         ("drivesplat/preprocess/actor_seed.py", "UNSEEN = 127", "UNSEEN = 128", {"actors": 1, "train": 1}),
         ("drivesplat/lidar/depth.py", "< interval", "<= interval", {"lidar_depth": 1, "train": 1}),
-        ("drivesplat/lidar/traversal.py", "OCCUPIED - 1:", "OCCUPIED - 2:", {"free_space": 1, "train": 1}),
     ],
 )
 def test_code_that_makes_them_reruns_no_training_that_does_not_take_them(trained, file, old, new, expected):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.tiny_world import Thing, World, default_things
+from helpers.drives import Thing, World, default_things
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
 
 from drivesplat.io.video import read_footage

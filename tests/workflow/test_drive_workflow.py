@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.killed_runs import VANILLA
+from helpers.shared_runs import VANILLA
 from helpers.workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.errors import DatasetError
@@ -17,15 +17,15 @@ pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("drive_workflow")]
 
 
 @pytest.fixture(scope="module")
-def copy(tmp_path_factory) -> WorkflowCopy:
-    """The tiny drive's tables, and the drive folder written from them as another scene."""
-    datasets = {
+def copy(finished_run, tmp_path_factory) -> WorkflowCopy:
+    """The tiny drive's tables, measured, and the drive folder written from them as another scene."""
+    made = finished_run.again(tmp_path_factory.mktemp("drive") / "workflow")
+    made.config["datasets"] = {
         "nuscenes": {"dataroot": "data", "scenes": ["0001"]},
         "mine": {"reader": "drive", "dataroot": "drives", "scenes": ["monday"]},
     }
-    made = WorkflowCopy.make(tmp_path_factory.mktemp("drive") / "workflow", datasets=datasets, methods=VANILLA)
-    done = made.run("results/0001/metrics.json")
-    assert done.returncode == 0, done.stdout
+    made.config["methods"] = VANILLA
+    made.write_config()
     with chdir(made.folder):
         write_drive(read_scene("results/0001/scene.json"), Path("drives/monday"))
     return made

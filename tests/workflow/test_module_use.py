@@ -11,7 +11,7 @@ import pytest
 import yaml
 from helpers import REPOSITORY
 from helpers.forked_snakemake import run_snakemake
-from helpers.killed_runs import VANILLA
+from helpers.shared_runs import VANILLA
 from helpers.workflow_copy import WorkflowCopy
 from snakemake.path_modifier import PathModifier
 

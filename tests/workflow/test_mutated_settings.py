@@ -4,12 +4,12 @@ import copy
 import math
 from collections.abc import Iterator
 from datetime import date, datetime
-from random import Random
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
+import hypothesis
 from helpers import REPOSITORY
+from hypothesis import strategies as st
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.settings.config import Config
@@ -60,9 +60,12 @@ def test_a_value_of_another_kind_is_refused_in_one_sentence_or_taken(monkeypatch
     (tmp_path / "presets").symlink_to(REPOSITORY / "presets")
     monkeypatch.chdir(tmp_path)
     plan(config)
-    random, places, refused = Random(20), list(paths(config)), 0
-    for _ in range(MUTATIONS):
-        path, value = random.choice(places), random.choice(VALUES)
+    refused = 0
+
+    @hypothesis.settings(max_examples=MUTATIONS)
+    @hypothesis.given(st.sampled_from(list(paths(config))), st.sampled_from(VALUES))
+    def replaced(path: tuple[str, ...], value: Any) -> None:
+        nonlocal refused
         values = copy.deepcopy(config)
         at = values
         for key in path[:-1]:
@@ -73,6 +76,6 @@ def test_a_value_of_another_kind_is_refused_in_one_sentence_or_taken(monkeypatch
         except DriveSplatError as refusal:
             assert "\n" not in str(refusal) and len(str(refusal)) < 1500, (path, value)
             refused += 1
-        except Exception as error:
-            pytest.fail(f"{'.'.join(path)} = {value!r:.80}: {type(error).__name__}: {error}")
+
+    replaced()
     assert refused > MUTATIONS / 2, "mutations that are refused"

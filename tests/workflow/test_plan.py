@@ -23,7 +23,6 @@ ACTORS = ["background", "actors"]
 DRIFTING = ["background", "drifting"]
 HELD = {"train": {"depth_weight": 0.01}}
 LIDAR = {"train": {"scans": {"per_image": 0.3}}}
-KEPT_OUT = {"train": {"floaters": {"free_space": True}}}
 
 
 def plan(**values: Any) -> Plan:
@@ -65,12 +64,6 @@ def test_depth_is_an_input_of_trainings_supervised_with_it():
     assert taken(made, "a1", "vanilla") == []
 
 
-def test_free_space_is_an_input_where_a_training_keeps_gaussians_out_of_it():
-    made = plan(methods={"vanilla": {}, "kept_out": {"overrides": KEPT_OUT}})
-    assert taken(made, "a1", "kept_out") == ["elsewhere/a1/free_space.npz"]
-    assert taken(made, "a1", "vanilla") == []
-
-
 def test_depth_follows_the_overrides_of_dataset_and_method():
     free = {"overrides": {"train": {"depth_weight": 0.0}}}
     made = plan(methods={"vanilla": {}, "free": free}, b=HELD)
@@ -87,7 +80,6 @@ def test_depth_follows_the_overrides_of_dataset_and_method():
         ({"vanilla": {}}, {"a1": set(), "b1": {"lidar_depth"}}),
         ({"vanilla": {}, "mine": {"parts": ACTORS}}, {"a1": {"actors"}, "b1": {"actors", "lidar_depth"}}),
         ({"vanilla": {}, "held": {"overrides": HELD}}, {"a1": {"lidar_depth"}, "b1": {"lidar_depth"}}),
-        ({"vanilla": {}, "kept": {"overrides": KEPT_OUT}}, {"a1": {"free_space"}, "b1": {"free_space", "lidar_depth"}}),
         (
             {"mine": {"parts": ACTORS, "overrides": {"train": {"depth_weight": 0}}}},
             {"a1": {"actors"}, "b1": {"actors"}},
@@ -142,16 +134,7 @@ def test_poses_are_refined_unless_they_are_known_to_be_exact(world, enabled, ref
     ],
 )
 def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_they_are_wanted(settings, taken):
-    assert plan(**settings).triangulated("lidar_seed")(SimpleNamespace(scene="a1")) == taken
-
-
-@pytest.mark.parametrize(
-    ("settings", "taken"),
-    [({}, 0), (REFINED, 1), ({**REFINED, "free_space": {"triangulated": False}}, 0)],
-)
-def test_triangulated_points_are_an_input_of_free_space_where_there_are_any_and_they_are_wanted(settings, taken):
-    found = plan(**settings).triangulated("free_space")(SimpleNamespace(scene="a1"))
-    assert found == ["elsewhere/a1/triangulated.npz"] * taken
+    assert plan(**settings).triangulated(SimpleNamespace(scene="a1")) == taken
 
 
 def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
@@ -196,15 +179,13 @@ def test_each_stage_gets_the_settings_that_determine_it():
         "actors": {"humans": True}, "holdout": {"last_block": 2}, "images": {"width": 320}, "random_seed": 7,
         "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3},
     }  # fmt: skip
-    values |= {"free_space": {"voxel": 0.4}, "lidar_depth": {"ray_spacing": [0.2, 0.4]}}
-    actors, depth, free = (stage_record(stage, **values) for stage in ("actors", "lidar_depth", "free_space"))
+    values |= {"lidar_depth": {"ray_spacing": [0.2, 0.4]}}
+    actors, depth = (stage_record(stage, **values) for stage in ("actors", "lidar_depth"))
     for record in (actors, depth):
         assert (record["holdout"]["last_block"], record["images"]["width"], record["own_car_radius"]) == (2, 320, 3.0)
     assert (actors["actors"]["humans"], actors["random_seed"]) == (True, 7)
     assert depth["box_margin"] == 0.3 and "actors" not in depth and "random_seed" not in depth
     assert depth["ray_spacing"] == [0.2, 0.4] and stage_record("evaluate", **values)["lidar"] == depth
-    assert (free["free_space"]["voxel"], free["holdout"]["last_block"]) == (0.4, 2)
-    assert (free["own_car_radius"], free["box_margin"]) == (3.0, 0.3) and "images" not in free
 
 
 def test_a_dataset_may_set_its_actors_for_itself():

@@ -4,7 +4,7 @@ import base64
 from pathlib import Path
 
 import pytest
-from helpers.killed_runs import VANILLA
+from helpers.shared_runs import VANILLA
 from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.workflow.snakemake_records import drop_foreign_records

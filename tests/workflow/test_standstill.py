@@ -5,8 +5,8 @@ import json
 
 import numpy as np
 import pytest
+from helpers.drives import World, write_world
 from helpers.small_runs import Finished, run
-from helpers.tiny_world import World, write_world
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from drivesplat.editing.actors import editable_actors

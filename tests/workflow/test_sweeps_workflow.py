@@ -1,8 +1,8 @@
 """Images and LiDAR between key frames through the whole workflow, as users run it, one image missing."""
 
 import pytest
+from helpers.drives import World
 from helpers.small_runs import BASE
-from helpers.tiny_world import World
 from helpers.workflow_copy import WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("sweeps_workflow")]

@@ -15,7 +15,7 @@ from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import stage_settings
 
 ACTORS = ["background", "actors"]
-SUPERVISED = {"train": {"depth_weight": 0.01, "scans": {"per_image": 0.2}, "floaters": {"free_space": True}}}
+SUPERVISED = {"train": {"depth_weight": 0.01, "scans": {"per_image": 0.2}}}
 METHODS = {
     "vanilla": {},
     "street": {"parts": ACTORS, "overrides": SUPERVISED},
@@ -53,10 +53,8 @@ def test_a_training_reads_what_was_made_for_its_tracks(method, folder):
     made, job = plan(), at(method)
     assert made.scene(job) == f"{folder}/scene.json" and made.of_tracks("parser.pkl")(job) == f"{folder}/parser.pkl"
     assert made.images_of_tracks("masks/masks.json")(job) == [f"{folder}/masks/masks.json"]
-    stages = ("actors", "lidar_depth", "free_space", "scans") if method != "blind" else ()
-    taken = [
-        file for stage in ("actors", "lidar_depth", "free_space", "scans") for file in made.training_input(stage)(job)
-    ]
+    stages = ("actors", "lidar_depth", "scans") if method != "blind" else ()
+    taken = [file for stage in ("actors", "lidar_depth", "scans") for file in made.training_input(stage)(job)]
     assert taken == [f"{folder}/{stage}.npz" for stage in stages]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.archives import NO_FILES, addresses, addresses_in_results, dead_links
 from helpers.chromium import chromium, in_a_browser
+from helpers.shared_runs import CAR, EDITS, two_edits
 from helpers.workflow_copy import WorkflowCopy, complaints
 from PIL import Image
 
@@ -23,38 +24,10 @@ pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("workflow")]
 REGIONS = ("all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human")
 
 
-CAR = "0001 instance 0"
-"""The one vehicle that moves in the tiny world, 8 m ahead of the camera's car."""
-STREET = {"sky": "none", "train": {"strategy": "default", "depth_weight": 0.01}}
-EDITS = """\
-edits:
-  gone:
-    - remove: {track: 0001 instance 0}
-  stop:
-    - shift: {track: 0001 instance 0, lateral: 1.0}
-    - stop: {track: 0001 instance 0, at: 2}
-"""
-
-
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> WorkflowCopy:
-    """The workflow run to its end on one scene with two methods and two edits."""
-    copy = with_two_edits(tmp_path_factory.mktemp("finished"))
-    done = copy.run()
-    assert done.returncode == 0, done.stdout
-    return copy
-
-
-def with_two_edits(folder: Path) -> WorkflowCopy:
-    """A workflow of one scene with two methods and two edits."""
-    copy = WorkflowCopy.make(
-        folder,
-        datasets={"nuscenes": {"dataroot": "data", "scenes": ["0001"], "edits": {"0001": "edits.yaml"}}},
-        methods={"vanilla": {}, "street": {"parts": ["background", "actors"], "overrides": STREET}},
-        actors={"random_points": 200},
-    )
-    (copy.folder / "edits.yaml").write_text(EDITS)
-    return copy
+def finished(finished_run, tmp_path_factory) -> WorkflowCopy:
+    """A copy of the finished run; what a test changes in it, it changes back."""
+    return finished_run.again(tmp_path_factory.mktemp("finished") / "workflow")
 
 
 def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
@@ -98,8 +71,8 @@ def test_the_report_has_a_row_per_scene_and_method(finished):
 @pytest.mark.slow
 def test_scripts_in_new_interpreters_make_the_same_files(finished, tmp_path):
     """In other tests scripts are forked from a process with other packages imported (`helpers.forked_scripts`)."""
-    copy = with_two_edits(tmp_path / "workflow")
-    done = copy.run(under=("env",))
+    copy = two_edits(tmp_path / "workflow")
+    done = copy.run("all", "results/0001/scans.npz", under=("env",))
     assert done.returncode == 0, done.stdout
     made, expected = (set(files_without_logs(one.folder / "results")) for one in (copy, finished))
     assert made == expected and made

@@ -17,6 +17,7 @@ from drivesplat.readers.checks import (
 from drivesplat.readers.drive.format import Distortion, Drive, Pose, TimedPose
 from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
+from drivesplat.readers.record_names import shown
 from drivesplat.scene.lens import lens_fault
 
 MAX_ELEVATION = 1.6
@@ -183,7 +184,7 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
         for i, (sensor, time, file, needs_ego) in enumerate(records):
             where = f"{list_name}[{i}]"
             if sensor not in known:
-                yield f"{where}: {kind} {sensor!r} is not in {kind}s; there are: {', '.join(known) or 'none'}"
+                yield f"{where}: {kind} {shown(sensor)} is not in {kind}s; there are: {', '.join(known) or 'none'}"
             if (sensor, time) in seen:
                 yield f"{where}: {list_name}[{seen[sensor, time]}] has the same {kind} and timestamp"
             seen[sensor, time] = i

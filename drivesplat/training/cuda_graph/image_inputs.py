@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.time_states import TimeStates
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.views import LidarDepth, TrainingView
@@ -81,11 +80,10 @@ class SharedImageInputs:
         return LidarDepth(pixels, depth, torch.zeros((), dtype=torch.int64, device=depth.device))
 
 
-def can_share(model: SplatModel, image: TrainingView) -> bool:
+def can_share(image: TrainingView) -> bool:
     """Whether an iteration with an image depends on nothing but its tensors, the parts' time states and, with
     exposures, the name of its camera. Otherwise Python looks up what belongs to its time: its graph serves no other."""
-    looks_up = model.camera_poses is not None or any(part.penalties_depend_on_time for part in model.parts)
-    return image.view.shutter is None and image.classes is None and not looks_up
+    return image.view.shutter is None and image.classes is None
 
 
 def _tensors(image: TrainingView, states: TimeStates) -> list[Tensor]:

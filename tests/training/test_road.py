@@ -1,6 +1,5 @@
 """Surfaces are flat, and the road is where the car drove: the terms, what they pull on, and what they leave alone."""
 
-import dataclasses
 import logging
 
 import numpy as np
@@ -20,13 +19,7 @@ from drivesplat.scene.training_record import SeedInfo, TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP
-from drivesplat.training.geometry_priors import (
-    NO_PRIORS,
-    GeometryPriors,
-    geometry_priors,
-    geometry_terms,
-    road_loss,
-)
+from drivesplat.training.losses import road_loss, surface_terms
 from drivesplat.training.road import CELL, LIDAR_CELL, driven_road, lidar_road, road_of
 
 WIDE = RoadSettings(half_width=1.2, reach=0.3)
@@ -306,17 +299,17 @@ def a_street() -> SplatModel:
     return SplatModel([still, moving], None)
 
 
-def known() -> GeometryPriors:
-    return GeometryPriors(road=driven_road(straight(), WIDE))
+def known() -> Road:
+    return driven_road(straight(), WIDE)
 
 
 def test_terms_are_weighted_and_apply_to_static_parts_only():
     model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
-    terms = geometry_terms(picture.sets, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
+    terms = surface_terms(picture.sets, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
     still = model.parts[0].at(0.0)
     torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
-    torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known().road))
+    torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known()))
     assert float(terms["road"].detach()) > 0.0
     sum(terms.values()).backward()
     moving = [*model.parts[1].params.values(), *model.parts[1].shared.values()]
@@ -325,16 +318,11 @@ def test_terms_are_weighted_and_apply_to_static_parts_only():
 
 
 def test_without_their_weights_there_are_no_terms():
-    model, record = a_street(), training_record_of(len(straight()), ego_to_world=straight())
+    model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
-    plain = TrainSettings()
-    assert geometry_priors(record, None, plain) == NO_PRIORS
-    assert geometry_terms(picture.sets, model, geometry_priors(record, None, plain), plain) == {}
-    for changes, term in (({"flatness_weight": 0.1}, "flatness"), ({"road_weight": 0.1}, "road")):
-        settings = TrainSettings(**changes)
-        priors = geometry_priors(record, None, settings)
-        assert geometry_terms(picture.sets, model, priors, settings).keys() == {term}
-    assert geometry_priors(training_record_of(0), None, TrainSettings(road_weight=0.1)) == NO_PRIORS
+    assert surface_terms(picture.sets, model, None, TrainSettings()) == {}
+    assert surface_terms(picture.sets, model, None, TrainSettings(flatness_weight=0.1)).keys() == {"flatness"}
+    assert surface_terms(picture.sets, model, known(), TrainSettings(road_weight=0.1)).keys() == {"road"}
 
 
 def test_flatness_makes_the_shortest_axis_shorter_and_no_other():
@@ -347,6 +335,6 @@ def test_flatness_makes_the_shortest_axis_shorter_and_no_other():
     assert (part.params["scales"].grad > 0).tolist() == [[False, True, False], [False, False, True]]
 
 
-def test_priors_move_to_the_requested_device():
-    moved = dataclasses.replace(known(), free=None).to(torch.device("meta"))
-    assert moved.free is None and {t.device.type for t in (moved.road.normals, moved.road.cells.keys)} == {"meta"}
+def test_a_road_moves_to_the_requested_device():
+    moved = known().to(torch.device("meta"))
+    assert {t.device.type for t in (moved.normals, moved.cells.keys)} == {"meta"}

@@ -10,7 +10,7 @@ from drivesplat.model.splat_model import SplatModel
 
 
 @dataclass(frozen=True)
-class Visits:
+class Probes:
     """`count` stops of a training, after equal numbers of iterations, the last one at its end. `see` then gets the
     number of iterations so far, the seconds of training until then, which do not include earlier stops, and the model.
     It must leave the model as it is."""
@@ -21,8 +21,8 @@ class Visits:
     def due(self, step: int, iterations: int) -> bool:
         """Whether a training of so many iterations stops after its first `step`.
 
-        >>> visits = Visits(4, lambda *_: None)
-        >>> [step for step in range(1, 11) if visits.due(step, 10)]
+        >>> probes = Probes(4, lambda *_: None)
+        >>> [step for step in range(1, 11) if probes.due(step, 10)]
         [3, 5, 8, 10]
         """
         return step * self.count // iterations > (step - 1) * self.count // iterations
@@ -35,4 +35,4 @@ class Visits:
         return time.monotonic() - began
 
 
-NO_VISITS = Visits(0, lambda *_: None)
+NO_PROBES = Probes(0, lambda *_: None)

@@ -1,0 +1,60 @@
+"""Config files that name a removed setting: one line that says so and why."""
+
+import pytest
+
+from drivesplat.errors import ConfigError
+from drivesplat.settings.config import Config, load
+from drivesplat.settings.removed import REMOVED
+
+
+def tree(key: str) -> dict:
+    """A config with a value at a dotted key."""
+    *path, name = key.split(".")
+    values: dict = {name: {"voxel": 1.0} if key == "free_space" else 0.5}
+    for part in reversed(path):
+        values = {part: values}
+    return values
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_a_config_with_a_removed_setting_is_refused_with_its_reason(key):
+    with pytest.raises(ConfigError) as error:
+        load(tree(key))
+    message = str(error.value)
+    assert f"'{key}' was removed: {REMOVED[key]}" in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"methods": {"mine": {"overrides": tree("train.mcmc.growth")}}}, "methods.mine.overrides.train.mcmc.growth"),
+        (
+            {"datasets": {"a": {"scenes": ["a1"], "overrides": tree("free_space")}}},
+            "datasets.a.overrides.free_space",
+        ),
+        (
+            {"ablation": {"without": {"it": {"overrides": tree("train.camera_poses")}}}},
+            "ablation.without.it.overrides.train.camera_poses",
+        ),
+    ],
+)
+def test_overrides_with_a_removed_setting_are_refused_by_their_full_name(values, named):
+    with pytest.raises(ConfigError, match=f"'{named}' was removed"):
+        load(values)
+
+
+def test_no_removed_setting_exists():
+    """What is there again has to leave the table."""
+    for key in REMOVED:
+        known = Config().model_dump()
+        for part in key.split("."):
+            known = known.get(part, {}) if isinstance(known, dict) else {}
+        assert known == {}, key
+
+
+@pytest.mark.parametrize("values", [{}, {"train": {"mcmc": {"noise_lr": 1.0}, "iterations": 9}}, {"train": None}])
+def test_other_configs_are_not_refused_as_removed(values):
+    try:
+        load(values)
+    except ConfigError as error:
+        assert "was removed" not in str(error)
