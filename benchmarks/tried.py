@@ -6,6 +6,7 @@ A row of the ledger is one experiment. `commit` has its code or recorded its fig
 measurement that changed nothing).
 """
 
+import argparse
 import csv
 import datetime
 import re
@@ -99,4 +100,5 @@ def main(docs: Path = DOCS) -> int:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser("python -m benchmarks.tried", description=__doc__).parse_args()
     sys.exit(main())

@@ -14,7 +14,6 @@ from snakemake.utils import validate
 sys.path.insert(0, here)
 
 from drivesplat.settings.config import in_current_names
-from drivesplat.settings.renamed import note_of_old_names
 from drivesplat.workflow.costs.run_costs import COSTS, ESTIMATE, RunCosts
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.this_copy import in_this_copy
@@ -35,9 +34,9 @@ try:
     prefix = "" if main else take_prefix(workflow)
     if not main:
         config = module_config(config, os.path.join(here, "config.yaml"), prefix)
-    config, old_names = in_current_names(config)
-    if old_names and workflow.is_main_process:
-        print(f"drivesplat: {note_of_old_names(old_names)}", file=sys.stderr)
+    config, notes = in_current_names(config)
+    for note in notes if workflow.is_main_process else ():
+        print(f"drivesplat: {note}", file=sys.stderr)
     plan = Plan(config, here, prefix, workflow.is_main_process)
     if not main:
         stop_at_absent_data(plan)

@@ -31,8 +31,7 @@ from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, buil
 from drivesplat.settings.names import require_name, suggestion
 from drivesplat.settings.published import PublishedFigures
 from drivesplat.settings.refine_poses import RefinePosesSettings
-from drivesplat.settings.removed import refuse_removed
-from drivesplat.settings.renamed import current_names
+from drivesplat.settings.removed import in_this_version, refuse_removed
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.results_folder import ResultsFolder
 from drivesplat.settings.scans import ScanSettings
@@ -248,8 +247,8 @@ class Config(Settings):
 
 
 def in_current_names(values: Mapping[Any, Any]) -> tuple[dict[Any, Any], list[str]]:
-    """The values of a config with the current names of settings, and the old names in it; see `current_names`."""
-    return current_names(values, lambda: Config().model_dump())
+    """The values of a config as this version has them, and notes of what the next one will refuse."""
+    return in_this_version(values, lambda: Config().model_dump())
 
 
 def load(values: Mapping[str, Any]) -> Config:
@@ -259,7 +258,6 @@ def load(values: Mapping[str, Any]) -> Config:
             "a result of this workflow is among the config files, where Snakemake takes what follows --configfile: "
             "put -- before the targets, as in --configfile mine.yaml -- results/0103/metrics.json"
         )
-    refuse_removed(values)
     config = validated(Config, in_current_names(values)[0])
     variants = {name: variant for name, variant in config.ablation.without.items() if variant is not None}
     for kind, named, allowed in (

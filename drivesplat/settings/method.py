@@ -11,7 +11,7 @@ from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import MOVING_PARTS, STAGE_OF_PART, PartName, Parts
 
 
-def merged(base: Mapping[str, Any], overrides: Mapping[Any, Any]) -> dict[str, Any]:
+def merged(base: Mapping[Any, Any], overrides: Mapping[Any, Any]) -> dict[Any, Any]:
     """`base` with `overrides` laid over it; mappings are merged key by key."""
     result = dict(base)
     for key, value in overrides.items():

@@ -1,9 +1,14 @@
-"""Settings that no longer exist, and why: a config file that still names one gets this sentence."""
+"""Settings that no longer exist, and why: a config file that sets one gets this sentence.
 
-from collections.abc import Mapping
+config.yaml had every setting until the last version. In a file that was made from it, a removed setting at its former
+default says nothing: in this version it is left out, with a note.
+"""
+
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from drivesplat.errors import ConfigError
+from drivesplat.settings.renamed import current_names, note_of_old_names, settings_trees
 
 REMOVED = {
     "free_space": "fading Gaussians in space that LiDAR rays prove empty improved no measurement",
@@ -21,6 +26,67 @@ REMOVED = {
     "train.default.absgrad": "it was never measured to be better",
 }
 """Reasons by key, dotted from the top level of the config. docs/tried.csv has the measurements."""
+
+
+FORMER_DEFAULTS = {
+    "free_space": {
+        "triangulated": True, "voxel": 0.3, "range": 30.0, "margin": 0.3, "margin_share": 0.02, "min_rays": 3,
+    },
+    "train.floaters.free_space": False,
+    "train.camera_poses": {
+        "corrected": False, "max_shift": 0.05, "max_turn": 0.3, "learning_rate": 0.002, "size_weight": 0.001,
+        "bend_weight": 0.01,
+    },
+    "train.actors.mirrored": 0.0,
+    "train.actors.mirrored_images": 30,
+    "train.deformable.field": "lattice",
+    "train.deformable.network": {
+        "layers": 8, "width": 256, "frequencies": 10, "embedding": 16, "learning_rate": 0.0005,
+    },
+    "train.deformable.out_of_box_weight": 0.0,
+    "train.drifting.opacity_weight": 0.0,
+    "train.entropy_every": 1,
+    "train.mcmc.growth": 0.05,
+    "train.default.absgrad": False,
+}  # fmt: skip
+
+
+def in_this_version(
+    values: Mapping[Any, Any], defaults: Callable[[], Mapping[str, Any]]
+) -> tuple[dict[Any, Any], list[str]]:
+    """The values of a config in the names of this version, without removed settings at their former defaults, and a
+    note for each kind of setting that the next version will refuse; `defaults` as in `current_names`. Raises
+    ConfigError for other removed settings."""
+    current, old_paths = current_names(values, defaults)
+    dropped = []
+    for where, tree in settings_trees(current):
+        dropped += [where + key for key in without_former_defaults(tree)]
+        refuse_removed(tree, where)
+    notes = [note_of_old_names(old_paths)] if old_paths else []
+    if dropped:
+        notes.append(f"removed settings, which the next version will refuse: {', '.join(dropped)}")
+    return current, notes
+
+
+def without_former_defaults(tree: dict[Any, Any]) -> list[str]:
+    """Drops from a tree of settings what was removed and is at its former default; returns the keys."""
+    dropped = []
+    for key, default in FORMER_DEFAULTS.items():
+        *path, name = key.split(".")
+        node: Any = tree
+        for part in path:
+            node = node.get(part) if isinstance(node, dict) else None
+        if isinstance(node, dict) and name in node and _says_nothing(node[name], default):
+            del node[name]
+            dropped.append(key)
+    return dropped
+
+
+def _says_nothing(value: Any, default: Any) -> bool:
+    """Whether a setting, or each one of a section, is at its default."""
+    if isinstance(value, dict) and isinstance(default, dict):
+        return all(key in default and given == default[key] for key, given in value.items())
+    return value == default
 
 
 def refuse_removed(values: Mapping[str, Any], where: str = "") -> None:

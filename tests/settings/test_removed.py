@@ -4,7 +4,7 @@ import pytest
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, load
-from drivesplat.settings.removed import REMOVED
+from drivesplat.settings.removed import FORMER_DEFAULTS, REMOVED
 
 
 def tree(key: str) -> dict:
@@ -41,6 +41,16 @@ def test_a_config_with_a_removed_setting_is_refused_with_its_reason(key):
 def test_overrides_with_a_removed_setting_are_refused_by_their_full_name(values, named):
     with pytest.raises(ConfigError, match=f"'{named}' was removed"):
         load(values)
+
+
+def test_every_removed_setting_may_stand_at_its_former_default():
+    assert FORMER_DEFAULTS.keys() == REMOVED.keys()
+    for key, default in FORMER_DEFAULTS.items():
+        *path, name = key.split(".")
+        values: dict = {name: default}
+        for part in reversed(path):
+            values = {part: values}
+        assert load(values) == Config(), key
 
 
 def test_no_removed_setting_exists():

@@ -13,6 +13,7 @@ from helpers.patience import PATIENCE_S
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, for_scene, in_current_names, load
 from drivesplat.settings.method import merged
+from drivesplat.settings.removed import FORMER_DEFAULTS
 from drivesplat.settings.renamed import RENAMED
 
 DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
@@ -40,7 +41,9 @@ def test_an_old_name_sets_the_setting_of_its_new_name(old):
     default = value_at(Config().model_dump(), new_path(old))
     other = default + 20 if isinstance(default, int) else default / 2
     assert load(merged(DEFAULTS, at(old, other))) == load(merged(DEFAULTS, at(new_path(old), other))) != Config()
-    assert in_current_names(at(old, other)) == (at(new_path(old), other), [old])
+    current, (note,) = in_current_names(at(old, other))
+    assert current == at(new_path(old), other)
+    assert note.endswith(f": {old} (now {RENAMED[old]})")
 
 
 @pytest.mark.parametrize(
@@ -50,7 +53,7 @@ def test_overrides_may_have_old_names(where):
     old = "train.coarse_to_fine.share"
     config = merged(DEFAULTS, at(f"{where}.{old}", 0.5))
     assert load(config) == load(merged(DEFAULTS, at(f"{where}.{new_path(old)}", 0.5)))
-    assert in_current_names(config)[1] == [f"{where}.{old}"]
+    assert in_current_names(config)[1][0].endswith(f": {where}.{old} (now fraction)")
 
 
 def test_an_old_name_holds_over_the_default_of_the_new_one_in_config_yaml():
@@ -82,10 +85,16 @@ def test_a_whole_config_of_the_last_version_gives_the_same_settings():
     demo["checkpoint_apart_s"] = demo.pop("min_checkpoint_interval_s")
     for method in whole["methods"].values():
         del method["of"]
+    for key, default in FORMER_DEFAULTS.items():
+        whole = merged(whole, at(key, default))
     before = json.dumps(whole)
     assert load(whole) == load(merged(DEFAULTS, whole)) == Config()
     assert json.dumps(whole) == before, "the config as read stays as it is"
-    assert len(in_current_names(whole)[1]) == len(RENAMED) + 1
+    names, removed = in_current_names(whole)[1]
+    assert names.count("(now ") == len(RENAMED) + 1
+    assert removed.endswith(", ".join(FORMER_DEFAULTS)) and removed.startswith(
+        "removed settings, which the next version"
+    )
 
 
 def test_planning_says_which_names_are_old(tmp_path):

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import hypothesis
-import yaml
 from helpers import REPOSITORY
 from hypothesis import strategies as st
 
 from drivesplat.errors import DriveSplatError
+from drivesplat.settings.config import Config
 from drivesplat.settings.method import merged
 from drivesplat.workflow.plan import Plan
 
@@ -28,12 +28,15 @@ VALUES = (
 OPTIONAL = {
     "subjects": {"demo": {"track": "a", "key_frame": 1}},
     "datasets": {"demo": {"frames": {"demo": [0, 5]}, "overrides": {"train": {"iterations": 3}}}},
-    "methods": {"own": {"parts": ["background"], "overrides": {"train": {"iterations": 3}}}},
+    "methods": {
+        "own": {"parts": ["background"], "overrides": {"train": {"iterations": 3}}},
+        "built": {"of": "own", "overrides": {"train": {"iterations": 4}}},
+    },
     "ablation": {"without": {"own": {"parts": ["background"], "overrides": {"train": {"dropout": 0.1}}}}},
     "render": {"trajectories": {"own": {"lateral": 1.0}}},
     "actors": {"classes": {"pedestrian": ["deformable", "actors"]}},
 }
-"""Entries that config.yaml leaves empty."""
+"""Entries that the defaults leave empty."""
 
 
 def paths(tree: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -53,7 +56,7 @@ def plan(values: dict[str, Any]) -> None:
 
 
 def test_a_value_of_another_kind_is_refused_in_one_sentence_or_taken(monkeypatch, tmp_path):
-    config = merged(yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8")), OPTIONAL)
+    config = merged(Config().model_dump(mode="json"), OPTIONAL)
     (tmp_path / "presets").symlink_to(REPOSITORY / "presets")
     monkeypatch.chdir(tmp_path)
     plan(config)
