@@ -12,9 +12,8 @@ After Street Gaussians (Yan et al. 2024, arXiv 2401.01339). What a camera sees a
 (`Part.densify`), `evaluate` measures static and moving pixels of held-out images. World: metres, z up. Cameras: OpenCV
 axes. Quaternions: w, x, y, z. Shapes: n Gaussians, a actors with m annotations in all, images of h rows and w columns.
 
-The rest of the repository makes this fast, exact and measured; a test compares its rule `train` with this file. It adds
-reduced images at first, rolling shutters, exposures of several cameras, losses of ground and horizon, colours where no
-image looks, further parts (people who walk, drives without boxes), LiDAR scans, and resuming.
+The rest of the repository makes this fast, exact and measured, and a test compares it with this file. It adds rolling
+shutters, exposures, reduced images, unknown skies, colours where no image looks, other parts, LiDAR scans and resuming.
 """
 
 import json
@@ -37,27 +36,25 @@ from torch import Tensor, nn
 
 from drivesplat.kernels.color_difference import ssim
 from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.lidar.ground import GroundMap
 from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.scene.actor_record import ActorRecord, read_actors
 from drivesplat.scene.images import read_image
 from drivesplat.scene.masks import read_labels, read_sky_mask
 from drivesplat.scene.regions import LABELS, REGIONS
 
-LEARNING_RATES = {  # of means in units of the extent of their part; it decays to a hundredth
-    "means": 1.6e-4, "scales": 1e-2, "quats": 2e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4,
-    "translation": 1e-3, "yaw": 5e-4, "texels": 1e-2,
-}  # fmt: skip
+RATES = {"means": 1.6e-4, "scales": 1e-2, "quats": 2e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+RATES |= {"translation": 1e-3, "yaw": 5e-4, "texels": 1e-2}  # that of means is in units of the extent of a part
 Adam = partial(torch.optim.Adam, eps=1e-15, fused=True)
 DEAD, FADED = 0.005, math.log(1e-4 / (1.0 - 1e-4))  # opacity up to which Gaussians are relocated; a logit below it
 Gaussians = namedtuple("Gaussians", "means quats scales opacities sh")
-"""In the world: (n, 3) metres, (n, 4), (n, 3) standard deviations in metres, (n,) in [0, 1], and spherical harmonics of
-RGB (n, 4, 3): one of degree 0 and three of degree 1, which are multiples of -y, z and -x."""
+"""In the world: (n, 3) metres, (n, 4), (n, 3) metres, (n,) in [0, 1], (n, 4, 3) harmonics of RGB: of 1, -y, z, -x."""
 Picture = namedtuple("Picture", "image alpha depth actors_alpha gaussians")
 """(h, w, 3) with the sky, (h, w) of all Gaussians, (h, w) metres, (h, w) of actors alone or None, and `Gaussians`."""
 View = namedtuple("View", "K camera_to_world pixels sky ego static moving dynamic lidar_pixels lidar_depth time")
-"""An image: (3, 3), with the centre of the first pixel at (0.5, 0.5); (4, 4); (h, w, 3) uint8; masks (h, w) of the sky,
-the ego vehicle, what is static, moving vehicles, these and moving people; of k pixels that LiDAR measured row-major
-indices (k,) and depth (k,) in metres along the optical axis; seconds since the first image."""
+"""An image: (3, 3), pixels with centres at halves; (4, 4); (h, w, 3) uint8; masks (h, w) of the sky, the ego vehicle,
+static pixels, moving vehicles, these and moving people; row-major indices (k,) of pixels with LiDAR depth (k,) in
+metres along the optical axis; seconds since the first image."""
 
 
 def read_views(folder: Path, record: dict, images: np.ndarray, device: torch.device) -> list[View]:
@@ -78,9 +75,9 @@ def read_views(folder: Path, record: dict, images: np.ndarray, device: torch.dev
     return views
 
 
-def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
-    axis = quats[..., 1:].expand(vectors.shape)
+def rotate(quats: Tensor, vectors: Tensor, back: bool = False) -> Tensor:
+    """Vectors (..., 3) rotated by unit quaternions (..., 4), or by their inverses."""
+    axis = (-quats if back else quats)[..., 1:].expand(vectors.shape)
     twice = 2.0 * torch.linalg.cross(axis, vectors)
     return vectors + quats[..., :1] * twice + torch.linalg.cross(axis, twice)
 
@@ -113,16 +110,14 @@ class Part:
 
     def __init__(self, params: dict[str, Tensor], extent: float, cap: int, args: Namespace, device: torch.device):
         self.params = {name: nn.Parameter(v.to(device), v.is_floating_point()) for name, v in params.items()}
-        self.cap, self.args, self.lr_means = cap, args, extent * LEARNING_RATES["means"]
-        self.adam = {
-            name: Adam([values], LEARNING_RATES[name]) for name, values in self.params.items() if name != "owner"
-        }
+        self.cap, self.args, self.lr_means = cap, args, extent * RATES["means"]
+        self.adam = {name: Adam([values], RATES[name]) for name, values in self.params.items() if name in RATES}
 
     def at(self, time: float) -> Gaussians:
         """The Gaussians in the world at a time in seconds."""
         p = self.params
-        sh = torch.cat([p["sh0"], p["shN"]], dim=1)
-        return Gaussians(p["means"], p["quats"], torch.exp(p["scales"]), torch.sigmoid(p["opacities"]), sh)
+        opacities, sh = torch.sigmoid(p["opacities"]), torch.cat([p["sh0"], p["shN"]], dim=1)
+        return Gaussians(p["means"], p["quats"], torch.exp(p["scales"]), opacities, sh)
 
     def fade(self, rows: Tensor) -> None:
         """Makes Gaussians transparent. Densification then relocates them."""
@@ -143,17 +138,14 @@ class Part:
         # equation 8: noise in the shape of a Gaussian, Σ @ noise, for those that are nearly transparent
         rate, quats = self.adam["means"].param_groups[0]["lr"], F.normalize(p["quats"], dim=1)
         noise = 5e5 * rate * torch.sigmoid(100.0 * (0.005 - torch.sigmoid(p["opacities"])))[:, None]
-        along_axes = rotate(quats * quats.new_tensor([1, -1, -1, -1]), noise * torch.randn_like(p["means"]))
+        along_axes = rotate(quats, noise * torch.randn_like(p["means"]), back=True)
         p["means"] += rotate(quats, along_axes * torch.exp(2.0 * p["scales"]))
 
     def copy(self, source: Tensor, target: Tensor | None = None) -> None:
         """Copies Gaussians over those in the rows `target`, or adds the copies. N coincident ones look as one did
         before by equation 9; its sum of binomial coefficients over i is a binomial coefficient, too."""
         p, copies = self.params, (torch.bincount(source)[source] + 1).clamp(max=51)[:, None].double()
-        before, k = (
-            torch.sigmoid(p["opacities"][source]).double()[:, None],
-            torch.arange(1.0, 52.0, device=source.device).double(),
-        )
+        before, k = torch.sigmoid(p["opacities"][source]).double()[:, None], torch.arange(1.0, 52.0).to(copies)
         after = 1.0 - (1.0 - before) ** (1.0 / copies)
         of_n = torch.lgamma(copies + 1) - torch.lgamma(k + 1) - torch.lgamma((copies - k).clamp(min=0) + 1)
         series = (-1.0) ** (k - 1) * after**k / torch.sqrt(k) * torch.exp(of_n) * (k <= copies)
@@ -173,7 +165,6 @@ class Part:
 
 class Actors(Part):
     """Moving vehicles, their Gaussians in the frames of their boxes: x forward, y left, z up, origin at the centre.
-
     A spline through the annotated poses of its track places a vehicle. Corrections of the annotations are learned,
     `translation` (m, 3) in metres and `yaw` (m,) in radians, and interpolated by the same spline."""
 
@@ -193,7 +184,7 @@ class Actors(Part):
         self.runs = [last + 1 - first for motion in self.motions for first, last in motion.runs]  # without gaps
         zeros = (torch.zeros(sum(self.runs), *row, device=device) for row in ((3,), ()))
         self.translation, self.yaw = map(nn.Parameter, zeros)
-        self.adam |= {name: Adam([getattr(self, name)], LEARNING_RATES[name]) for name in ("translation", "yaw")}
+        self.adam |= {name: Adam([getattr(self, name)], RATES[name]) for name in ("translation", "yaw")}
 
     def state_at(self, time: float) -> list[Tensor]:
         """Of each actor: its pose by annotations as quaternion (a, 4) and translation (a, 3), their weights in it
@@ -217,9 +208,8 @@ class Actors(Part):
         of_actors = quats, translations + weights @ self.translation, present, series
         quats, translations, present, series = (values.index_select(0, p["owner"]) for values in of_actors)
         sh = (series[..., None, None] * torch.cat([p["sh0"], p["shN"]], dim=2)).sum(dim=1)
-        # reflections turn with the vehicle; no gradient reaches its track through them, which would be noise
-        vectors = torch.stack([-sh[:, 3], -sh[:, 1], sh[:, 2]], dim=2)
-        x, y, z = rotate(quats.detach()[:, None], vectors).unbind(dim=2)
+        vectors = torch.stack([-sh[:, 3], -sh[:, 1], sh[:, 2]], dim=2)  # reflections turn with the vehicle, but tracks
+        x, y, z = rotate(quats.detach()[:, None], vectors).unbind(dim=2)  # would only learn noise from them: detach
         means, opacities = rotate(quats, p["means"]) + translations, torch.sigmoid(p["opacities"]) * present
         quats, sh = product(quats, F.normalize(p["quats"], dim=1)), torch.stack([sh[:, 0], -y, z, -x], dim=1)
         return Gaussians(means, quats, torch.exp(p["scales"]), opacities, sh)
@@ -230,58 +220,55 @@ class Actors(Part):
         bend = torch.cat([run[:-2] - 2.0 * run[1:-1] + run[2:] for run in off.split(self.runs)])
         return sum(0.001 * values.square().sum() / max(1, len(values)) for values in (off, bend))
 
-    def confine(self) -> None:
-        """Fades Gaussians with centres outside their box, and shrinks those that are longer than it."""
-        p, reach = self.params, self.reach[self.params["owner"]]
-        self.fade((p["means"].abs() > reach).any(dim=1))
-        in_box = rotate(F.normalize(p["quats"], dim=1)[:, None], torch.diag_embed(torch.exp(p["scales"])))
-        p["scales"] -= (in_box.norm(dim=1) / (0.6 * reach)).amax(dim=1, keepdim=True).clamp(min=1.0).log()
-
 
 class Sky:
     """A cube map of colours, as logits; its faces are +x, -x, +y, -y, +z and -z."""
 
     def __init__(self, color: Tensor):
-        logits = torch.logit(color.clamp(0.02, 0.98))
-        self.texels = nn.Parameter(logits.reshape(1, 3, 1, 1, 1).repeat(1, 1, 6, 128, 128))
-        self.adam = {"texels": Adam([self.texels], LEARNING_RATES["texels"])}
+        self.texels = nn.Parameter(torch.logit(color.nan_to_num(0.5), 0.02).view(3, 1, 1, 1).repeat(1, 6, 128, 128))
+        self.adam = {"texels": Adam([self.texels], RATES["texels"])}
 
     def colors(self, view: View) -> Tensor:
         """The colours (h, w, 3) that a view sees."""
         x, y = (torch.arange(count, device=view.K.device) + 0.5 for count in reversed(view.sky.shape))
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         in_camera = F.pad((pixels - view.K[:2, 2]) / view.K.diagonal()[:2], (0, 1), value=1.0)
-        rays = in_camera @ view.camera_to_world[:3, :3].T
+        rays = in_camera @ view.camera_to_world[:3, :3].T  # of any length
         axis = rays.abs().argmax(dim=-1, keepdim=True)
         along = rays.gather(-1, axis)
         u, v = (rays.gather(-1, (axis + i) % 3) / along.abs() for i in (1, 2))
         face = (2 * axis + (along < 0)) * (2.0 / 5.0) - 1.0  # six faces one behind the other: a volume
         where = torch.cat([u, v, face], dim=-1)[None, None]
-        logits = F.grid_sample(self.texels, where, padding_mode="border", align_corners=True)
+        logits = F.grid_sample(self.texels[None], where, padding_mode="border", align_corners=True)
         return torch.sigmoid(logits[0, :, 0].permute(1, 2, 0))
 
 
 class Street:
-    """The model: `parts`, the background and, where anything moves, the actors; `sky`."""
+    """The model: `parts`, the background and, with any moving vehicle, the actors; `sky`."""
 
     def __init__(self, record: dict, actors: list[ActorRecord], views: list[View], args: Namespace):
-        device, pixels = views[0].K.device, sum(view.sky.numel() for view in views)
-        cap = min(args.cap_max, int(pixels / 20.0))
-        seed = init_params(record["points"], record["points_rgb"], cap)
-        self.args, self.parts = args, [Part(seed, record["scene_scale"], cap, args, device)]
+        device, cap = views[0].K.device, min(args.cap_max, sum(view.sky.numel() for view in views) // 20)
+        params = init_params(record["points"], record["points_rgb"], cap)
+        self.args, self.parts = args, [Part(params, record["scene_scale"], cap, args, device)]
         self.parts += [Actors(actors, args, device)] if actors else []
-        self.sky = Sky(
-            torch.cat([view.pixels[view.sky] for view in views]).double().mean(dim=0).float().nan_to_num(128.0) / 255.0
-        )
+        self.sky = Sky(torch.cat([view.pixels[view.sky] for view in views]).double().mean(dim=0).float() / 255.0)
         self.optimizers = [optimizer for it in (*self.parts, self.sky) for optimizer in it.adam.values()]
         self.path = [view.camera_to_world[:3, 3] for view in views]
+        ground = GroundMap(record["points"][: record["seed"]["lidar"]]).planes()  # through the lowest LiDAR points
+        planes = torch.from_numpy(np.column_stack([ground.normals, ground.offsets])).float()
+        self.places, self.planes = cKDTree(ground.places), F.pad(planes, (0, 0, 0, 1)).to(device)  # the last is none
+        self.find_ground()
+
+    def find_ground(self) -> None:
+        """Looks up the plane of the ground (n, 4), normal and offset, at each static Gaussian, in cells of 0.25 m."""
+        cells = (4.0 * self.parts[0].params["means"].detach()[:, :2].double().cpu()).floor()
+        self.ground = self.planes[self.places.query((cells + 0.5) / 4.0, distance_upper_bound=1.0, workers=-1)[1]]
 
     def render(self, view: View, sh_degree: int = 1, dropout: float = 0.0) -> Picture:
         """What a view shows, by spherical harmonics up to a degree, without a random share of the static Gaussians."""
         sets = [part.at(view.time) for part in self.parts]
-        if dropout:
-            opacities = sets[0].opacities
-            sets[0] = sets[0]._replace(opacities=opacities * (torch.rand_like(opacities) >= dropout))
+        opacities = sets[0].opacities
+        sets[0] = sets[0]._replace(opacities=opacities * (torch.rand_like(opacities) >= dropout))
         shown = Gaussians(*(torch.cat(values) for values in zip(*sets, strict=True)))
         seen = self.splat(shown, shown.sh, view, sh_degree=sh_degree, with_depth=True)
         image = seen.image[0] + (1.0 - seen.alpha[0]) * self.sky.colors(view)
@@ -291,23 +278,26 @@ class Street:
     def splat(self, g: Gaussians, colors: Tensor, view: View, **options: int | bool) -> Rendering:
         """EWA splatting. It linearises the projection: what is large for its distance would look wrong."""
         distances = (g.means.detach() - view.camera_to_world[:3, 3]).norm(dim=1, keepdim=True)
-        scales = torch.minimum(g.scales, self.args.max_scale * distances) if self.args.max_scale else g.scales
+        scales = torch.minimum(g.scales, (self.args.max_scale or math.inf) * distances)
         camera = torch.linalg.inv(view.camera_to_world)[None], view.K[None], view.sky.shape[1], view.sky.shape[0]
         return rasterize(g.means, g.quats, scales, g.opacities, colors, *camera, **options)
 
     @torch.no_grad()
     def fade_floaters(self) -> None:
-        """Fades actors outside their boxes, and what is static within a metre of the path that the vehicle drove."""
-        if len(self.parts) > 1:
-            self.parts[1].confine()
+        """Fades Gaussians outside their actor's box, shrinks those longer than it, fades static ones near the path."""
+        for actors in self.parts[1:]:
+            p, reach = actors.params, actors.reach[actors.params["owner"]]
+            actors.fade((p["means"].abs() > reach).any(dim=1))
+            in_box = rotate(F.normalize(p["quats"], dim=1)[:, None], torch.diag_embed(torch.exp(p["scales"])))
+            p["scales"] -= (in_box.norm(dim=1) / (0.6 * reach)).amax(dim=1, keepdim=True).clamp(min=1.0).log()
         points = self.parts[0].params["means"]
         for start, end in pairwise(self.path):
-            along = (end - start) * ((end - start).norm() < 15.0)  # farther apart, images are missing
+            along = (end - start) * ((end - start).norm() < 15.0)  # the vehicle drove there; beyond, images are missing
             fraction = ((points - start) @ along / along.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0)
             self.parts[0].fade((points - start - fraction[:, None] * along).norm(dim=1) < 1.0)
 
 
-def losses(picture: Picture, view: View, parts: list[Part]) -> dict[str, Tensor]:
+def losses(picture: Picture, view: View, model: Street) -> dict[str, Tensor]:
     """The weighted terms of the loss. Pixels that show the ego vehicle have no effect."""
     target, g = view.pixels.float() / 255.0, picture.gaussians
     image, alpha = torch.where(view.ego[..., None], target, picture.image), picture.alpha.masked_fill(view.ego, 1.0)
@@ -322,12 +312,19 @@ def losses(picture: Picture, view: View, parts: list[Part]) -> dict[str, Tensor]
     if len(view.lidar_depth):  # the worst 5 % are returns from behind edges
         off = (picture.depth.flatten()[view.lidar_pixels] - view.lidar_depth).abs()
         terms["depth"] = 0.01 * off.topk(max(1, len(off) * 95 // 100), largest=False).values.mean()
-    if len(parts) > 1:
-        moving = (difference.mean(dim=2) * view.dynamic).sum() / view.dynamic.sum().clamp(min=1)
-        terms["dynamic"] = 0.1 * moving  # these pixels are few: they hardly count in the mean of all
-        o = picture.actors_alpha.masked_fill(view.ego, 1.0).clamp(1e-4, 1.0 - 1e-4)  # actors are opaque, or not there
+    if len(model.parts) > 1:  # dynamic pixels are few; actors are opaque, or absent
+        terms["dynamic"] = 0.1 * (difference.mean(dim=2) * view.dynamic).sum() / view.dynamic.sum().clamp(min=1)
+        o = picture.actors_alpha.masked_fill(view.ego, 1.0).clamp(1e-4, 1.0 - 1e-4)
         terms["entropy"] = -0.005 * (o * o.log() + (1.0 - o) * (1.0 - o).log()).mean()
-        terms["tracks"] = parts[1].penalty()
+        terms["tracks"] = model.parts[1].penalty()
+    # near the ground, sqrt(d² + nᵀ Σ n): the distance of a Gaussian's mass from the plane with normal n; pseudo-Huber
+    static = Gaussians(*(values[: len(model.ground)] for values in g))
+    normal, offset = model.ground.split([3, 1], dim=1)
+    height = (static.means * normal).sum(dim=1, keepdim=True) - offset
+    along = rotate(F.normalize(static.quats, dim=1), normal, back=True) * static.scales
+    near = (normal[:, 2:] > 0.0) & (height.abs() < 0.3) & (static.opacities > 0.0)[:, None]
+    distance = torch.sqrt(height**2 + along.square().sum(dim=1, keepdim=True) + 0.05**2) - 0.05
+    terms["ground"] = (near * distance).sum() / near.sum().clamp(min=1)
     return terms
 
 
@@ -342,17 +339,18 @@ def train(model: Street, views: list[View], cameras: int) -> None:
         for part in parts:
             part.adam["means"].param_groups[0]["lr"] = part.lr_means * 0.01 ** (step / args.iterations)
         sh_degree = min(1, step // max(1, int(0.0333 * args.iterations)))  # 0: colours are the same from all sides
-        terms = losses(model.render(view, sh_degree, dropout), view, parts)
-        torch.stack(list(terms.values())).sum().backward()
+        loss = sum(losses(model.render(view, sh_degree, dropout), view, model).values())
+        loss.backward()
         for optimizer in model.optimizers:
             optimizer.step()
             optimizer.zero_grad()
         for part in parts:
             part.densify(step)
+        if step % 100 == 0:
+            model.find_ground()
+            print(f"iteration {step}: loss {loss.item():.4f}, {len(model.ground)} static Gaussians", flush=True)
         if (step + 1) % 100 == 0:
             model.fade_floaters()
-            counts, loss = [len(part.params["means"]) for part in parts], sum(term.item() for term in terms.values())
-            print(f"iteration {step + 1}: loss {loss:.4f}, {' + '.join(map(str, counts))} Gaussians", flush=True)
         if step >= int(0.9 * args.iterations) and (args.iterations - step - 1) % 5 == 0:
             learned, count = [one.param_groups[0]["params"][0].data for one in model.optimizers], count + 1
             sums = [total + values for total, values in zip(sums or [0.0] * len(learned), learned, strict=True)]
@@ -364,12 +362,13 @@ def train(model: Street, views: list[View], cameras: int) -> None:
 @torch.no_grad()
 def evaluate(model: Street, views: list[View]) -> dict[str, float | None]:
     """The PSNR (dB) of a region over all its pixels in held-out images; None where these are fewer than 1000."""
-    errors: dict[str, list[Tensor]] = {"static": [], "moving": []}
+    sums = {"static": (0, 0.0), "moving": (0, 0.0)}  # number of pixels and squared error
     for view in views:
-        error = (model.render(view).image.clamp(0.0, 1.0) - view.pixels / 255.0).square().mean(dim=2).double()
-        errors = {region: [*found, error[getattr(view, region)]] for region, found in errors.items()}
-    pooled = {region: torch.cat(found) for region, found in errors.items()}
-    return {region: -10.0 * math.log10(all.mean()) if len(all) >= 1000 else None for region, all in pooled.items()}
+        squared = (model.render(view).image.clamp(0.0, 1.0) - view.pixels / 255.0).square().mean(dim=2).double()
+        for region, (count, total) in sums.items():
+            errors = squared[getattr(view, region)]
+            sums[region] = count + len(errors), total + errors.sum().item()
+    return {region: -10.0 * math.log10(e / n) if n >= 1000 else None for region, (n, e) in sums.items()}
 
 
 def main() -> None:
@@ -391,8 +390,8 @@ def main() -> None:
     figures = {"iterations": args.iterations, "seed": args.seed, "seconds": round(time.monotonic() - began, 1)}
     measured = np.flatnonzero(record["is_key_frame"] & (cameras == record["camera_names"].index(args.camera)))
     for group in ("interpolation", "extrapolation"):
-        images = np.intersect1d(splits[group], measured)
-        figures |= {group: evaluate(model, read_views(args.folder, record, images, device))}
+        held_out = read_views(args.folder, record, np.intersect1d(splits[group], measured), device)
+        figures |= {group: evaluate(model, held_out)}
     print(json.dumps(figures))
 
 

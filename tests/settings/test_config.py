@@ -70,7 +70,7 @@ def test_config_yaml_fits_two_screens():
 
 def test_the_page_of_settings_has_every_setting_with_its_meaning():
     page = re.sub(r"\[([\w-]+\.md)\]\(\1\)", r"docs/\1", settings_page())
-    rows = {(row[1], row[2]) for row in re.finditer(r"^\| \W*(\w+)`.* \| (.*) \|$", page, re.MULTILINE)}
+    rows = {(row[1], row[2]) for row in re.finditer(r"^\| \W*(?:[^`| ]+\.)?(\w+)`.* \| (.*) \|$", page, re.MULTILINE)}
     schema = json.loads(config_schema())
     records = [schema, *schema["$defs"].values()]
     fields = [(name, field) for record in records for name, field in record.get("properties", {}).items()]
