@@ -46,7 +46,7 @@ def module_config(config: Any, defaults: str | Path, prefix: str) -> dict[str, A
     load(values)
     values["results_dir"] = str(Path(prefix, Path(values["results_dir"]).expanduser()))
     for dataset in values["datasets"].values():
-        if dataset.get("world"):
+        if dataset.get("world") is not None:
             dataset["dataroot"] = str(Path(prefix, Path(dataset["dataroot"]).expanduser()))
     return values
 
