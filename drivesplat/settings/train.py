@@ -40,11 +40,11 @@ Parts = Annotated[
 
 class GaussianSettings(Settings):
     """Initial values and learning rates of Gaussians. Learning rates are those of gsplat's example trainer, those of
-    scales and rotations twice as high (docs/measured.md)."""
+    scales and rotations twice as high (docs/tried.md)."""
 
     sh_degree: int = Field(1, ge=0, le=3)
     """Degree of the spherical harmonics of the colours. A drive shows objects from few directions; degree 3 gives the
-    same held-out PSNR with twice the memory (docs/measured.md)."""
+    same held-out PSNR with twice the memory (docs/tried.md)."""
     init_opacity: float = Field(0.1, gt=0, lt=1)
     """Initial opacity of seed Gaussians."""
     init_scale: float = Field(0.4, gt=0, le=10)
@@ -124,7 +124,7 @@ class TrainSettings(Settings):
     """Fraction of the iterations after which densification stops."""
     averaged: float = Field(0.1, ge=0, le=1)
     """Fraction of the iterations, the last ones, over which all parameters are averaged: at most those after
-    `refine_stop`. Their mean shows held-out images better than their last values (docs/measured.md). 0 = no average."""
+    `refine_stop`. Their mean shows held-out images better than their last values (docs/tried.md). 0 = no average."""
     sh_every: float = Field(0.0333, ge=0, le=1)
     """Fraction of the iterations after which the degree of the spherical harmonics rises by one, repeatedly."""
     ssim_weight: float = Field(0.2, ge=0, le=1)

@@ -53,11 +53,11 @@ class DeformableSettings(ActorSettings):
 
     sh_degree: int = Field(0, ge=0, le=3)
     """Degree of the spherical harmonics of their colours. 0 = the same colour from all directions. Higher degrees
-    overfit (docs/measured.md)."""
+    overfit (docs/tried.md)."""
     fourier: int = Field(1, ge=1, le=16)
     """Number of Fourier coefficients over time of every colour coefficient, and of shapes beside the gait. 1 = colours
     are constant in time, and shapes change with the gait alone, so that who stands does not move. More of them overfit
-    (docs/measured.md)."""
+    (docs/tried.md)."""
     mirrored: float = Field(0.5, ge=0, le=1)
     """Probability with which an iteration mirrors an object, left for right and half a cycle later in its gait, so that
     each side learns from images of the other."""
