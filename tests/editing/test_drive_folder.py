@@ -97,7 +97,7 @@ def as_read(folder: Path) -> Scene:
 
 def tables_as_read(folder: Path, name: str) -> Scene:
     cameras = ("CAM_FRONT",)
-    source = drives.source(dataset="", scene=name, cameras=cameras, lidar_sweeps=False)
+    source = drives.source(dataset="", version=VERSION, scene=name, cameras=cameras, lidar_sweeps=False)
     return read(folder / TABLES, source)
 
 
