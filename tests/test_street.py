@@ -313,9 +313,7 @@ def test_on_the_demo_it_is_as_good_as_the_rule_train(tmp_path):
 
     files = (REPOSITORY / "config.yaml", REPOSITORY / "presets/demo.yaml")
     config, root = load(merged(*(yaml.safe_load(file.read_text()) for file in files))), tmp_path / "data"
-    world = config.datasets["demo"].world
-    assert world is not None
-    make_world(root, WorldJob(scene="demo", version="v1.0-mini", world=world, edits={}), {"stages": {}}, workers=2)
+    make_world(root, settings_of(config, "demo", "demo_world", WorldJob), {"stages": {}}, workers=2)
     drive = prepared(tmp_path / "results", config, root, "demo")
     job = settings_of(config, "demo", "train", TrainJob, "street")
     theirs = trained_by_rule(drive, job, tmp_path / "street")
