@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.settings.renamed import current_names, note_of_old_names, settings_trees
+from drivesplat.settings.renamed import current_names, note_of_old_names, settings_trees, subtree
 
 REMOVED = {
     "free_space": "fading Gaussians in space that LiDAR rays prove empty improved no measurement",
@@ -72,11 +72,9 @@ def without_former_defaults(tree: dict[Any, Any]) -> list[str]:
     """Drops from a tree of settings what was removed and is at its former default; returns the keys."""
     dropped = []
     for key, default in FORMER_DEFAULTS.items():
-        *path, name = key.split(".")
-        node: Any = tree
-        for part in path:
-            node = node.get(part) if isinstance(node, dict) else None
-        if isinstance(node, dict) and name in node and _says_nothing(node[name], default):
+        section, _, name = key.rpartition(".")
+        node = subtree(tree, section)
+        if node is not None and name in node and _says_nothing(node[name], default):
             del node[name]
             dropped.append(key)
     return dropped
@@ -93,9 +91,6 @@ def refuse_removed(values: Mapping[str, Any], where: str = "") -> None:
     """Raises ConfigError, one line, where a tree of settings from the top level has a key of REMOVED; `where` precedes
     the key in the message."""
     for key, reason in REMOVED.items():
-        *path, name = key.split(".")
-        tree: Any = values
-        for part in path:
-            tree = tree.get(part) if isinstance(tree, Mapping) else None
-        if isinstance(tree, Mapping) and name in tree:
+        section, _, name = key.rpartition(".")
+        if name in (subtree(values, section) or {}):
             raise ConfigError(f"'{where}{key}' was removed: {reason}; delete it (docs/tried.csv has the measurements)")

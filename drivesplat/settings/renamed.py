@@ -68,8 +68,8 @@ def settings_trees(values: dict[Any, Any]) -> Iterator[tuple[str, dict[Any, Any]
 
 
 def subtree(tree: Mapping[Any, Any], path: str) -> dict[Any, Any] | None:
-    """The mapping at a `path` of keys with dots; None where there is none."""
+    """The mapping at a `path` of keys with dots, which is `tree` for an empty path; None where there is none."""
     node: Any = tree
-    for key in path.split("."):
+    for key in path.split(".") if path else ():
         node = node.get(key) if isinstance(node, Mapping) else None
     return node if isinstance(node, dict) else None
