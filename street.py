@@ -38,10 +38,10 @@ from drivesplat.kernels.color_difference import ssim
 from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.rasterization import Rendering, rasterize
-from drivesplat.scene.actor_record import ActorRecord, read_actors
 from drivesplat.scene.images import read_image
 from drivesplat.scene.masks import read_labels, read_sky_mask
 from drivesplat.scene.regions import LABELS, REGIONS
+from drivesplat.trajectories.actor_record import ActorRecord, read_actors
 
 RATES = {"means": 1.6e-4, "scales": 1e-2, "quats": 2e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 RATES |= {"translation": 1e-3, "yaw": 5e-4, "texels": 1e-2}  # that of means is in units of the extent of a part

@@ -19,10 +19,10 @@ from benchmarks.command import argument_parser, run_command
 from drivesplat.machine.device import device_name
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
 from drivesplat.rendering.film import Shot, recorded_shot, render_film
-from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
+from drivesplat.trajectories.camera_path import film_path
 
 WARM_UP = 0.1
 """The share of the frames before timing starts."""

@@ -125,7 +125,7 @@ compile_ahead() {
   say "compiling what trains and makes synthetic worlds on processors; a minute at most"
   .venv/bin/python -m compileall -q drivesplat workflow_scripts ||
     say "no bytecode could be kept: is the checkout read-only? Every job will compile it anew"
-  if .venv/bin/python -m drivesplat.training.warm_up && .venv/bin/python -m drivesplat.demo.warm_up; then
+  if .venv/bin/python -m drivesplat.training.warm_up && .venv/bin/python -m drivesplat.world.warm_up; then
     { : > "$compiled"; } 2>/dev/null || true  # a .venv of somebody else's: the next call does it again
   else
     say "all packages are in place, but a first training or world on the processors fails (see above); make doctor says more"

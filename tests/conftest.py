@@ -120,7 +120,7 @@ def demo_root(demo_job, tmp_path_factory) -> Path:
     """A small synthetic drive in nuScenes format with its truth: scene demo, read only."""
     from helpers.shared_runs import made_once
 
-    from drivesplat.demo.world import make_world
+    from drivesplat.world.generate import make_world
 
     return made_once(tmp_path_factory, "demo", lambda root: make_world(root, demo_job, {"stages": {}}, workers=2))
 
@@ -128,7 +128,7 @@ def demo_root(demo_job, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def demo_recorder(demo_job):
     """What recorded it."""
-    from drivesplat.demo.recorder import Recorder
+    from drivesplat.world.recorder import Recorder
 
     return Recorder(demo_job.world)
 

@@ -31,7 +31,6 @@ from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import training_record
-from drivesplat.scene.actor_record import ActorRecords
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.training_record import read_training_record, write_training_record
 from drivesplat.settings import Settings
@@ -48,6 +47,7 @@ from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.settings.world import WorldJob
 from drivesplat.training.road import lidar_road
 from drivesplat.training.run import TrainingFiles, read_inputs, run_training
+from drivesplat.trajectories.actor_record import ActorRecords
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -309,7 +309,7 @@ def test_its_command_prints_the_figures_of_both_held_out_groups(drive, device, m
 @pytest.mark.slow
 def test_on_the_demo_it_is_as_good_as_the_rule_train(tmp_path):
     """The method with all that street.py leaves out, and the settings of the demo."""
-    from drivesplat.demo.world import make_world  # GPU machines that run this file may lack its ray caster
+    from drivesplat.world.generate import make_world  # GPU machines that run this file may lack its ray caster
 
     files = (REPOSITORY / "config.yaml", REPOSITORY / "presets/demo.yaml")
     config, root = load(merged(*(yaml.safe_load(file.read_text()) for file in files))), tmp_path / "data"

@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.inspection.compare import render_comparison
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.settings.render import CompareJob
+from drivesplat.visuals.compare import render_comparison
 
 with job(snakemake, dataset=("images",)) as current:
     files = current.input

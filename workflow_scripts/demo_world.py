@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.demo.world import make_world
 from drivesplat.settings.world import WorldJob
+from drivesplat.world.generate import make_world
 
 with job(snakemake) as current:
     root = Path(current.output.tables[0]).parents[1]

@@ -3,8 +3,8 @@
 import dataclasses
 
 from drivesplat.workflow.job import job
-from drivesplat.discovery.record import write_discovered
-from drivesplat.discovery.tracks import discovered_tracks
+from drivesplat.lidar.objects.record import write_discovered
+from drivesplat.lidar.objects.tracks import discovered_tracks
 from drivesplat.scene.scan_record import read_scans
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.discover import DiscoverJob

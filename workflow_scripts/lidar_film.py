@@ -3,13 +3,13 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.inspection.lidar_film import render_lidar_film
-from drivesplat.inspection.trained_lidar import open_trained_lidar
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scan_record import read_scans
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.render import LidarFilmJob
+from drivesplat.visuals.lidar_film import render_lidar_film
+from drivesplat.visuals.trained_lidar import open_trained_lidar
 
 with job(snakemake) as current:
     scene, scans = read_scene(current.input.scene), read_scans(current.input.scans)

@@ -3,7 +3,7 @@
 import dataclasses
 
 from drivesplat.workflow.job import job
-from drivesplat.discovery.record import read_discovered
+from drivesplat.lidar.objects.record import read_discovered
 from drivesplat.scene.scene import read_scene, write_scene
 from drivesplat.scene.track_references import refuse_unknown_tracks
 

@@ -1,15 +1,15 @@
 """checkpoint.npz with and without a vehicle, into with_car.png, without_car.png, removal.png and removal.json."""
 
 from drivesplat.workflow.job import job
-from drivesplat.inspection.drawing import draw_removal
-from drivesplat.inspection.figures import save_figure
-from drivesplat.inspection.removal import remove_actor
-from drivesplat.inspection.rendered_view import open_model_with_recording
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.scene.images import write_image
-from drivesplat.settings.inspection import RemovalJob
+from drivesplat.settings.visuals import RemovalJob
+from drivesplat.visuals.drawing import draw_removal
+from drivesplat.visuals.figures import save_figure
+from drivesplat.visuals.removal import remove_actor
+from drivesplat.visuals.rendered_view import open_model_with_recording
 
 with job(snakemake, dataset=("images",)) as current:
     files, made, checkpoint = current.input, current.output, read_checkpoint(current.input.checkpoint)

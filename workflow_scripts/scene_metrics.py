@@ -2,9 +2,9 @@
 tracks, into metrics.json."""
 
 from drivesplat.workflow.job import job
-from drivesplat.discovery.record import read_discovered
 from drivesplat.evaluation.scene_metrics import read_baselines, read_evaluations, side_by_side
 from drivesplat.io.storage import write_json
+from drivesplat.lidar.objects.record import read_discovered
 
 with job(snakemake) as current:
     evals = read_evaluations(current.input.evals)

@@ -1,10 +1,10 @@
 """scene.json and actors.npz as tracks.csv and tracks.png: the dynamic objects and their ids."""
 
 from drivesplat.workflow.job import job
-from drivesplat.inspection.figures import save_figure
-from drivesplat.inspection.track_table import draw_tracks, editable_tracks, subjects_by_image, track_rows, write_tracks
 from drivesplat.scene.evaluation_data import read_evaluation_data
-from drivesplat.settings.inspection import TracksJob
+from drivesplat.settings.visuals import TracksJob
+from drivesplat.visuals.figures import save_figure
+from drivesplat.visuals.track_table import draw_tracks, editable_tracks, subjects_by_image, track_rows, write_tracks
 
 with job(snakemake, dataset=("images",)) as current:
     files, settings = current.input, current.settings(TracksJob)

@@ -4,11 +4,11 @@ from pathlib import Path
 
 from drivesplat.workflow.job import job
 from drivesplat.evaluation.synthetic import DriveTruth
-from drivesplat.inspection.truth_film import render_truth_film
 from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.settings.render import CompareJob
+from drivesplat.visuals.truth_film import render_truth_film
 
 with job(snakemake, dataset=("images",)) as current:
     files, settings = current.input, current.settings(CompareJob)

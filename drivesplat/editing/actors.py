@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rendering.trajectory import recorded_frames
-from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
+from drivesplat.trajectories.camera_path import recorded_frames
+from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.trajectories.motion import HALF_STEP, Motion
 
 log = logging.getLogger(__name__)
 

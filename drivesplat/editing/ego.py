@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.edited_motion.ego_path import edited_poses, recorded_time
-from drivesplat.edited_motion.lateral_offset import PosesAt
 from drivesplat.errors import ConfigError
-from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames, smooth_poses
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.edit import Edit, Ego
 from drivesplat.settings.render import TrajectorySettings
+from drivesplat.trajectories.camera_path import CameraPath, film_path, recorded_frames, smooth_poses
+from drivesplat.trajectories.ego_path import edited_poses, recorded_time
+from drivesplat.trajectories.lateral_offset import PosesAt
 
 MAX_LEAD = 0.1
 """Seconds by which the path of a camera is extrapolated before its first image: the cameras of a rig fire at different

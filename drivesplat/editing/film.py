@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.editing.actors import actor_placements, other_objects, recorded_and_edited, warn_of_collisions
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.shown_objects import ShownObjects
@@ -20,11 +19,12 @@ from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, film_size, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
-from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.images import write_png
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob, TrajectorySettings
+from drivesplat.trajectories.camera_path import film_path
+from drivesplat.trajectories.edited_actors import EditedActor
 
 DECIMALS = 6
 """Decimals of a pose in labels: micrometres, and 1e-4 degrees. More would double the size of the file."""

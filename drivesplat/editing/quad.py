@@ -16,11 +16,11 @@ from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
-from drivesplat.rendering.trajectory import recorded_frames
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob
+from drivesplat.trajectories.camera_path import recorded_frames
 
 T = TypeVar("T")
 

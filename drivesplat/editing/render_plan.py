@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.editing.actors import (
     actor_placements,
     other_objects,
@@ -20,13 +19,14 @@ from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.trajectory import displaced, recorded_frames
 from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.sensors import Camera
 from drivesplat.settings.export import DriveJob
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.render import TrajectorySettings
+from drivesplat.trajectories.camera_path import displaced, recorded_frames
+from drivesplat.trajectories.edited_actors import EditedActor
 
 LABEL_INTERVAL = 100_000
 """Microseconds between the poses of an object in labels, besides those at key frames."""

@@ -5,15 +5,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drivesplat.edited_motion.sampled_edit import CameraMotion, Instance, SampledEdit, sampled_actor
 from drivesplat.editing.actors import recorded_and_edited
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rendering.trajectory import sampled_path
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
+from drivesplat.trajectories.camera_path import sampled_path
+from drivesplat.trajectories.sampled_edit import CameraMotion, Instance, SampledEdit, sampled_actor
 
 log = logging.getLogger(__name__)
 

@@ -10,22 +10,22 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int, Int16
 
-from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.editing.actors import actor_placements, collisions, recorded_and_edited, trained_actors
 from drivesplat.editing.ego import EgoEdit
+from drivesplat.editing.sensor_path import beside, carried, recorded_ego
 from drivesplat.editing.shown_objects import parts_that_may_show
 from drivesplat.errors import ConfigError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.objects_met import TrackedBoxes
 from drivesplat.model.scans import ScanView, group_met, view_of_scan
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rendering.sensor_path import beside, carried, recorded_ego
-from drivesplat.rendering.trajectory import recorded_frames
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.export import ScanFolderJob
+from drivesplat.trajectories.camera_path import recorded_frames
+from drivesplat.trajectories.edited_actors import EditedActor
 
 log = logging.getLogger(__name__)
 

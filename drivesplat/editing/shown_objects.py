@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.editing.actors import actor_placements
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
@@ -18,6 +17,7 @@ from drivesplat.scene.regions import fill, hull_of
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import Box
+from drivesplat.trajectories.edited_actors import EditedActor
 
 OWN, NONE = "own", "none"
 """What shows an object besides the names of parts: Gaussians of its own, or nothing."""

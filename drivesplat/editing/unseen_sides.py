@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.rendering.film import Shot
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.splits import training_images
+from drivesplat.trajectories.edited_actors import EditedActor
 
 UNSEEN = "sides that no camera saw"
 """The note in the film."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivesplat.scene.motion import Motion
+from drivesplat.trajectories.motion import Motion
 
 SAMPLES_PER_SECOND = 30
 SHAPES_PER_SECOND = 15

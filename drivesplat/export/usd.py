@@ -28,10 +28,10 @@ from drivesplat.export.unique_names import unique_names
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_group, usd_matrix
 from drivesplat.io.storage import Provenance, atomic_path, unwritable
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.rendering.trajectory import recorded_frames, recorded_timestamps, sampled_path
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.export import ExportJob
+from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, sampled_path
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,6 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from drivesplat.edited_motion.sampled_edit import SampledEdit
 from drivesplat.export import viewer_page as template
 from drivesplat.export.modes import fitted_modes
 from drivesplat.export.thinning import thinned_groups
@@ -23,10 +22,11 @@ from drivesplat.export.viewer_scene import ViewerContent, recorded_path, scene_r
 from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import Provenance, atomic_write
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.rendering.trajectory import recorded_timestamps
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.export import ViewerJob
+from drivesplat.trajectories.camera_path import recorded_timestamps
+from drivesplat.trajectories.sampled_edit import SampledEdit
 
 log = logging.getLogger(__name__)
 

@@ -6,10 +6,10 @@ from typing import Any
 
 from PIL import Image
 
-from drivesplat.rendering.trajectory import recorded_frames
 from drivesplat.scene.images import read_image
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.trajectories.camera_path import recorded_frames
 
 QUALITY = 80
 """Of JPEG, up to 95."""

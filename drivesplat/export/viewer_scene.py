@@ -14,16 +14,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.edited_motion.sampled_edit import Instance, InstanceMotion, SampledEdit
 from drivesplat.export.modes import Gait, Modes
 from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Sky
 from drivesplat.rendering.color_bytes import to_uint8
-from drivesplat.rendering.trajectory import recorded_frames, sampled_path
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Frame, Scene
+from drivesplat.trajectories.camera_path import recorded_frames, sampled_path
+from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit
 
 
 @dataclass(frozen=True)

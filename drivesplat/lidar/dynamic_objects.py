@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import in_box, moving_tracks
+from drivesplat.trajectories.motion import HALF_STEP, Motion
 
 CLEARANCE = 0.1
 """Height in metres above a box's floor up to which a return may belong to the road."""

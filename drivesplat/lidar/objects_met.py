@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan_record import NO_OBJECT
 from drivesplat.scene.scene import Scene
+from drivesplat.trajectories.motion import Motion
 
 SLACK = 1.0
 """Metres around a box's way within which returns are looked at."""

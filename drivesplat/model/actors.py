@@ -26,9 +26,9 @@ from drivesplat.model.parameters import init_params, learning_rates, make_parame
 from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.model.track_penalties import track_penalties
-from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.trajectories.motion import HALF_STEP, Motion
 
 MAX_SPREAD = 0.6
 """Maximum standard deviation of a Gaussian along an axis of its box, as a fraction of half the size of the box with its

@@ -18,10 +18,10 @@ from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
-from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.trajectories.actor_record import ActorRecord
 
 EXPOSURE_PREFIX = "exposure.first."
 """Prefix of the initial gains of exposures in a model's state; the camera name follows."""

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from drivesplat.model.gaussians import Gaussians, without_colors
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.scene.motion import HALF_STEP, Motion
+from drivesplat.trajectories.motion import HALF_STEP, Motion
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
 """The parameters of every Gaussian that images and LiDAR scans share."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from drivesplat.scene.motion import HALF_STEP
+from drivesplat.trajectories.motion import HALF_STEP
 
 TimeStates = Sequence[Sequence[Tensor]]
 """The time state of each part of a model."""

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from drivesplat.scene.motion import Motion
+from drivesplat.trajectories.motion import Motion
 
 MAX_CACHED_TIMES = 16384
 """Number of times whose states are cached. A training reuses those of its images, 1,440 for six cameras at 12 Hz over

@@ -16,7 +16,6 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.sweeps import returns_of
-from drivesplat.scene.actor_record import ActorRecord, ActorRecords
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.regions import MIN_PIXELS, hulls_in, owner_image
@@ -26,6 +25,7 @@ from drivesplat.scene.shutter import Shutter, shutter_of, where_seen
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
 from drivesplat.settings.train import PartName
+from drivesplat.trajectories.actor_record import ActorRecord, ActorRecords
 
 log = logging.getLogger(__name__)
 

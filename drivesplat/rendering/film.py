@@ -23,11 +23,11 @@ from drivesplat.model.view import View
 from drivesplat.rendering.captions import Caption, captioned, drive_captions, last_training_second
 from drivesplat.rendering.frames import film_frame, film_frames, uint8_image
 from drivesplat.rendering.panels import Panels
-from drivesplat.rendering.trajectory import CameraPath, film_intrinsics, film_path, recorded_frames
 from drivesplat.scene.images import target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmEncoding, FilmFormat, FilmJob, ShownParts, TrajectorySettings
+from drivesplat.trajectories.camera_path import CameraPath, film_intrinsics, film_path, recorded_frames
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,6 @@ from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
 from drivesplat.settings.extract import ExtractSettings
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
-from drivesplat.settings.inspection import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
@@ -36,6 +35,7 @@ from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.results_folder import ResultsFolder
 from drivesplat.settings.scans import ScanSettings
 from drivesplat.settings.train import SkyKind, TrainSettings
+from drivesplat.settings.visuals import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.world import CameraChannel
 
 DATASET_OVERRIDES = (

@@ -4,9 +4,9 @@ from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.images import HoldoutSettings
-from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.tracks import Tracks
+from drivesplat.settings.visuals import RemovalSettings
 
 BACKBONE = "resources/lpips/alexnet.pth"
 """Path of LPIPS's AlexNet backbone. Without a network, users put the file there."""

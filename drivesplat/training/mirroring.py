@@ -15,10 +15,10 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.time_states import TimeStates
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.model.view import View
-from drivesplat.scene.motion import HALF_STEP
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_objects import DeformableSettings
+from drivesplat.trajectories.motion import HALF_STEP
 
 
 def choose_mirrored(model: SplatModel, record: TrainingRecord, settings: TrainSettings) -> None:

@@ -21,7 +21,6 @@ from drivesplat.machine.device import choose_device, explain_out_of_memory, flus
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.actor_record import ActorRecord, read_actors
 from drivesplat.scene.horizon import below_horizon
 from drivesplat.scene.masks import NO_MASKS, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
@@ -41,6 +40,7 @@ from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, wi
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import Supervision, TrainingView, load_views
+from drivesplat.trajectories.actor_record import ActorRecord, read_actors
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Any
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
-from drivesplat.settings.inspection import SubjectSettings
 from drivesplat.settings.track_references import EditReference, TrackReferences
 from drivesplat.settings.tracks import FOUND, Tracks
+from drivesplat.settings.visuals import SubjectSettings
 from drivesplat.workflow.film_names import EDITS, scene_edits
 
 RULES_OF_EDITS = ("edit", "quad", "drive_folder", "scan_folder")

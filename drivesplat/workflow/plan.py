@@ -12,7 +12,6 @@ from types import SimpleNamespace
 from typing import Any
 
 from drivesplat import IS_CHECKOUT
-from drivesplat.demo.marker import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.file_lock import LockHeldError, locked_file
 from drivesplat.io.storage import canonical_json
@@ -30,6 +29,7 @@ from drivesplat.workflow.recordings import Recordings
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
+from drivesplat.world.marker import refuse_foreign_data
 
 ABLATION_FILES = ("ablation.json", "ablation.csv")
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from drivesplat.demo.marker import WORLD_MARKER
 from drivesplat.errors import ConfigError
 from drivesplat.readers.datasets import layout
 from drivesplat.readers.outline import (
@@ -24,6 +23,7 @@ from drivesplat.readers.outline import (
 from drivesplat.settings.config import for_scene
 from drivesplat.workflow.job_resources import JobResources
 from drivesplat.workflow.stages import SCANS, TRAIN, WORLD
+from drivesplat.world.marker import WORLD_MARKER
 
 TRAINING_MB = 16_000
 """Memory in MB of a training without its images."""

@@ -18,7 +18,6 @@ from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import ParserJob
-from drivesplat.settings.inspection import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, RegionJob
@@ -26,6 +25,7 @@ from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob
 from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
+from drivesplat.settings.visuals import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.workflow import film_fields
 from drivesplat.workflow.film_names import no_such_edit, scene_edits

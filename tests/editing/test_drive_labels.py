@@ -17,7 +17,6 @@ from nuscenes.nuscenes import NuScenes
 from nuscenes.scripts.export_2d_annotations_as_json import post_process_coords
 from nuscenes.utils.geometry_utils import BoxVisibility, view_points
 
-from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.editing.actors import other_objects, trained_actors
 from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_drive
 from drivesplat.editing.film import track_labels
@@ -34,6 +33,7 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.export import DriveJob
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.render import TrajectorySettings
+from drivesplat.trajectories.edited_actors import EditedActor
 
 STEPS = [{"shift": {"track": AHEAD, "lateral": 2.0}}, {"remove": {"track": TURNING}}]
 PARKED, WALKER, CONE = "vehicle.truck", "human.pedestrian.adult", "movable_object.trafficcone"

@@ -25,7 +25,6 @@ from helpers.hand_made_street import (
 from helpers.hand_made_traffic import placed
 from PIL import Image
 
-from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.actors import actor_placements, collisions, editable_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, render_edit
@@ -37,13 +36,14 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.render import EditJob, FilmJob, TrajectorySettings
+from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.trajectories.motion import Motion
 
 CPU = DeviceSettings(kind="cpu")
 BUSY = [

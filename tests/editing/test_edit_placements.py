@@ -18,8 +18,6 @@ from helpers.hand_made_street import (
 )
 from helpers.hand_made_traffic import placed
 
-from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
-from drivesplat.edited_motion.recolouring import color_matrix
 from drivesplat.editing.actors import actor_placements, editable_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.kernels.gsplat_private import sh_basis
@@ -28,11 +26,13 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot
 from drivesplat.rendering.frames import film_frame
-from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit, Recolour
 from drivesplat.settings.render import FilmFormat, TrajectorySettings
+from drivesplat.trajectories.camera_path import film_path
+from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.trajectories.recolouring import color_matrix
 
 LAST = 4.5
 """The tiny drive's first image is at 0, its last at this second."""

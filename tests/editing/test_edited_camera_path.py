@@ -6,11 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import TrajectorySettings
+from drivesplat.trajectories.camera_path import CameraPath, film_path, recorded_frames
 
 START = 1_532_402_927_612_460
 SPEED, RADIUS, FPS = 8.0, 20.0, 10

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers.hand_made_street import AHEAD, GONE, TURNING, checkpoint_of, street_model, street_scene
 
-from drivesplat.edited_motion.edited_actors import edited_actors
 from drivesplat.editing.actors import editable_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.sampled_edits import sampled_edits
 from drivesplat.settings.edit import Edit
+from drivesplat.trajectories.edited_actors import edited_actors
 
 
 @pytest.fixture(scope="module")

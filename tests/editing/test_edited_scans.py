@@ -8,13 +8,13 @@ import torch
 from helpers.hand_made import about_z, actors_of, motion_through, round_gaussians, track_of
 from torch import nn
 
-from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.actors import actor_placements
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanPicture, ScanView
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rasterization.scans import RayGrid
 from drivesplat.settings.edit import Edit
+from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
 
 CAR, SPEED, TIME = "car", 8.0, 1.0
 CAR_AT, WALL_AT = 12.0, 30.0

@@ -11,12 +11,12 @@ from drivesplat.editing.film import EditFiles, render_edit
 from drivesplat.editing.quad import recorded_picture, render_quad
 from drivesplat.rendering.film import Shot
 from drivesplat.rendering.frames import film_frame
-from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.images import read_image
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import EditJob, TrajectorySettings
+from drivesplat.trajectories.camera_path import film_path
 
 CPU = DeviceSettings(kind="cpu")
 STOP = Edit.model_validate({"steps": [{"stop": {"track": AHEAD, "at": 1.0}}]})

@@ -14,13 +14,13 @@ from plyfile import PlyData
 
 from drivesplat.editing.scan_folder import write_scan_folder
 from drivesplat.editing.scans import ScanRenderPlan, SimulatedScan, scan_render_plan
+from drivesplat.editing.sensor_path import recorded_ego
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import scan_of
 from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.readers.nuscenes.sweep_file import file_fault, read_file
-from drivesplat.rendering.sensor_path import recorded_ego
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scan_record import NO_OBJECT, ScanRecords
 from drivesplat.scene.scene import Scene

@@ -35,8 +35,8 @@ from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at, boxes_at
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
-from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
+from drivesplat.settings.visuals import RemovalSettings
 
 CPU = torch.device("cpu")
 MARGIN = 0.1

@@ -24,7 +24,6 @@ from helpers.viewer_pages import (
 from helpers.walkers import SIZE, walker, walking
 from scipy.spatial.transform import Rotation
 
-from drivesplat.edited_motion.sampled_edit import Instance, InstanceMotion, SampledEdit
 from drivesplat.export.modes import Gait, Modes, fitted_modes
 from drivesplat.export.sampled_motion import SampledMotion
 from drivesplat.export.trained_parts import SampledGroup, sampled_shapes, trained_groups
@@ -35,6 +34,7 @@ from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit
 
 EDITED = {"walked": 0.7, "scale": 1.25, "phase": 0.3}
 

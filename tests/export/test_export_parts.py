@@ -28,9 +28,9 @@ from drivesplat.export.trained_parts import SampledGroup, trained_gaussians, tra
 from drivesplat.export.unique_names import unique_names
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.export import SplatJob
+from drivesplat.trajectories.motion import Motion
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {}}

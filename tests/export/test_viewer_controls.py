@@ -33,7 +33,6 @@ from helpers.viewer_pages import (
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.edited_motion.sampled_edit import CameraMotion, Instance, InstanceMotion, SampledEdit
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_images import key_frame_images
@@ -41,6 +40,7 @@ from drivesplat.export.viewer_scene import ViewerContent
 from drivesplat.model.gaussians import Gaussians, concatenate, recolored
 from drivesplat.scene.images import read_image
 from drivesplat.scene.rigid import rigid
+from drivesplat.trajectories.sampled_edit import CameraMotion, Instance, InstanceMotion, SampledEdit
 
 SIZE = np.array([4.0, 4.0, 4.0])
 

@@ -11,7 +11,6 @@ import pytest
 import torch
 from helpers import REPOSITORY
 
-from drivesplat.discovery.record import read_discovered
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.lpips_map import load_alexnet
@@ -21,11 +20,11 @@ from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.point_cloud import read_ply
 from drivesplat.io.storage import read_json
 from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.lidar.objects.record import read_discovered
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.provenance.file_digests import checked_digest, record_output
 from drivesplat.readers.truth import read_truth
-from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.scan_record import read_scans
@@ -33,6 +32,7 @@ from drivesplat.scene.scene import read_scene
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.training.resume_state import resumable
 from drivesplat.training.run import read_summary
+from drivesplat.trajectories.actor_record import read_actors
 
 SOURCES = [
     path for folder in ("drivesplat", "workflow_scripts", "benchmarks") for path in (REPOSITORY / folder).rglob("*.py")

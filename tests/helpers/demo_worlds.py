@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.demo.optics.rig import SENSORS, key_frame_time
-from drivesplat.demo.output.tables import visibility_level
-from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.street.objects import StreetObject
 from drivesplat.io.storage import canonical_json
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.world import WorldJob, WorldSettings
+from drivesplat.world.optics.rig import SENSORS, key_frame_time
+from drivesplat.world.output.tables import visibility_level
+from drivesplat.world.recorder import Recorder
+from drivesplat.world.street.objects import StreetObject
 from helpers.classed import classed
 
 RIG = {sensor.channel: sensor for sensor in SENSORS}

@@ -4,8 +4,8 @@ from itertools import combinations
 
 import numpy as np
 
-from drivesplat.demo.recorder import Recorder, Viewpoint
-from drivesplat.demo.street.objects import StreetObject
+from drivesplat.world.recorder import Recorder, Viewpoint
+from drivesplat.world.street.objects import StreetObject
 
 EGO_CENTER, EGO_SIZE = 1.4, (4.6, 1.9)
 """Middle of the ego vehicle in metres ahead of its origin; its length and width."""

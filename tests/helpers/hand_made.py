@@ -16,15 +16,15 @@ from drivesplat.model.part import Part
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.preprocess.parser import training_record
-from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.masks import mask_name
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.trajectories.actor_record import ActorRecord
+from drivesplat.trajectories.motion import Motion
 
 BLACK = (0.0, 0.0, 0.0)
 

@@ -16,12 +16,12 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.render import FilmFormat
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.trajectories.motion import Motion
 from helpers.classed import classed
 from helpers.hand_made import about_z, round_gaussians
 from helpers.hand_made import actors_of as made_actors

@@ -10,9 +10,9 @@ from torch import nn
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.part import Part, RigidGroup
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
+from drivesplat.trajectories.motion import Motion
 
 TURNING, GONE_AT_TIMES = "0a8dee9e8b4b4b0f8d6c2a5f1e3d4c5b", "f00dee9e8b4b4b0f8d6c2a5f1e3d4c5b"
 REACH = 0.25

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from drivesplat.demo.optics.rig import DemoSensor
-from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.street.objects import EGO_VEHICLE
 from drivesplat.scene.scene import Frame, Scene, Sweep
+from drivesplat.world.optics.rig import RigSensor
+from drivesplat.world.recorder import Recorder
+from drivesplat.world.street.objects import EGO_VEHICLE
 from helpers import demo_worlds
 from helpers.demo_worlds import RIG
 
@@ -48,7 +48,7 @@ def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = KEY_FRAMES
     )
 
 
-def _frame(folder: Path, recorder: Recorder, sensor: DemoSensor, index: int) -> Frame:
+def _frame(folder: Path, recorder: Recorder, sensor: RigSensor, index: int) -> Frame:
     time_us = index * KEY_FRAME_US + sensor.delay_us
     camera = recorder.camera(sensor, time_us * 1e-6)
     path = folder / f"{sensor.channel}_{index:02}.png"

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.evaluation.scene_metrics import side_by_side
-from drivesplat.inspection.rendered_view import ModelWithRecording, open_model_with_recording
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
@@ -29,6 +28,7 @@ from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.train import TrainJob
 from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
+from drivesplat.visuals.rendered_view import ModelWithRecording, open_model_with_recording
 from drivesplat.workflow.stages import stage_settings
 from helpers.workflow_copy import TINY_TRAINING
 

@@ -4,10 +4,10 @@ import numpy as np
 import torch
 
 from drivesplat.model.deformable import Deformable
-from drivesplat.scene.motion import Motion
 from drivesplat.settings.deformable import LatticeSettings
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import DeformableSettings
+from drivesplat.trajectories.motion import Motion
 from helpers.hand_made import motion_through, track_of
 from helpers.hand_made_traffic import TURNING
 

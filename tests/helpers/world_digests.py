@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from drivesplat.demo.optics.materials import facade, ground, surface
-from drivesplat.demo.recorder import Recorder, Viewpoint
-from drivesplat.demo.shapes.mesh import ColoredMesh, Material
 from drivesplat.settings.config import load
 from drivesplat.settings.world import WorldJob
 from drivesplat.workflow.stages import stage_settings
+from drivesplat.world.optics.materials import facade, ground, surface
+from drivesplat.world.recorder import Recorder, Viewpoint
+from drivesplat.world.shapes.mesh import ColoredMesh, Material
 from helpers import REPOSITORY
 from helpers.demo_worlds import FRONT, LIDAR, recorder_of
 from helpers.world_shapes import ALL, FIGURES, FURNITURE, PLANTS, VEHICLES
 
 WORLDS = sorted(path.stem for path in (REPOSITORY / "benchmarks/worlds").glob("*.yaml"))
-DIGESTS = Path(__file__).parents[1] / "demo/world_digests.json"
+DIGESTS = Path(__file__).parents[1] / "world/world_digests.json"
 FRACTIONS = np.array([0.0, 0.37, 1.0])
 """Of the drive: the times at which poses count."""
 RESOLUTION = 1e-4

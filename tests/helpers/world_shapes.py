@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drivesplat.demo.shapes import buildings, mesh, plants, scenery, vehicles
-from drivesplat.demo.shapes.animals import Dog
-from drivesplat.demo.shapes.bicycle import GEAR_RATIO, WHEEL_RADIUS
-from drivesplat.demo.shapes.body import Body
-from drivesplat.demo.shapes.cyclist import Cyclist
-from drivesplat.demo.shapes.mesh import ColoredMesh, Material, SurfaceClass
-from drivesplat.demo.shapes.people import Person
+from drivesplat.world.shapes import buildings, mesh, plants, scenery, vehicles
+from drivesplat.world.shapes.animals import Dog
+from drivesplat.world.shapes.bicycle import GEAR_RATIO, WHEEL_RADIUS
+from drivesplat.world.shapes.body import Body
+from drivesplat.world.shapes.cyclist import Cyclist
+from drivesplat.world.shapes.mesh import ColoredMesh, Material, SurfaceClass
+from drivesplat.world.shapes.people import Person
 
 RED = (0.5, 0.1, 0.1)
 GREY = (0.3, 0.3, 0.3)

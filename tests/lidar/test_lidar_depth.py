@@ -28,7 +28,6 @@ from helpers.drives import (
 from helpers.records import write_invalid
 from PIL import Image
 
-from drivesplat.demo.world import make_world
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
 from drivesplat.io.storage import no_provenance
@@ -43,6 +42,7 @@ from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
+from drivesplat.world.generate import make_world
 
 CAR, TRUCK = World().things[:2]
 AHEAD = Thing("vehicle.truck", (4.0, 2.0, 2.6), (8.5, 0.0, 1.3), (4.2, 0.0))

@@ -8,7 +8,6 @@ import pytest
 from helpers.demo_worlds import LIDAR, recorder_of
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.optics.lidar import FORWARD
 from drivesplat.errors import DatasetError
 from drivesplat.lidar import scans
 from drivesplat.lidar.scans import Spin, mean_velocity, scan_of, sensor_poses, wrapped
@@ -16,6 +15,7 @@ from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scan import Scan
 from drivesplat.scene.scene import Sweep
 from drivesplat.scene.sensors import Lidar, LidarReturns, SweepMotion
+from drivesplat.world.optics.lidar import FORWARD
 
 TIME_US = 2_000_000
 REVOLUTION_US = 50_000

@@ -15,11 +15,11 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
-from drivesplat.scene.motion import Motion
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
+from drivesplat.trajectories.motion import Motion
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 

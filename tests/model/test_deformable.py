@@ -17,10 +17,10 @@ from drivesplat.model.harmonics import rotated
 from drivesplat.model.lattice import Lattice, Undeformed, roughness
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import ActorTrack
-from drivesplat.scene.motion import HALF_STEP
 from drivesplat.settings.deformable import GaitSettings, LatticeSettings
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.settings.train_objects import DeformableSettings
+from drivesplat.trajectories.motion import HALF_STEP
 
 SIZE, SPEED = (0.8, 0.6, 1.8), 1.5
 STRIDE = 0.83 * SIZE[2]

@@ -25,10 +25,10 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
-from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings
+from drivesplat.trajectories.actor_record import ActorRecord
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SH_C0 = 0.5 / np.sqrt(np.pi)

@@ -12,12 +12,12 @@ from helpers.workflow_copy import WorkflowCopy
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.poses.refine import refine_poses
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame, Scene, Track, read_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 from drivesplat.settings.world import WorldSettings
+from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
 
 KEY_FRAMES, KEY_FRAME_US = 6, 500_000
 WIDTH = 400

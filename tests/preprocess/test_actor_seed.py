@@ -32,13 +32,13 @@ from drivesplat.io.array_file import write_arrays
 from drivesplat.io.storage import no_provenance
 from drivesplat.io.typed_record import field_values
 from drivesplat.preprocess.actor_seed import actors_record
-from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, ObjectClassName
+from drivesplat.trajectories.actor_record import ActorRecord, ActorRecords, read_actors
+from drivesplat.trajectories.motion import Motion
 
 CAR = World().things[0]
 """A car ahead of the ego vehicle: 4 x 2 x 1.6 m, its rear initially 4.8 m from the camera."""

@@ -7,7 +7,7 @@ import drivesplat
 from drivesplat.readers.nuscenes.layout import TABLES
 
 LIBRARY = Path(drivesplat.__file__).parent
-KNOWING = ("readers", "demo")
+KNOWING = ("readers", "world")
 WORDS_OF_ITS_OWN = ("calibrated_sensor", "ego_pose", "sample_annotation", "sample_data")
 """The tables whose names are not ordinary words."""
 DATASETS_OWN = re.compile(

@@ -28,12 +28,12 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, film_size, render_film
 from drivesplat.rendering.frames import film_frame
-from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
 from drivesplat.settings.train import GaussianSettings, TrainSettings
+from drivesplat.trajectories.camera_path import film_path
 
 WIDTH, HEIGHT, FPS = 160, 120, 30
 SIZE = (WIDTH, HEIGHT)

@@ -4,7 +4,7 @@ import pytest
 from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.lidar.depth_record import read_lidar_depth
-from drivesplat.scene.actor_record import read_actors
+from drivesplat.trajectories.actor_record import read_actors
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("inputs")]
 

@@ -10,9 +10,9 @@ from helpers.drives import Thing, World, default_things
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
 
 from drivesplat.io.video import read_footage
-from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.scan_record import read_scans
 from drivesplat.scene.scene import read_scene
+from drivesplat.trajectories.actor_record import read_actors
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("discovered_workflow")]
 ACTORS = ["background", "actors"]

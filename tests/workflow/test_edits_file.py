@@ -9,16 +9,16 @@ import pytest
 import yaml
 from helpers import REPOSITORY
 
-from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.tokens import instance_token
-from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
-from drivesplat.scene.motion import Motion
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit, Step
 from drivesplat.settings.world import WorldSettings
+from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.trajectories.motion import Motion
 from drivesplat.workflow.edits_file import read_edits
+from drivesplat.world.recorder import Recorder
+from drivesplat.world.tokens import instance_token
 
 DEMO = REPOSITORY / "presets" / "edits" / "demo.yaml"
 EVERY_STEP = """

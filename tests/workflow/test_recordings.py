@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.demo.marker import WORLD_MARKER
 from drivesplat.errors import ConfigError
 from drivesplat.readers.drive.layout import outline
 from drivesplat.readers.outline import RecordedCamera, trained_key_frames
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.workflow.plan import Plan
+from drivesplat.world.marker import WORLD_MARKER
 
 CAMERA = {"width": 1600, "height": 900}
 DRIVE: dict[str, Any] = {

@@ -12,11 +12,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from drivesplat.editing.actors import editable_actors
 from drivesplat.errors import ConfigError
 from drivesplat.evaluation.summary import sentences
-from drivesplat.inspection.ghost_panel import ghost_panel
-from drivesplat.inspection.removal import remove_actor
-from drivesplat.rendering.trajectory import film_path
-from drivesplat.settings.inspection import PanelJob, RemovalJob
 from drivesplat.settings.render import FilmJob
+from drivesplat.settings.visuals import PanelJob, RemovalJob
+from drivesplat.trajectories.camera_path import film_path
+from drivesplat.visuals.ghost_panel import ghost_panel
+from drivesplat.visuals.removal import remove_actor
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.demo.optics.rig import recording_sensors
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.settings.config import load
 from drivesplat.settings.world import WorldJob
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import TRAINING_INPUTS, refines_poses, stage_settings
 from drivesplat.workflow.without_cameras import CAMERA_STAGES, methods_left_out, require_methods
+from drivesplat.world.optics.rig import recording_sensors
 
 ALONE = {"cameras": [], "eval_camera": None}
 METHODS = {

@@ -503,7 +503,7 @@ def test_comments_and_code_of_other_settings_rerun_nothing(finished):
         ("drivesplat/scene/object_class.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
         ("drivesplat/io/video.py", "bicubic", "bilinear", FILMS),
         ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", FILMS),
-        ("drivesplat/edited_motion/lateral_offset.py", "HEADING_SPEED = 1.0", "HEADING_SPEED = 0.5",
+        ("drivesplat/trajectories/lateral_offset.py", "HEADING_SPEED = 1.0", "HEADING_SPEED = 0.5",
          {"edit": 2, "export_viewer": 2}),
         ("drivesplat/export/viewer_page/controls.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report/gaps.py", "SCHEMA = 3", "SCHEMA = 4", {"gap_report": 1}),

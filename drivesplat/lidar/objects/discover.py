@@ -1,0 +1,202 @@
+"""Moving objects of a drive from its LiDAR scans: evidence, clusters, chains, boxes."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from drivesplat.lidar.objects.boxes import Discovered, fitted_box
+from drivesplat.lidar.objects.clusters import Chain, Cluster, chains_of, clusters_of
+from drivesplat.lidar.objects.ends import Ends
+from drivesplat.lidar.objects.ground import ground_of
+from drivesplat.lidar.objects.merging import merged, united
+from drivesplat.lidar.objects.seen_empty import seen_empty
+from drivesplat.lidar.objects.separation import separated
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.scan_record import RecordedScan
+
+MIN_SCANS, MIN_SECONDS, MIN_WAY = 3, 0.4, 1.0
+"""Scans, seconds and metres of a chain that is an object."""
+MIN_FILL = 0.35
+"""Fraction of the scans between its first and its last one in which it was found."""
+MIN_TYPICAL = 4.0
+"""Median number of returns of its clusters."""
+STRAIGHT = 0.5
+"""Least ratio of the distance between its ends to the length of its way."""
+SAME_VELOCITY, SAME_SHARE = 2.5, 0.5
+"""Metres per second, and fraction of the speed, by which the velocities of parts of one object seem to differ."""
+SLACK = (1.0, 0.3)
+"""Metres along and across a vehicle by which the middles of its parts may lie beyond its box."""
+NEARLY_ALWAYS, FEW = 0.75, 0.1
+"""Fractions of their common time, and of the returns of the larger one."""
+MAX_CLEARANCE = 0.8
+"""Metres between the ground and the lowest return of an object. Far away it is the height of a kerb and twice the
+distance of two beams there, where that is more."""
+MIN_MOVING = 0.4
+"""Fraction of the returns in the place of an object that move."""
+BESIDE, KERB = 0.2, 0.3
+"""Metres around a cluster, and above the ground, where returns are counted for it."""
+MAX_SEPARATIONS = 8
+"""Rounds in which boxes and the returns that belong to them are found by turns."""
+Boxed = tuple[Chain, Discovered]
+"""A chain and its box."""
+
+
+def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
+    """The moving objects in the scans of one LiDAR, which are in order of time, in the order in which they appear."""
+    moving = seen_empty(scans)
+    clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
+    around = Surroundings(scans, moving)
+    chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and around.confirm(chain)]
+    boxes = _without_overlaps([around.boxed(chain) for chain in chains], around)
+    boxes = _without_overlaps(_apart(boxes, around), around)
+    ends = Ends(scans)
+    return sorted((ends.followed(item) for _, item in boxes), key=lambda it: it.seconds[0])
+
+
+def _apart(boxes: Sequence[Boxed], around: "Surroundings") -> Sequence[Boxed]:
+    """Chains with their boxes, refined by turns with the returns that belong to each, until these stay."""
+    for _ in range(MAX_SEPARATIONS if boxes else 0):
+        before = [_counts(chain) for chain, _ in boxes]
+        chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= MIN_SCANS]
+        if [_counts(chain) for chain in chains] == before:
+            break
+        boxes = [around.boxed(chain) for chain in chains]
+    return boxes
+
+
+def _counts(chain: Chain) -> list[tuple[int, int]]:
+    return [(cluster.scan, len(cluster.points)) for cluster in chain.clusters]
+
+
+def _without_overlaps(boxes: Sequence[Boxed], around: "Surroundings") -> Sequence[Boxed]:
+    """Chains with their boxes, those whose boxes overlap while both move as one object."""
+    while True:
+        pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if overlap(boxes[i][1], boxes[j][1]))
+        pair = next(pairs, None)
+        if pair is None:
+            return boxes
+        whole = united(*(boxes[k][0] for k in pair))
+        boxes = [it for k, it in enumerate(boxes) if k not in pair] + [around.boxed(whole)]
+
+
+def overlap(a: Discovered, b: Discovered) -> bool:
+    """Whether two boxes are of one object: over their common time the centre of one mostly lies in the other, with
+    SLACK about vehicles, and they move alike; or it nearly always lies in a truck, on whose side patches seem to slide,
+    or in a box with many more returns."""
+    first, last = max(a.seconds[0], b.seconds[0]), min(a.seconds[-1], b.seconds[-1])
+    if last <= first:
+        return False
+    seconds = np.linspace(first, last, 10)
+    alike = _move_alike(a, b, seconds)
+    for outer, inner in ((a, b), (b, a)):
+        slack = np.zeros(2) if outer.object_class.is_human else np.array(SLACK)
+        if alike and _share_inside(outer, inner, seconds, slack) > 0.5:
+            return True
+        is_patch = outer.object_class is ObjectClass.TRUCK or inner.returns < FEW * outer.returns
+        if is_patch and _share_inside(outer, inner, seconds, np.zeros(2)) > NEARLY_ALWAYS:
+            return True
+    return False
+
+
+def _move_alike(a: Discovered, b: Discovered, seconds: np.ndarray) -> bool:
+    velocities = [item.path.velocities(seconds) for item in (a, b)]
+    speed = max(float(np.median(np.linalg.norm(own, axis=1))) for own in velocities)
+    apart = float(np.median(np.linalg.norm(velocities[0] - velocities[1], axis=1)))
+    return apart <= max(SAME_VELOCITY, SAME_SHARE * speed)
+
+
+def _share_inside(outer: Discovered, inner: Discovered, seconds: np.ndarray, slack: np.ndarray) -> float:
+    """The fraction of the times at which the centre of a box lies in another one, enlarged by `slack` (2,) metres."""
+    poses, places = outer.poses(seconds), inner.poses(seconds)[:, :3, 3]
+    local = np.einsum("nji,nj->ni", poses[:, :3, :3], places - poses[:, :3, 3])
+    return float((np.abs(local[:, :2]) < 0.5 * outer.size[:2] + slack).all(axis=1).mean())
+
+
+def _long(chains: Sequence[Chain]) -> list[Chain]:
+    return [chain for chain in chains if len(chain.clusters) >= MIN_SCANS]
+
+
+def is_object(chain: Chain) -> bool:
+    """Whether a chain is long, dense and straight enough to be an object that moves."""
+    seconds, places = chain.seconds, chain.places
+    scans = chain.clusters[-1].scan - chain.clusters[0].scan + 1
+    count = max(2, round((seconds[-1] - seconds[0]) / 0.5) + 1)
+    coarse = np.stack([np.interp(np.linspace(*seconds[[0, -1]], count), seconds, places[:, k]) for k in (0, 1)], axis=1)
+    way = np.linalg.norm(np.diff(coarse, axis=0), axis=1).sum()
+    distance = np.linalg.norm(places[-1] - places[0])
+    return bool(
+        len(seconds) >= MIN_SCANS
+        and seconds[-1] - seconds[0] >= MIN_SECONDS
+        and distance >= MIN_WAY
+        and distance >= STRAIGHT * way
+        and len(seconds) >= MIN_FILL * scans
+        and np.median([len(cluster.points) for cluster in chain.clusters]) >= MIN_TYPICAL
+    )
+
+
+class Surroundings:
+    """What the scans say around clusters: the height of the ground, returns that do not move, and the range below which
+    nothing is measured."""
+
+    def __init__(self, scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " _"]]):
+        self._scans, self._moving = scans, moving
+        elevations = np.sort(scans[0].scan.rays.beam_elevations)
+        self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
+        self._ground = ground_of(scans, moving)
+        self._blind = max(_blind_range(scan) for scan in scans)
+        self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
+
+    def boxed(self, chain: Chain) -> Boxed:
+        """A chain with its box."""
+        return chain, fitted_box(chain, self._grounds(chain), self._blind)
+
+    def _grounds(self, chain: Chain) -> Float[np.ndarray, " k"]:
+        """The height of the ground below each cluster of a chain in metres: where it is unknown, between known ones, or
+        that of the lowest returns."""
+        heights = np.array([self._ground.height(cluster.place) for cluster in chain.clusters])
+        known = np.isfinite(heights)
+        if not known.any():
+            return np.full(len(heights), min(cluster.lowest for cluster in chain.clusters))
+        return np.interp(chain.seconds, chain.seconds[known], heights[known])
+
+    def confirm(self, chain: Chain) -> bool:
+        """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
+        move, as those of standing objects do not."""
+        clearances = np.array([cluster.lowest - self._ground.height(cluster.place) for cluster in chain.clusters])
+        excess = clearances - [max(MAX_CLEARANCE, KERB + 2 * self._beams_apart(cluster)) for cluster in chain.clusters]
+        if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
+            return False
+        return bool(np.median([self._moving_share(cluster) for cluster in chain.clusters]) > MIN_MOVING)
+
+    def _beams_apart(self, cluster: Cluster) -> float:
+        """The vertical distance in metres of neighbouring beams at the place of a cluster."""
+        return self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2]))
+
+    def _moving_share(self, cluster: Cluster) -> float:
+        """The fraction of the returns in a cluster's extents, above the ground where it is known, that move."""
+        ground = self._ground.height(cluster.place)
+        floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
+        tree, heights = self._of_scan(cluster.scan)
+        low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
+        reach = 0.5 * float(np.linalg.norm(high[:2] - low[:2]))
+        near = np.array(tree.query_ball_point(cluster.place, reach), dtype=np.int64)
+        places, z = tree.data[near], heights[near]
+        inside = (places >= low[:2]).all(axis=1) & (places <= high[:2]).all(axis=1)
+        standing = int((inside & (z > floor) & (z <= high[2])).sum())
+        own = int((cluster.points[:, 2] > floor).sum())
+        return own / max(own + standing, 1)
+
+    def _of_scan(self, number: int) -> tuple[cKDTree, np.ndarray]:
+        """The places of the returns of a scan that do not move, and their heights."""
+        if number not in self._standing:
+            points = self._scans[number].points()[~self._moving[number]]
+            self._standing[number] = cKDTree(points[:, :2]), points[:, 2]
+        return self._standing[number]
+
+
+def _blind_range(scan: RecordedScan) -> float:
+    """The range in metres below which returns are not measured, as they are of the ego vehicle; 0 if there are none."""
+    return float(scan.scan.ranges[scan.scan.returned & ~scan.measured].max(initial=0.0))

@@ -1,0 +1,205 @@
+"""The actors of an edited drive: the recorded actors after every step of an edit."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from drivesplat.errors import ConfigError
+from drivesplat.scene.track_references import why_fixed
+from drivesplat.scene.tracks import short_ids
+from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
+from drivesplat.trajectories.actor_path import ActorPath, recorded_path
+from drivesplat.trajectories.motion import Motion
+from drivesplat.trajectories.placed_path import placed_motion
+from drivesplat.trajectories.recolouring import color_matrix
+from drivesplat.trajectories.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
+
+MIN_DISTANCE = 0.5
+"""Metres; an actor that moves less counts as standing, since annotations are noisy."""
+LOOKAHEAD = 60.0
+"""Seconds past the end of a track in which that distance counts."""
+ORIGIN = np.eye(4)[None]
+"""The ego pose of a drive that begins at the world's origin."""
+
+
+@dataclass(frozen=True)
+class EditedActor:
+    """An actor of an edited drive: `id` is a track's or the name of a duplicate. It has the Gaussians of the track
+    `source`, scaled by `scale` about the box centre to `size` (3,): length, width, height in metres, their
+    RGB colours mapped by `color_matrix` (3, 3; None: as trained), and a gait that is ahead by `phase` cycles. Unless
+    `edited` it is as recorded."""
+
+    id: str
+    source: str
+    scale: float
+    category: str
+    size: np.ndarray
+    edited: bool
+    path: ActorPath = field(repr=False)
+    color_matrix: np.ndarray | None = None
+    phase: float = 0.0
+
+    @classmethod
+    def recorded(cls, id: str, category: str, size: np.ndarray, motion: Motion) -> "EditedActor":
+        """An actor before any edit."""
+        return cls(id, id, 1.0, category, size, False, recorded_path(motion, float(size[2])))
+
+    def present(self, times: np.ndarray) -> np.ndarray:
+        """Whether the actor is present at `times` (n,) in film seconds: (n,) bool."""
+        return self.path.present(np.asarray(times, dtype=np.float64))
+
+    def poses(self, times: np.ndarray) -> np.ndarray:
+        """Object to world (n, 4, 4) at `times` (n,) in film seconds, at the centre of the scaled box."""
+        times = np.asarray(times, dtype=np.float64)
+        if not self.edited:
+            return self.path.trajectory.motion.poses(times)
+        return self.path.poses(times, float(self.size[2]))
+
+    def walked(self, times: np.ndarray) -> np.ndarray:
+        """The distance (n,) in metres by which its limbs have advanced at `times` (n,) in film seconds."""
+        return self.path.walked(np.asarray(times, dtype=np.float64))
+
+
+def edited_actors(
+    actors: Sequence[EditedActor], edit: Edit, where: str, other_ids: Collection[str] = (),
+    ego_to_world: np.ndarray = ORIGIN,
+) -> list[EditedActor]:  # fmt: skip
+    """The recorded `actors` after all steps of an edit: in their order without the removed ones, then the duplicates.
+
+    `other_ids` are those of tracks that cannot be edited; no duplicate may have one. `ego_to_world` (n, 4, 4) are the
+    ego poses of the drive, for steps that place a copy. Raises ConfigError, one line that
+    starts with `where` (the scene and the edit), if a step names an unknown track, changes nothing or contradicts an
+    earlier step.
+    """
+    state = _EditState({actor.id: actor for actor in actors}, {}, frozenset(other_ids), ego_to_world)
+    for number, step in enumerate(edit.steps, start=1):
+        try:
+            state = _after_step(state, step, number)
+        except _StepError as error:
+            raise ConfigError(f"{where}, step {number} ({step.kind}): {error}") from None
+    return list(state.actors.values())
+
+
+class _StepError(Exception):
+    """The problem with a step, without its number."""
+
+
+@dataclass(frozen=True)
+class _EditState:
+    """The actors after some steps by id; the removed ones by id, with the number of the step that removed them; ids of
+    other tracks; the ego poses (n, 4, 4)."""
+
+    actors: dict[str, EditedActor]
+    removed: dict[str, tuple[int, EditedActor]]
+    other_ids: frozenset[str]
+    ego_to_world: np.ndarray
+
+    def find(self, name: str, also_removed: bool = False) -> EditedActor:
+        """The actor with that id, or the only one whose id starts with it; perhaps `also_removed` ones."""
+        known = [*self.actors, *self.removed]
+        found = [name] if name in known else [other for other in known if other.startswith(name)]
+        short = short_ids(known)
+        remaining = ", ".join(short[other] for other in self.actors) or "none"
+        if not found:
+            fixed = why_fixed(name, self.other_ids)
+            raise _StepError(f"no editable track has an id starting with {name!r}; editable tracks: {remaining}{fixed}")
+        if len(found) > 1:
+            matches = ", ".join(short[other] for other in found)
+            raise _StepError(f"{len(found)} tracks have ids starting with {name!r}: {matches}; give more characters")
+        if found[0] in self.removed:
+            number, actor = self.removed[found[0]]
+            if also_removed:
+                return actor
+            raise _StepError(f"track {short[found[0]]} was removed by step {number}; remaining tracks: {remaining}")
+        return self.actors[found[0]]
+
+    def with_actors(self, *actors: EditedActor) -> "_EditState":
+        """The state with these actors replaced or added."""
+        return replace(self, actors=self.actors | {actor.id: actor for actor in actors})
+
+    def without(self, actor: EditedActor, number: int) -> "_EditState":
+        """The state after step `number` has removed an actor."""
+        remaining = {name: other for name, other in self.actors.items() if name != actor.id}
+        return replace(self, actors=remaining, removed=self.removed | {actor.id: (number, actor)})
+
+
+def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
+    change = step.change
+    if step.kind == "ego":
+        return state
+    actor = state.find(change.track, also_removed=step.kind == "place")
+    match change:
+        case Swap():
+            return _swapped(state, actor, change)
+        case Duplicate():
+            return _copied(state, actor, change, apply_duplicate(actor.path, change))
+        case Place():
+            height = float(actor.size[2])
+            path = recorded_path(placed_motion(change, state.ego_to_world, height), height)
+            return _copied(state, actor, change, path)
+        case Rescale():
+            scale, size = actor.scale * change.factor, actor.size * change.factor
+            return state.with_actors(replace(actor, scale=scale, size=size, edited=True))
+        case Recolour():
+            matrix = color_matrix(change)
+            before = np.eye(3) if actor.color_matrix is None else actor.color_matrix
+            return state.with_actors(replace(actor, color_matrix=matrix @ before, edited=True))
+        case Speed() | Stop() | Reverse() | Shift():
+            return state.with_actors(replace(actor, path=_changed_path(actor.path, change), edited=True))
+        case _:
+            return state.without(actor, number)
+
+
+def _changed_path(path: ActorPath, change: Speed | Stop | Reverse | Shift) -> ActorPath:
+    match change:
+        case Speed():
+            _require_present(path, change.start, "start", may_precede=True)
+            if change.factor is not None:
+                _require_moving(path, change.start)
+            return apply_speed(path, change)
+        case Stop():
+            _require_present(path, change.at, "at", may_precede=False)
+            return apply_stop(path, change)
+        case Reverse():
+            return apply_reverse(path, change)
+        case Shift():
+            _require_present(path, change.start, "start", may_precede=True)
+            return apply_shift(path, change)
+
+
+def _require_present(path: ActorPath, second: float | None, key: str, may_precede: bool) -> None:
+    """A change after the track has no effect; one before it has, if it `may_precede` the track."""
+    if second is None or bool(path.present(np.array([second]))[0]):
+        return
+    if second <= path.end and (may_precede or second >= path.begin):
+        return
+    problem = "ends before" if second > path.end else "begins after"
+    raise _StepError(
+        f"the track {problem} {key!r} ({second:g} s): it was recorded from {path.begin:.2f} to {path.end:.2f} s"
+    )
+
+
+def _require_moving(path: ActorPath, start: float | None) -> None:
+    """A speed factor has no effect on a standing actor."""
+    begin = max(path.begin, start or 0.0)
+    first, last = path.distance(np.array([begin, max(begin, path.end) + LOOKAHEAD]))
+    if abs(last - first) < MIN_DISTANCE:
+        raise _StepError(f"the track stands from {begin:.2f} s on, where 'factor' has no effect; use 'to'")
+
+
+def _swapped(state: _EditState, actor: EditedActor, swap: Swap) -> _EditState:
+    other = state.find(swap.other)
+    if other.id == actor.id:
+        raise _StepError(f"{swap.track!r} and {swap.other!r} are the same track; name two tracks")
+    return state.with_actors(replace(actor, path=other.path, edited=True), replace(other, path=actor.path, edited=True))
+
+
+def _copied(state: _EditState, actor: EditedActor, copy: Duplicate | Place, path: ActorPath) -> _EditState:
+    taken = [*state.actors, *state.removed]
+    if copy.name in taken:
+        used = ", ".join(short_ids(taken).values())
+        raise _StepError(f"the name {copy.name!r} in 'as' is already used; names in use: {used}")
+    if copy.name in state.other_ids:
+        raise _StepError(f"the name {copy.name!r} in 'as' is the id of another track; choose another name")
+    return state.with_actors(replace(actor, id=copy.name, path=path, edited=True, phase=actor.phase + copy.phase))

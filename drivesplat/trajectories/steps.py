@@ -1,0 +1,137 @@
+"""The effect of each step of an edit on an actor's path, as pure functions.
+
+`speed` and `reverse` change the position along the path; offsets keep their film seconds. `stop` and a delay act on
+position and offsets, so that a stopped actor does not slide.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from drivesplat.settings.edit import Duplicate, Reverse, Shift, Speed, Stop
+from drivesplat.trajectories.actor_path import ActorPath, PathOffsets, PathPosition
+from drivesplat.trajectories.transition import Transition
+
+INTEGRATION_STEP = 0.005
+"""Seconds between the samples of the distance integral during a change of speed."""
+
+Clock = Callable[[np.ndarray], np.ndarray]
+"""Maps seconds (n,) of the path after a step to seconds (n,) of the path before it."""
+
+
+def apply_speed(path: ActorPath, speed: Speed) -> ActorPath:
+    """Scales the pace by a factor, or replaces it by a constant speed."""
+    if speed.factor == 1.0:
+        return path
+    beginning = max(path.begin, 0.0)
+    transition = Transition.of(speed, beginning)
+    transition = Transition(max(transition.start, beginning), transition.duration)
+    if speed.factor is None:
+        return _at_constant_speed(path, transition, path.direction * speed.to)
+    return _paced(path, lambda times: transition.warp_time(times, speed.factor), transition.start)
+
+
+def apply_stop(path: ActorPath, stop: Stop) -> ActorPath:
+    """Reduces the pace from 1 to 0 over the duration; offsets stop changing with it."""
+    transition = Transition(stop.at, stop.duration)
+
+    def clock(times: np.ndarray) -> np.ndarray:
+        return transition.warp_time(times, 0.0)
+
+    def offsets(times: np.ndarray) -> PathOffsets:
+        before = path.offsets(clock(times))
+        return replace(before, lateral_speed=before.lateral_speed * (1.0 - transition.fraction(times)))
+
+    return replace(_paced(path, clock, stop.at), offsets=offsets)
+
+
+def apply_reverse(path: ActorPath, reverse: Reverse) -> ActorPath:
+    """Reverses time between the first and the last second of the path."""
+    reversed_path = _paced(path, lambda times: path.begin + path.end - times, -np.inf)
+    reversed_path = replace(reversed_path, direction=-path.direction)
+    if not reverse.turn:
+        return reversed_path
+    half_turn = np.pi * path.facing  # a second reversal turns back
+    offsets = _added_offsets(path, lambda times: {"yaw": np.full(len(times), half_turn)})
+    return replace(reversed_path, offsets=offsets, facing=-path.facing)
+
+
+def apply_shift(path: ActorPath, shift: Shift) -> ActorPath:
+    """Adds offsets forward along the path, to the left, and in yaw."""
+    transition = Transition.of(shift, -np.inf)
+
+    def added(times: np.ndarray) -> dict[str, np.ndarray]:
+        fraction = transition.fraction(times)
+        return {
+            "longitudinal": path.direction * shift.longitudinal * fraction,
+            "lateral": path.facing * shift.lateral * fraction,
+            "lateral_speed": path.facing * shift.lateral * transition.rate(times),
+            "yaw": np.radians(shift.yaw) * fraction,
+        }
+
+    return replace(path, offsets=_added_offsets(path, added))
+
+
+def apply_duplicate(path: ActorPath, duplicate: Duplicate) -> ActorPath:
+    """The path of a copy: `delay` seconds later, and offset from the original."""
+    delay = duplicate.delay
+    delayed = replace(
+        path,
+        position=lambda times: path.position(times - delay),
+        offsets=lambda times: path.offsets(times - delay),
+        recorded=lambda times: path.recorded(times) | path.recorded(times - delay),
+        begin=min(path.begin, path.begin + delay),
+        end=max(path.end, path.end + delay),
+        paced_from=path.paced_from + delay,
+    )
+    if not (duplicate.longitudinal or duplicate.lateral):
+        return delayed
+    offset = {"longitudinal": duplicate.longitudinal, "lateral": duplicate.lateral}
+    return apply_shift(delayed, Shift(track=duplicate.name, **offset))
+
+
+def _paced(path: ActorPath, clock: Clock, start: float) -> ActorPath:
+    """The path whose position follows `clock`, which differs from film time from second `start` on."""
+    return replace(path, position=lambda times: path.position(clock(times)), paced_from=min(path.paced_from, start))
+
+
+def _at_constant_speed(path: ActorPath, transition: Transition, velocity: float) -> ActorPath:
+    """The path along which the speed changes over `transition` to `velocity` (m/s, negative: backwards)."""
+    remainder = _integral(path, transition)
+
+    def position(times: np.ndarray) -> PathPosition:
+        before, remaining = path.position(times), 1.0 - transition.fraction(times)
+        recorded = path.trajectory.distance(before.clock)
+        distance = remaining * (recorded + before.advance) + remainder(times) + velocity * transition.integral(times)
+        return PathPosition(before.clock, distance - recorded, before.deviation_weight * remaining)
+
+    return replace(path, position=position, paced_from=min(path.paced_from, transition.start))
+
+
+def _integral(path: ActorPath, transition: Transition) -> Callable[[np.ndarray], np.ndarray]:
+    """The integral (n,) up to the seconds (n,) of the rate of `transition` times the distance of `path`.
+
+    By partial integration, the integral of (1 - fraction) times the speed is (1 - fraction) times the distance plus
+    this integral; distances are smoother than speeds.
+    """
+    end = transition.start + transition.duration
+    if not transition.duration:
+        distance = path.distance(np.array([transition.start]))
+        return lambda times: transition.fraction(times) * distance
+    during = np.linspace(transition.start, end, max(5, int(transition.duration / INTEGRATION_STEP) + 1))
+    integral = CubicSpline(during, transition.rate(during) * path.distance(during)).antiderivative()
+    return lambda times: integral(times.clip(transition.start, end))
+
+
+def _added_offsets(
+    path: ActorPath, added: Callable[[np.ndarray], dict[str, np.ndarray]]
+) -> Callable[[np.ndarray], PathOffsets]:
+    """The offsets of `path` plus those `added`."""
+
+    def offsets(times: np.ndarray) -> PathOffsets:
+        before = path.offsets(times)
+        return replace(before, **{name: getattr(before, name) + value for name, value in added(times).items()})
+
+    return offsets

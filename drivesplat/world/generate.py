@@ -1,0 +1,169 @@
+"""The rule `demo_world`: a synthetic street in nuScenes format, with ground truth that recorded drives lack."""
+
+import logging
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import repeat
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from drivesplat.io.storage import Provenance, atomic_write, canonical_json, sha256_text
+from drivesplat.readers.truth import TruthFrame, TruthScan, TruthView
+from drivesplat.settings.world import WorldJob, WorldSettings
+from drivesplat.world.marker import prepare_folder
+from drivesplat.world.optics.rig import RigSensor, image_height, key_frame_time, recording_sensors, trigger_times
+from drivesplat.world.output.class_maps import write_class_maps
+from drivesplat.world.output.disk_space import require_space, world_bytes
+from drivesplat.world.output.tables import NuScenesTables
+from drivesplat.world.output.truth import (
+    ScanPlan,
+    TruthPlan,
+    key_frames_of,
+    planned_scans,
+    planned_views,
+    write_frame,
+    write_scan,
+    write_truth,
+)  # fmt: skip
+from drivesplat.world.placed import require_free_places
+from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
+
+log = logging.getLogger(__name__)
+
+START_US = 1_767_225_600_000_000
+ANNOTATED_RANGE = 80.0
+"""Objects farther from the ego vehicle than this (metres) have no box."""
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class SensorFile:
+    """An image or sweep to write. `path` is relative to the dataset's root; `time_us` counts from the drive's start."""
+
+    sensor: RigSensor
+    time_us: int
+    is_key_frame: bool
+    index: int
+    token: str
+    path: str
+
+
+def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int = 1) -> None:
+    """Writes the dataset below `root`: images, sweeps, truth/, class maps if asked for, and last the tables.
+
+    The tables contain a digest of the provenance, so results are remade when the images are. Equal settings give equal
+    bytes for any number of processes (`workers`). Raises ConfigError where `root` holds other files or an edit does not
+    fit the street, ResultError where the disk is full or has no space for the world.
+    """
+    recorder = Recorder(job.world, job.scene, job.edits)
+    context = multiprocessing.get_context("fork")
+    if any(step.place for edit in job.edits.values() for step in edit.steps):
+        with ProcessPoolExecutor(1, context) as pool:
+            pool.submit(_check_places, job).result()
+    prepare_folder(root, provenance)
+    source = sha256_text(canonical_json(provenance["stages"]))
+    tables = NuScenesTables(job.scene, _description(job.world), source, START_US, job.world)
+    for index in range(job.world.key_frames):
+        tables.add_sample(index, key_frame_time(job.world, index))
+    files = [file for sensor in recording_sensors(job.world) for file in _sensor_files(tables, recorder, sensor)]
+    views, scans = planned_views(recorder), planned_scans(recorder)
+    images = sum(file.sensor.is_camera for file in files)
+    require_space(root, world_bytes(job.world, images, len(files) - images, len(views), len(scans)))
+    with ProcessPoolExecutor(workers, context, _start_worker, (recorder, root)) as pool:
+        counts = pool.map(_write_file, files)
+        visible = pool.map(_visible_fractions, range(job.world.key_frames))
+        frames = [pool.map(_write_frame, repeat(plan), key_frames_of(recorder, plan)) for plan in views]
+        sweeps = [pool.map(_write_scan, repeat(plan), range(job.world.key_frames)) for plan in scans]
+        lidar = {f.index: n for f, n in zip(files, counts, strict=True) if n is not None and f.is_key_frame}
+        for index, fractions in enumerate(visible):
+            _annotate(tables, recorder, index, fractions, lidar[index])
+        true_views = [_view(recorder, plan, tuple(found)) for plan, found in zip(views, frames, strict=True)]
+        write_truth(root, recorder, true_views, [scan for found in sweeps for scan in found])
+    tables.write(root, job.version)
+    log.info("%d recordings, %d boxes in %s", len(files), len(tables.rows["sample_annotation"]), root)
+
+
+def _description(world: WorldSettings) -> str:
+    light = "night" if world.night else "day"
+    return (
+        f"Synthetic street, {light}, the ego vehicle {world.ego}, {world.traffic} traffic, {world.vehicles} moving "
+        f"vehicles, {world.pedestrians} pedestrians"
+    )
+
+
+def _sensor_files(tables: NuScenesTables, recorder: Recorder, sensor: RigSensor) -> list[SensorFile]:
+    """Adds the recordings of a sensor to the tables."""
+    world = recorder.world
+    size = (world.width, image_height(world.width)) if sensor.is_camera else (0, 0)
+    files = []
+    for time_us, is_key, index in trigger_times(sensor, world):
+        pose = recorder.ego_to_global(time_us * 1e-6)
+        row = tables.add_data(sensor, index, time_us, is_key, pose, size)
+        files.append(SensorFile(sensor, time_us, is_key, index, *row))
+    return files
+
+
+def _annotate(
+    tables: NuScenesTables, recorder: Recorder, index: int, visible: np.ndarray, lidar_points: np.ndarray
+) -> None:
+    """Adds the boxes of key frame `index`: objects in range that a camera or the LiDAR sees."""
+    seconds = key_frame_time(recorder.world, index) * 1e-6
+    ego = STREET_TO_GLOBAL @ recorder.ego_pose(seconds)
+    for item, fraction, points in zip(recorder.objects, visible.tolist(), lidar_points.tolist(), strict=True):
+        if item.category is None or not (fraction or points):
+            continue
+        box = recorder.box_to_global(item, seconds)
+        if np.linalg.norm((box - ego)[:2, 3]) <= ANNOTATED_RANGE:
+            tables.add_box(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
+
+
+def _view(recorder: Recorder, plan: TruthPlan, frames: tuple[TruthFrame, ...]) -> TruthView:
+    view = plan.viewpoint
+    without = recorder.instance(view.without) if view.without else None
+    return TruthView(plan.sensor.channel, view.left, view.edit, without, frames)
+
+
+_worker: tuple[Recorder, Path]
+"""In a worker process: the recorder and the dataset's root."""
+
+
+def _check_places(job: WorldJob) -> None:
+    require_free_places(Recorder(job.world, job.scene, job.edits))
+
+
+def _start_worker(recorder: Recorder, root: Path) -> None:
+    global _worker
+    _worker = recorder, root
+
+
+def _write_file(file: SensorFile) -> np.ndarray | None:
+    """Writes an image or a sweep. Returns the number of LiDAR returns per object, None for images."""
+    recorder, root = _worker
+    with atomic_write(root / file.path) as target:
+        if not file.sensor.is_camera:
+            scan = recorder.scan(file.sensor, file.time_us)
+            target.write(recorder.returns(scan, file.sensor, file.time_us).tobytes())
+            return np.bincount(scan.object[scan.returned], minlength=len(recorder.objects))
+        picture = recorder.picture(file.sensor, file.time_us)
+        image = recorder.to_bytes(picture.radiance, file.sensor, file.time_us)
+        Image.fromarray(image).save(target, "JPEG", quality=JPEG_QUALITY)
+    if recorder.world.class_maps:
+        write_class_maps(root, file.sensor.channel, file.path, picture.classes)
+    return None
+
+
+def _visible_fractions(index: int) -> np.ndarray:
+    return _worker[0].visible_fractions(index)
+
+
+def _write_frame(plan: TruthPlan, index: int) -> TruthFrame:
+    recorder, root = _worker
+    return write_frame(root, recorder, plan, index)
+
+
+def _write_scan(plan: ScanPlan, index: int) -> TruthScan:
+    recorder, root = _worker
+    return write_scan(root, recorder, plan, index)

@@ -1,0 +1,178 @@
+"""Writes the ground truth of a world; `drivesplat.readers.truth` describes the files."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivesplat.io.storage import atomic_write
+from drivesplat.readers.nuscenes.tokens import token
+from drivesplat.readers.truth import (
+    DEPTH_LIMIT,
+    DEPTH_UNITS_PER_METRE,
+    TRUTH_FILE,
+    Truth,
+    TruthFrame,
+    TruthScan,
+    TruthView,
+    write_truth_file,
+)  # fmt: skip
+from drivesplat.scene.images import write_png
+from drivesplat.scene.rigid import apply, inverse
+from drivesplat.world.optics.imaging import StreetImage, to_bytes
+from drivesplat.world.optics.rig import SENSORS, RigSensor, image_height, key_frame_time
+from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
+from drivesplat.world.shapes.mesh import SurfaceClass
+
+LIDAR = SENSORS[0]
+PATTERN_FILE = "lidar/pattern.npz"
+CLEARANCE = 0.3
+"""Metres between a camera and the box of an object below which an image shows next to nothing else."""
+
+
+@dataclass(frozen=True)
+class TruthPlan:
+    """A view to write: its camera and viewpoint, and the folder below truth/."""
+
+    sensor: RigSensor
+    viewpoint: Viewpoint
+    folder: str
+
+
+@dataclass(frozen=True)
+class ScanPlan:
+    """LiDAR scans to write: their viewpoint, and the folder below truth/."""
+
+    viewpoint: Viewpoint
+    folder: str
+
+
+def planned_views(recorder: Recorder) -> list[TruthPlan]:
+    """The views of each camera with truth: recorded, lateral, without the leading vehicle, edited."""
+    plans, settings, viewpoints = [], recorder.world.truth, _viewpoints(recorder)
+    for sensor in SENSORS:
+        if sensor.channel in settings.cameras:
+            plans += [TruthPlan(sensor, view, f"{sensor.channel}/{name}") for name, view in viewpoints.items()]
+    return plans
+
+
+def planned_scans(recorder: Recorder) -> list[ScanPlan]:
+    """The scans of the LiDAR: recorded, lateral, without the leading vehicle, edited; none unless the settings ask for
+    them."""
+    if not recorder.world.truth.lidar:
+        return []
+    return [ScanPlan(view, f"lidar/{name}") for name, view in _viewpoints(recorder).items()]
+
+
+def _viewpoints(recorder: Recorder) -> dict[str, Viewpoint]:
+    """The viewpoints of truth, by the names of their folders."""
+    viewpoints = {"recorded": Viewpoint(), **_lateral(recorder)}
+    if recorder.street.leading:
+        viewpoints["without_leading"] = Viewpoint(without=recorder.street.leading)
+    return viewpoints | {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+
+
+def key_frames_of(recorder: Recorder, plan: TruthPlan) -> list[int]:
+    """The key frames of a view: all but those at which its camera is inside an object or about to touch one."""
+    return [i for i in range(recorder.world.key_frames) if not _touches(recorder, plan, i)]
+
+
+def _touches(recorder: Recorder, plan: TruthPlan, index: int) -> bool:
+    seconds = np.array([(key_frame_time(recorder.world, index) + plan.sensor.delay_us) * 1e-6])
+    center = (recorder.ego_to_street(seconds, plan.viewpoint)[0] @ plan.sensor.sensor_to_ego)[:3, 3]
+    for item in recorder.variation(plan.viewpoint.edit).street.objects:
+        if item.category and item.name != plan.viewpoint.without:
+            beside = np.abs(apply(inverse(item.box_poses(seconds)[0]), center[None])[0])
+            if (beside < item.size / 2 + CLEARANCE).all():
+                return True
+    return False
+
+
+def _lateral(recorder: Recorder) -> dict[str, Viewpoint]:
+    offsets = dict.fromkeys(offset for offset in recorder.world.truth.lateral_m if offset)
+    return {f"{'left' if m > 0 else 'right'}_{abs(m):g}m": Viewpoint(left=m) for m in offsets}
+
+
+def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> TruthFrame:
+    """Renders and writes the truth of key frame `index` in a view."""
+    sensor, view = plan.sensor, plan.viewpoint
+    time_us = key_frame_time(recorder.world, index) + sensor.delay_us
+    recorded = view == Viewpoint() and sensor.channel in (recorder.world.cameras or ())
+    picture = (recorder.geometry if recorded else recorder.picture)(sensor, time_us, view)
+    images = {"depth": _depth(picture), "instances": _instances(recorder, view, picture)}
+    images["classes"] = picture.classes
+    if not recorded:
+        images["image"] = to_bytes(picture.radiance)
+    names = {kind: f"{plan.folder}/{kind}/{index:04}.png" for kind in images}
+    for kind, name in names.items():
+        write_png((root / TRUTH_FILE).parent / name, images[kind])
+    pose = STREET_TO_GLOBAL @ recorder.camera(sensor, time_us * 1e-6, view).pose
+    image = token(recorder.scene, sensor.channel, time_us)
+    return TruthFrame(image, index, pose.tolist(), **{"image": None, **names})
+
+
+def _depth(picture: StreetImage) -> np.ndarray:
+    depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNITS_PER_METRE, 0.0)
+    return np.clip(depth + 0.5, 0, DEPTH_LIMIT).astype(np.uint16)
+
+
+def _instances(recorder: Recorder, view: Viewpoint, picture: StreetImage) -> np.ndarray:
+    return _numbers_of_objects(recorder, view)[picture.objects + 1]
+
+
+def instance_numbers(recorder: Recorder) -> dict[str, int]:
+    """The number of each annotated object by its token, from 1; the objects of the drive first, then those that edits
+    add."""
+    streets = [recorder.variation(edit).street for edit in (None, *recorder.edits)]
+    names = dict.fromkeys(item.name for street in streets for item in street.objects if item.category)
+    return {recorder.instance(name): number for number, name in enumerate(names, start=1)}
+
+
+def _numbers_of_objects(recorder: Recorder, view: Viewpoint) -> np.ndarray:
+    """The instance number (objects + 1,) of each object of a view's street; the first entry is that of the sky."""
+    numbers = instance_numbers(recorder)
+    objects = recorder.variation(view.edit).street.objects
+    return np.array([0, *(numbers.get(recorder.instance(item.name), 0) for item in objects)], dtype=np.uint8)
+
+
+def write_scan(root: Path, recorder: Recorder, plan: ScanPlan, index: int) -> TruthScan:
+    """Casts and writes the LiDAR scan of key frame `index`."""
+    time_us = key_frame_time(recorder.world, index) + LIDAR.delay_us
+    found = recorder.scan(LIDAR, time_us, plan.viewpoint)
+    name = f"{plan.folder}/{index:04}.npz"
+    with atomic_write((root / TRUTH_FILE).parent / name) as file:
+        np.savez_compressed(
+            file,
+            range=found.range.astype(np.float32),
+            intensity=found.intensity.astype(np.float32),
+            instance=_numbers_of_objects(recorder, plan.viewpoint)[found.object + 1],
+            returned=found.returned,
+        )
+    view = plan.viewpoint
+    without = recorder.instance(view.without) if view.without else None
+    pose = STREET_TO_GLOBAL @ recorder.ego_to_street(np.array([time_us * 1e-6]), view)[0] @ LIDAR.sensor_to_ego
+    sweep = token(recorder.scene, LIDAR.channel, time_us)
+    return TruthScan(sweep, index, pose.tolist(), view.left, view.edit, without, name)
+
+
+def write_truth(root: Path, recorder: Recorder, views: Iterable[TruthView], scans: Iterable[TruthScan]) -> None:
+    """Writes truth.json, and the pattern of the scans."""
+    world, leading, scans = recorder.world, recorder.street.leading, tuple(scans)
+    if scans:
+        pattern = recorder.pattern
+        with atomic_write((root / TRUTH_FILE).parent / PATTERN_FILE) as file:
+            np.savez_compressed(file, elevations=pattern.elevations, azimuths=pattern.azimuths, offsets=pattern.offsets)
+    truth = Truth(
+        scene=recorder.scene,
+        width=world.width,
+        height=image_height(world.width),
+        samples_per_pixel=world.samples_per_pixel,
+        leading=recorder.instance(leading) if leading else None,
+        instances={str(number): token for token, number in instance_numbers(recorder).items()},
+        classes={str(int(c)): c.name.lower() for c in SurfaceClass},
+        views=tuple(views),
+        pattern=PATTERN_FILE if scans else None,
+        scans=scans,
+    )
+    write_truth_file(root, truth)

@@ -1,0 +1,131 @@
+"""The film of recorded images beside the renderings of several methods."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.hand_made import recording_of
+from helpers.hand_made_street import Reels, checkpoint_of, street_model, street_scene
+
+from drivesplat.errors import DatasetError, ResultError
+from drivesplat.io.video import read_footage
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
+from drivesplat.rendering.captions import BEYOND, Caption
+from drivesplat.rendering.frames import uint8_image
+from drivesplat.scene.evaluation_data import EvaluationData
+from drivesplat.scene.images import read_image
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.render import CompareJob
+from drivesplat.visuals.compare import render_comparison
+
+CPU = DeviceSettings(kind="cpu")
+
+
+@pytest.fixture(scope="module")
+def recording(tiny_scene) -> EvaluationData:
+    """Key frame 3 and the last two are held out; images of 41x23 pixels, of which the film shows an even size."""
+    keys = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
+    scene = street_scene(dataclasses.replace(tiny_scene, frames=keys))
+    return recording_of(scene, width=41, every_nth=8, offset=3, last_block=2)
+
+
+@pytest.fixture(scope="module")
+def models() -> dict[str, SplatModel]:
+    whole = street_model()
+    return {"plain": street_model(whole.parts[0]), "street": whole}
+
+
+def compare(recording: EvaluationData, models: dict[str, SplatModel], path: Path, **changes: Any) -> dict[str, Any]:
+    job = CompareJob(**{"eval_camera": "CAM_FRONT", "crf": 18, "captions": False, **changes})
+    checkpoints = {name: checkpoint_of(model) for name, model in models.items()}
+    return json.loads(json.dumps(render_comparison(checkpoints, recording, job, CPU, path)))
+
+
+@pytest.fixture(scope="module")
+def made(recording, models, tmp_path_factory) -> tuple[dict[str, Any], np.ndarray]:
+    """The record and the pictures (n, h, w, 3) of a film without captions."""
+    with pytest.MonkeyPatch.context() as patch:
+        reels = Reels()
+        patch.setattr("drivesplat.rendering.film.write_video", reels)
+        record = compare(recording, models, tmp_path_factory.mktemp("made") / "compare.mp4")
+    return record, reels["compare"]
+
+
+def panel(made: tuple[dict[str, Any], np.ndarray], name: str) -> np.ndarray:
+    """A panel of every picture, where the record says it is."""
+    record, pictures = made
+    (place,) = (one for one in record["film"]["panels"] if one["shows"] == name)
+    return pictures[:, place["top"] :, place["left"] :][:, :22, :40]
+
+
+def test_each_recorded_image_is_beside_the_rendering_of_each_method(made, recording, models):
+    assert made[1].shape == (10, 44, 80, 3)
+    for index in range(10):
+        image = read_image(recording.frame(index).image_path, (41, 23))[:22, :40]
+        np.testing.assert_array_equal(panel(made, "ground truth")[index], image)
+        for name, model in models.items():
+            rendering = uint8_image(
+                model.render(view_of(recording.record, index, model.parts[0].params["means"].device)).image
+            )
+            difference = panel(made, name)[index].astype(int) - rendering[:22, :40]
+            assert np.abs(difference).max() <= 1
+
+
+def test_the_record_holds_time_split_and_psnr_of_each_image(made, recording, models):
+    record = made[0]
+    assert [image["split"] for image in record["images"]] == [
+        *["train"] * 3, "interpolation", *["train"] * 4, "extrapolation", "extrapolation"
+    ]  # fmt: skip
+    np.testing.assert_allclose([image["second"] for image in record["images"]], 0.5 * np.arange(10), atol=1e-6)
+    for name in models:
+        truth, shown = (panel(made, it) / 255.0 for it in ("ground truth", name))
+        expected = -10 * np.log10(((truth - shown) ** 2).mean(axis=(1, 2, 3)))
+        np.testing.assert_allclose([image["psnr"][name] for image in record["images"]], expected, atol=0.2)
+
+
+def test_the_error_is_that_of_the_last_method(made):
+    """Brighter where it is larger."""
+    truth, shown = (panel(made, name).astype(float) for name in ("ground truth", "street"))
+    error, brightness = np.abs(truth - shown).mean(axis=-1), panel(made, "error of street").astype(float).sum(axis=-1)
+    order = np.argsort(error.ravel())
+    assert (np.diff(brightness.ravel()[order][:: len(order) // 50]) >= -10).all()
+
+
+def test_captions_name_the_methods_with_their_psnr_and_say_what_is_held_out(recording, models, tmp_path, monkeypatch):
+    captions: list[Caption] = []
+
+    def encoder(path, frames, count, panels, form):
+        captions.extend(caption for _, caption in frames)
+        return {"frames": count}
+
+    monkeypatch.setattr("drivesplat.visuals.compare.encode_film", encoder)
+    record = compare(recording, models, tmp_path / "compare.mp4")
+    assert [caption.notes[0] for caption in captions] == [
+        *["training image"] * 3, "held out", *["training image"] * 4, *[f"held out, {BEYOND}"] * 2
+    ]  # fmt: skip
+    assert captions[3].clock == "1.5 s" and not any(captions[3].notes[1:])
+    values = record["images"][3]["psnr"]
+    labels = ["ground truth", *(f"{name}, {values[name]:.1f} dB" for name in models), "error of street"]
+    assert list(captions[3].labels) == labels
+
+
+def test_a_film_runs_as_fast_as_the_images_were_recorded(recording, models, tmp_path):
+    path = tmp_path / "compare.mp4"
+    record = compare(recording, {"street": models["street"]}, path, captions=True)
+    footage = read_footage(path)
+    assert (footage.frames, footage.fps) == (10, 2.0)
+    assert (footage.width, footage.height) == (120, 22) == (record["film"]["width"], record["film"]["height"])
+
+
+def test_an_unknown_camera_and_a_rendering_without_numbers_are_refused(recording, models, tmp_path):
+    with pytest.raises(DatasetError, match=r"eval_camera CAM_BACK is not among the cameras of this run \(CAM_FRONT\)"):
+        compare(recording, models, tmp_path / "compare.mp4", eval_camera="CAM_BACK")
+    broken = street_model()
+    broken.parts[0].params["sh0"].data[:] = np.nan
+    with pytest.raises(ResultError, match=r"a rendering of mine contains NaN or Inf; delete its checkpoint\.npz"):
+        compare(recording, {"mine": broken}, tmp_path / "compare.mp4")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,294 @@
+"""What a moving box sweeps, and which Gaussians are its ghosts: against closed forms and dense sampling in time."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers.classed import classed
+from helpers.hand_made import Own, recording_of, round_gaussians
+from scipy.spatial.transform import Rotation
+
+from drivesplat.model.part import Part
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.tracks import box_at
+from drivesplat.settings.visuals import GhostSettings
+from drivesplat.visuals.ghosts import boxes_along_path, ghost_figures, ghosts_of, in_swept_volume
+from drivesplat.visuals.rendered_view import ModelWithRecording, RenderedView
+
+START = 1_532_402_927_647_951
+INTERVAL = 500_000.0
+"""Microseconds between key frames."""
+SIZE = np.array([4.0, 2.0, 1.6])
+SLACK = 0.26
+"""Metres: a box is looked at every 0.25 m of its way, so that much of its ends may be missed."""
+
+
+def pose(x: float, y: float, z: float = 0.0, angle: float = 0.0) -> np.ndarray:
+    """In closed form: turned about z, then moved."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
+
+
+def track_of(poses: list[np.ndarray], seconds=None, indices=None, size=SIZE) -> Track:
+    indices = np.arange(len(poses)) if indices is None else np.array(indices)
+    seconds = 0.5 * indices if seconds is None else np.array(seconds)
+    times = START + np.round(seconds * 1e6).astype(np.int64)
+    visibility = np.full(len(poses), 4)
+    return Track(
+        "it", *classed("vehicle.car"), np.array(size, dtype=float), times, indices, np.stack(poses), visibility
+    )
+
+
+def straight(speed: float, count: int = 7, heading: float = 0.0, **changes) -> Track:
+    """From the origin on along `heading`, `speed` metres a second."""
+    step_m = np.array([np.cos(heading), np.sin(heading)]) * speed
+    return track_of([pose(*(0.5 * i * step_m), angle=heading) for i in range(count)], **changes)
+
+
+def around(place: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of the box's frame in the world."""
+    return points @ place[:3, :3].T + place[:3, 3]
+
+
+def grid(size=SIZE, shrunk: float = 0.05) -> np.ndarray:
+    """Points (n, 3) all over a box of `size`, `shrunk` metres within its faces, in its frame."""
+    axes = [np.linspace(-s / 2 + shrunk, s / 2 - shrunk, 7) for s in size]
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.1, -2.5])
+@pytest.mark.parametrize("speed", [0.0, 1.5, 10.0, 30.0, 60.0])
+def test_a_straight_path_sweeps_a_long_box(speed, heading):
+    """From half a key-frame interval before the first box to as long after the last: length + 3.5 s of way."""
+    it = straight(speed, heading=heading)
+    random = np.random.default_rng(0)
+    low, high = np.array([-0.25 * speed - 5.0, -2.5, -2.0]), np.array([3.25 * speed + 5.0, 2.5, 2.0])
+    along = random.uniform(low, high, (20_000, 3))
+    found = in_swept_volume(it, INTERVAL, around(pose(0, 0, angle=heading), along))
+    beyond = np.maximum(-0.25 * speed - 2.0 - along[:, 0], along[:, 0] - 3.25 * speed - 2.0)
+    beside = np.maximum(np.abs(along[:, 1]) - 1.0, np.abs(along[:, 2]) - 0.8)
+    assert not found[(beyond > 1e-6) | (beside > 1e-6)].any()
+    certain = (beyond < -SLACK) & (beside < -1e-6)
+    assert certain.sum() > 1000 and found[certain].all()
+
+
+@pytest.mark.parametrize("speed", [3.0, 12.0, 30.0])
+@pytest.mark.parametrize("size", [SIZE, np.array([0.6, 0.5, 1.7]), np.array([12.0, 2.6, 3.4])])
+@pytest.mark.parametrize("turn", [0.0, 0.4, -0.8])
+def test_the_swept_volume_is_complete_between_annotations(speed, size, turn):
+    """Points moving with the box, within its faces, at every 4 ms; `turn` in radians a key frame.
+
+    Half a step of the way and half a step of turning may be missed at the faces.
+    """
+    places = [np.zeros(2)]
+    for i in range(5):
+        places.append(places[-1] + 0.5 * speed * np.array([np.cos(turn * i), np.sin(turn * i)]))
+    it = track_of([pose(*place, angle=turn * i) for i, place in enumerate(places)], size=size)
+    swing = min(0.125, 0.125 / speed) * abs(turn) / 0.5 * np.linalg.norm(size) / 2
+    inner = grid(size, shrunk=min(0.13 + swing, 0.24))
+    points = []
+    for step, seconds in enumerate(np.arange(0.0, 2.5, 0.004)):
+        i = min(int(seconds / 0.5), 4)
+        share = seconds / 0.5 - i
+        x, y = (1.0 - share) * places[i] + share * places[i + 1]
+        points.append(around(pose(x, y, angle=turn * (i + share)), inner[step % 7 :: 7]))
+    assert in_swept_volume(it, INTERVAL, np.concatenate(points)).all()
+
+
+@pytest.mark.parametrize("turn", [0.4, -0.8])
+def test_a_turning_box_sweeps_nothing_beside_its_path(turn):
+    """Random points against boxes every 10 ms, posed by the protocol's interpolation."""
+    it = track_of([pose(8.0 * np.cos(turn * i), 8.0 * np.sin(turn * i), 0.0, turn * i) for i in range(6)])
+    points = np.random.default_rng(1).uniform([-14, -14, -2], [14, 14, 2], (20_000, 3))
+    certain = np.zeros(len(points), dtype=bool)
+    possible = certain.copy()
+    for time in range(START - 250_000, START + 2_750_001, 10_000):
+        place = box_at(it, time, INTERVAL).object_to_world
+        in_box = np.abs((points - place[:3, 3]) @ place[:3, :3]) - SIZE / 2
+        possible |= (in_box < 0.05).all(axis=1)
+        certain |= (in_box < -0.25).all(axis=1)
+    found = in_swept_volume(it, INTERVAL, points)
+    assert certain.sum() > 300 and found[certain].all()
+    assert not found[~possible].any() and not found.all()
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.2, 0.5])
+def test_points_below_the_clearance_are_not_swept(clearance):
+    height = np.linspace(-1.2, 1.2, 481)
+    points = np.stack([np.full_like(height, 7.3), np.full_like(height, 0.4), height], axis=1)
+    expected = (height > clearance - 0.8 + 1e-9) & (height < 0.8 - 1e-9)
+    sure = np.abs(height - (clearance - 0.8)) > 1e-6
+    found = in_swept_volume(straight(10.0), INTERVAL, points, floor=clearance)
+    np.testing.assert_array_equal(found[sure], expected[sure])
+
+
+def test_clearance_is_above_the_floor_of_the_box_on_a_slope():
+    """Uphill by a fifth, the boxes tilted with the road."""
+    tilt = np.arctan(0.2)
+    slope = np.eye(4)
+    slope[:3, :3] = Rotation.from_euler("y", -tilt).as_matrix()
+    poses = []
+    for i in range(5):
+        place = slope.copy()
+        place[:3, 3] = slope[:3, 0] * 4.0 * i
+        poses.append(place)
+    above = np.array([[9.0, 0.3, 0.3 - 0.8], [9.0, 0.3, 0.1 - 0.8], [9.0, 0.3, 0.79], [9.0, 0.3, 0.81]])
+    found = in_swept_volume(track_of(poses), INTERVAL, around(slope, above), floor=0.2)
+    np.testing.assert_array_equal(found, [True, False, True, False])
+
+
+@pytest.mark.parametrize("index", [0, 4])
+def test_a_single_box_sweeps_itself(index):
+    place = pose(5.0, -3.0, 1.0, 0.6)
+    it = track_of([place], indices=[index])
+    points = np.random.default_rng(2).uniform([0, -8, -1], [10, 2, 3], (5000, 3))
+    in_box = np.abs((points - place[:3, 3]) @ place[:3, :3]) < SIZE / 2
+    np.testing.assert_array_equal(in_swept_volume(it, INTERVAL, points), in_box.all(axis=1))
+    assert in_box.all(axis=1).sum() > 50
+
+
+def axis_points(start: float, end: float) -> np.ndarray:
+    """Points (n, 3) every 5 cm along the way of `straight`."""
+    x = np.arange(start, end, 0.05)
+    return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
+
+
+@pytest.mark.parametrize("speed", [2.0, 10.0, 30.0])
+def test_nothing_is_swept_in_a_gap_of_the_annotation(speed):
+    """Key frames 3 to 6 do not hold it; it reaches a quarter of a second into the gap at both ends."""
+    indices = [0, 1, 2, 7, 8, 9]
+    it = track_of([pose(0.5 * i * speed, 0.0) for i in indices], indices=indices)
+    points = axis_points(-20.0, 5.0 * speed + 20.0)
+    x = points[:, 0]
+    found = in_swept_volume(it, INTERVAL, points)
+    margins = []
+    for first, last in ((0.0, 1.0), (3.5, 4.5)):
+        margins.append(np.maximum((first - 0.25) * speed - 2.0 - x, x - (last + 0.25) * speed - 2.0))
+    nearest = np.minimum(*margins)
+    assert not found[nearest > 1e-6].any()
+    assert found[nearest < -SLACK].all()
+
+
+@pytest.mark.parametrize("late", [0.01, 0.1])
+def test_after_a_gap_the_path_starts_as_early_as_at_the_beginning(late):
+    """Key frames are not quite half a second apart: the way back is met between two looks."""
+    seconds = np.array([0.0, 0.5, 1.5 + late, 2.0 + late])
+    it = track_of([pose(30.0 * s, 0.0) for s in seconds], seconds=seconds, indices=[0, 1, 3, 4])
+    begins = 30.0 * (1.25 + late) - 2.0
+    assert in_swept_volume(it, INTERVAL, axis_points(begins + SLACK, begins + 10.0)).all()
+
+
+def test_the_swept_volume_of_an_accelerating_box_is_complete():
+    """A crash of the annotation, or a coarse one: still for a segment, then 30 m/s; a short box shows the hole."""
+    seconds = np.array([0.0, 0.45, 0.95, 1.45])
+    places = [pose(x, 0.0) for x in (0.0, 0.0, 15.0, 30.0)]
+    it = track_of(places, seconds=seconds, size=(0.8, 0.8, 1.5))
+    assert in_swept_volume(it, INTERVAL, axis_points(0.0, 30.0)).all()
+
+
+def test_without_points_the_result_is_empty():
+    assert in_swept_volume(straight(5.0), INTERVAL, np.zeros((0, 3))).shape == (0,)
+    assert not in_swept_volume(straight(5.0), INTERVAL, np.full((3, 3), 1e4)).any()
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3, 15.0, 40.0])
+def test_boxes_along_a_path_are_ordered_and_close(speed):
+    boxes = boxes_along_path(straight(speed), INTERVAL)
+    x = np.array([box.object_to_world[0, 3] for box in boxes])
+    assert (np.diff(x) <= 0.2501).all() and (np.diff(x) >= 0).all()
+    assert x[0] == pytest.approx(-0.25 * speed) and 3.25 * speed - 0.2501 <= x[-1] <= 3.25 * speed + 1e-9
+    assert 14 <= len(boxes) < 3.5 * max(speed / 0.25, 4.0) + 2
+
+
+def render_image(scene: Scene, *parts: Part, index: int = 0) -> RenderedView:
+    model = SplatModel(parts, None).requires_grad_(False)
+    return RenderedView(ModelWithRecording(model, recording_of(scene), torch.device("cpu")), index)
+
+
+def drive_ahead(tiny_scene: Scene) -> Scene:
+    """One car at 10 m/s along y = 0.5, its centre 0.8 m over the road, its first box at x = 5."""
+    times = tiny_scene.key_frame_timestamps
+    poses = np.stack([pose(5.0 + 10.0 * (time - times[0]) * 1e-6, 0.5, 0.8) for time in times])
+    it = Track("it", *classed("vehicle.car"), SIZE, times, np.arange(10), poses, np.full(10, 4))
+    return dataclasses.replace(tiny_scene, tracks=(it,))
+
+
+LATER = 8
+"""The image of key frame 4, at x = 5 + 10 (2.0 - 0.035) = 24.65."""
+PLACES = np.array(
+    [
+        [10.0, 0.5, 0.8],  # where it was
+        [40.0, 0.5, 0.8],  # where it will be
+        [24.7, 0.5, 0.8],  # in the box now
+        [24.7, 0.5, 0.1],  # in the box now, lower than the clearance
+        [10.0, 0.5, 0.1],  # road where it was
+        [10.0, 2.0, 0.8],  # beside its way
+        [10.0, 0.5, 1.7],  # above its way
+        [26.6, 1.4, 1.5],  # in the box's corner
+        [26.8, 1.4, 1.5],  # right before it
+    ]
+)
+GHOSTS = np.array([True, True, False, False, False, False, False, False, True])
+
+
+def ghosts_at(rendered: RenderedView, clearance: float = 0.2) -> torch.Tensor:
+    scene = rendered.drive.recording.scene
+    box = box_at(scene.tracks[0], rendered.frame.timestamp, scene.key_frame_interval)
+    return ghosts_of(rendered, box, GhostSettings(clearance=clearance))
+
+
+def test_ghosts_lie_on_the_path_but_not_in_the_present_box(tiny_scene):
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER))
+    np.testing.assert_array_equal(found, GHOSTS)
+
+
+def test_ghosts_depend_on_the_time(tiny_scene):
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES[:4]), index=1))
+    np.testing.assert_array_equal(found, [True, True, True, False])
+
+
+def test_without_clearance_the_road_counts_as_ghosts(tiny_scene):
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER), clearance=0.0)
+    np.testing.assert_array_equal(np.flatnonzero(found & ~torch.from_numpy(GHOSTS)), [4])
+
+
+@pytest.mark.parametrize("whose", ["it", "another"])
+def test_gaussians_of_dynamic_parts_are_no_ghosts(tiny_scene, whose):
+    """Two parts of the same Gaussians: those that go where their object goes are no ghosts wherever they lie."""
+    parts = round_gaussians(PLACES), Own(round_gaussians(PLACES), whose)
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), *parts, index=LATER))
+    np.testing.assert_array_equal(found, [*GHOSTS, *np.zeros_like(GHOSTS)])
+
+
+def test_gaussians_of_the_object_in_a_static_part_can_be_ghosts(tiny_scene, monkeypatch):
+    """That it is known does not make it go: the part has to move."""
+    monkeypatch.setattr(Own, "moves", False)
+    parts = Own(round_gaussians(PLACES), "it"), round_gaussians(PLACES)
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), *parts, index=LATER))
+    np.testing.assert_array_equal(found, [*GHOSTS, *GHOSTS])
+
+
+def test_figures_of_ghosts(tiny_scene):
+    opacities = [0.1, 0.4, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9, 0.7]
+    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(PLACES, opacities=opacities), index=LATER)
+    figures = ghost_figures(rendered.gaussians, ghosts_at(rendered))
+    assert figures["gaussians"] == 3
+    assert figures["opacity_sum"] == pytest.approx(1.2, abs=1e-6)
+    assert figures["opacity_mean"] == pytest.approx(0.4, abs=1e-6)
+    assert figures["opacity_median"] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_the_median_of_two_is_their_mean(tiny_scene):
+    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(PLACES[:2], opacities=[0.2, 0.6]), index=LATER)
+    assert ghost_figures(rendered.gaussians, ghosts_at(rendered))["opacity_median"] == pytest.approx(0.4, abs=1e-6)
+
+
+@pytest.mark.parametrize("places", [PLACES[4:6], PLACES[:0]])
+def test_without_ghosts_the_means_are_null(tiny_scene, places):
+    """Nothing on the way, or no Gaussian at all."""
+    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(places), index=LATER)
+    figures = json.loads(json.dumps(ghost_figures(rendered.gaussians, ghosts_at(rendered)), allow_nan=False))
+    assert figures == {"gaussians": 0, "opacity_sum": 0.0, "opacity_mean": None, "opacity_median": None}

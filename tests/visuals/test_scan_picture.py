@@ -1,0 +1,81 @@
+"""The picture of a LiDAR scan: its rows, their order, and what is shown of rays without a return."""
+
+import numpy as np
+import pytest
+from helpers.scan_drives import STEPS, recorded, room
+from matplotlib.image import AxesImage
+from PIL import Image
+
+from drivesplat.scene.scan import RenderedScan
+from drivesplat.visuals.figures import save_figure
+from drivesplat.visuals.scan_picture import draw_scan
+
+TITLES = [
+    "Range, recorded", "Range, rendered", "Error of range, where both return", "Intensity, recorded",
+    "Intensity, rendered", "No return, recorded", "Probability of no return, rendered",
+]  # fmt: skip
+
+
+@pytest.fixture
+def pair():
+    """A scan with a hole and a ray that says nothing, and a rendering that is 1 m off."""
+    ranges = room()
+    ranges[3, 0] = np.nan  # the highest beam, straight behind
+    measured = np.ones(ranges.shape, dtype=bool)
+    measured[0, 10] = False
+    drops = np.full(ranges.shape, 0.25)
+    drops[1, 20] = 0.75
+    return recorded(ranges, measured=measured), RenderedScan(room(13.0), drops, np.full(ranges.shape, 0.4))
+
+
+def column(firing: int) -> int:
+    """Where a firing is shown: the first looks straight behind."""
+    return (STEPS - firing) % STEPS
+
+
+def images(figure) -> dict[str, AxesImage]:
+    return {axis.get_title(loc="left"): axis.images[0] for axis in figure.axes if axis.get_title(loc="left")}
+
+
+def labels(figure) -> list[str]:
+    """Those below the last row."""
+    axes = [axis for axis in figure.axes if axis.get_title(loc="left")]
+    return [label.get_text() for label in axes[-1].get_xticklabels()]
+
+
+def test_rows_show_values_with_the_highest_beam_above_and_azimuth_clockwise(pair, tmp_path):
+    figure = draw_scan(*pair, "a scan")
+    shown = {title: image.get_array() for title, image in images(figure).items()}
+    assert list(shown) == TITLES
+    recorded_range, error, drop = (shown[TITLES[i]] for i in (0, 2, 6))
+    assert recorded_range.shape == (4, STEPS)
+    assert recorded_range.mask[0, column(0)] and recorded_range.mask.sum() == 2, "a hole, and a ray that says nothing"
+    assert recorded_range.mask[3, column(10)] and error.mask[3, column(10)]
+    np.testing.assert_allclose(error.compressed(), 1.0, atol=1e-4)
+    assert error.mask.sum() == 3 and error.mask[2, column(20)], "a drop is predicted there"
+    assert drop[2, column(20)] == 0.75 and shown["No return, recorded"][0, column(0)] == 1.0
+    save_figure(tmp_path / "scan.png", figure)
+    assert Image.open(tmp_path / "scan.png").size[0] == 1600
+
+
+def test_without_intensities_their_rows_are_left_out(pair):
+    record, predicted = recorded(room(), intensity=None), pair[1]
+    assert list(images(draw_scan(record, predicted, ""))) == [t for t in TITLES if t != "Intensity, recorded"]
+
+
+def test_the_direction_of_travel_is_in_the_middle(pair):
+    """A ray of azimuth 90 degrees, with the sensor's y axis ahead."""
+    record, rendered = pair
+    at = STEPS // 2 + STEPS // 4
+    rendered.ranges[:, at] = 99.0
+    figure = draw_scan(record, rendered, "", ahead=np.pi / 2)
+    (column,) = np.unique(np.nonzero(images(figure)["Range, rendered"].get_array() > 50.0)[1])
+    assert abs(column - STEPS / 2) <= 1
+    assert labels(figure) == ["behind", "left", "ahead", "right", "behind"]
+    assert labels(draw_scan(record, rendered, ""))[:2] == ["180°", "90°"]
+
+
+def test_no_return_has_a_colour_of_its_own(pair):
+    """Neither the nearest nor the farthest range, the smallest error nor the lowest intensity is as black."""
+    for image in list(images(draw_scan(*pair, "")).values())[:5]:
+        assert image.get_cmap()(np.linspace(0.0, 1.0, 9))[:, :3].sum(axis=1).min() > 0.3

@@ -1,0 +1,341 @@
+"""The inspected vehicle and its key frame, compared with rays cast through every pixel at boxes in closed form."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.classed import classed
+from helpers.hand_made import recording_of, write_labels
+
+from drivesplat.errors import ConfigError, DatasetError
+from drivesplat.scene.evaluation_data import EvaluationData
+from drivesplat.scene.regions import LABELS
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame, Scene, Track
+from drivesplat.settings.visuals import SubjectSettings
+from drivesplat.visuals.subject import choose_subject, subject_record
+
+WIDTH = 192
+"""Twice as wide as the tiny drive's images."""
+ANY = SubjectSettings()
+
+
+@dataclasses.dataclass(frozen=True)
+class Actor:
+    """A box that drives straight on: at `position` when the first key frame is taken, then with `velocity` (m/s)."""
+
+    name: str
+    position: tuple[float, float, float]
+    velocity: tuple[float, float] = (0.0, 0.0)
+    size: tuple[float, float, float] = (4.0, 2.0, 1.6)
+    category: str = "vehicle.car"
+    visibility: int = 4
+    seen: range = range(10)
+
+    def place(self, seconds: float) -> np.ndarray:
+        return np.array(self.position) + seconds * np.array([*self.velocity, 0.0])
+
+    def track(self, scene: Scene) -> Track:
+        times, indices = scene.key_frame_timestamps[list(self.seen)], np.array(self.seen)
+        places = [rigid(np.eye(3), self.place((time - scene.key_frame_timestamps[0]) * 1e-6)) for time in times]
+        visibility = np.full(len(times), self.visibility)
+        return Track(
+            self.name, *classed(self.category), np.array(self.size), times, indices, np.stack(places), visibility
+        )
+
+
+def with_actors(scene: Scene, *actors: Actor) -> Scene:
+    return dataclasses.replace(scene, tracks=tuple(actor.track(scene) for actor in actors))
+
+
+def recorded(scene: Scene, width: int = WIDTH, masks: Path | None = None) -> EvaluationData:
+    return recording_of(scene, masks, width, every_nth=4, offset=2, last_block=2)
+
+
+def chosen(scene: Scene, settings: SubjectSettings = ANY, camera: str = "CAM_FRONT", width: int = WIDTH):
+    return choose_subject(recorded(scene, width), camera, settings)
+
+
+def seen_alone(frame: Frame, actor: Actor, seconds: float, width: int = WIDTH) -> np.ndarray:
+    """The pixels (h, w) whose centres' rays meet the actor's box (slabs)."""
+    scale = width / frame.width
+    x, y = np.meshgrid((np.arange(width) + 0.5) / scale - 0.5, (np.arange(frame.height * scale) + 0.5) / scale - 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(frame.intrinsics).T
+    rays = rays @ frame.camera_to_world[:3, :3].T
+    start, half = frame.camera_to_world[:3, 3] - actor.place(seconds), np.array(actor.size) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (-half - start) / rays, (half - start) / rays
+    enter, leave = np.fmin(a, b).max(axis=-1), np.fmax(a, b).min(axis=-1)
+    return (enter < leave) & (leave > 0)
+
+
+def pixels_of(scene: Scene, *actors: Actor, width: int = WIDTH) -> dict[tuple[str, int], int]:
+    """How many pixels each actor fills in each key frame where no box that is nearer hides it."""
+    counts = {}
+    for frame in (frame for frame in scene.frames if frame.is_key_frame):
+        seconds = (frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6
+        there = [actor for actor in actors if frame.sample_index in actor.seen]
+        away = [np.linalg.norm(actor.place(seconds) - frame.camera_to_world[:3, 3]) for actor in there]
+        free = np.ones((frame.height * width // frame.width, width), dtype=bool)
+        for i in np.argsort(away):
+            own = seen_alone(frame, there[i], seconds, width)
+            counts[there[i].name, frame.sample_index] = int((own & free).sum())
+            free &= ~own
+    return counts
+
+
+def largest(counts: dict[tuple[str, int], int], *names: str) -> tuple[str, int]:
+    return max((key for key in counts if key[0] in names), key=lambda key: counts[key])
+
+
+def found(subject) -> tuple[str, int]:
+    return subject.box.track_id, subject.frame.sample_index
+
+
+LEADING = Actor("leading", (9.0, 0.3, 0.8), (4.2, 0.0))
+ONCOMING = Actor("oncoming", (60.0, 4.0, 0.8), (-8.0, 0.0))
+PARKED = Actor("parked", (11.0, -4.0, 1.3), size=(6.0, 2.4, 2.6), category="vehicle.truck")
+WALKER = Actor("walker", (7.0, 2.0, 0.9), (4.0, 0.0), size=(0.8, 0.8, 1.8), category="human.pedestrian.adult")
+
+
+def test_of_the_tiny_drive_the_car_ahead_is_chosen_at_its_nearest(tiny_scene):
+    """It drives off slowly: nearest in the first key frame. The parked truck is passed much nearer."""
+    subject = chosen(tiny_scene, width=96)
+    assert (subject.box.category, subject.frame.sample_index, subject.index) == ("vehicle.car", 0, 0)
+
+
+@pytest.mark.parametrize(
+    "actors",
+    [
+        pytest.param([LEADING], id="one"),
+        pytest.param([LEADING, ONCOMING], id="two"),
+        pytest.param([ONCOMING, LEADING], id="the order of tracks does not matter"),
+        pytest.param([LEADING, ONCOMING, PARKED, WALKER], id="with what is no moving vehicle"),
+        pytest.param([dataclasses.replace(LEADING, size=(1.8, 0.6, 1.2)), ONCOMING], id="nearest is not largest"),
+        pytest.param([dataclasses.replace(LEADING, velocity=(2.0, 0.0))], id="nearer and nearer"),
+        pytest.param([dataclasses.replace(LEADING, seen=range(3, 6))], id="there for a while"),
+    ],
+)
+def test_the_moving_vehicle_with_the_most_pixels_is_chosen(tiny_scene, actors):
+    scene = with_actors(tiny_scene, *actors)
+    counts = pixels_of(scene, *actors)
+    subject = chosen(scene)
+    assert found(subject) == largest(counts, "leading", "oncoming")
+    assert subject.pixels == pytest.approx(counts[found(subject)], abs=2)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_in_random_traffic_the_largest_moving_vehicle_is_chosen(tiny_scene, seed):
+    random = np.random.default_rng(seed)
+    actors = []
+    for i in range(6):
+        place = (*random.uniform([8, -4], [18, 4]), 0.8)
+        velocity = (random.uniform(3.5, 6.0), 0.0) if i % 2 else (0.0, 0.0)
+        actors.append(Actor(f"{i}", place, velocity, size=tuple(random.uniform([3, 1.6, 1.4], [8, 2.5, 3.0]))))
+    scene = with_actors(tiny_scene, *actors)
+    counts = pixels_of(scene, *actors)
+    subject = chosen(scene)
+    assert subject.pixels == pytest.approx(counts[largest(counts, "1", "3", "5")], abs=2)
+    assert subject.pixels == pytest.approx(counts[found(subject)], abs=2)
+    assert subject.box.track_id in ("1", "3", "5")
+
+
+@pytest.mark.parametrize(
+    "still",
+    [
+        pytest.param(PARKED, id="parked"),
+        pytest.param(dataclasses.replace(LEADING, velocity=(0.9, 0.0)), id="slower than the threshold of motion"),
+        pytest.param(WALKER, id="a person"),
+        pytest.param(dataclasses.replace(LEADING, visibility=1), id="hardly visible"),
+        pytest.param(dataclasses.replace(LEADING, position=(95.0, 0.0, 0.8)), id="too far"),
+        pytest.param(dataclasses.replace(LEADING, size=(0.3, 0.3, 0.3)), id="too small"),
+        pytest.param(dataclasses.replace(LEADING, position=(-20.0, 0.0, 0.8)), id="behind the camera"),
+        pytest.param(dataclasses.replace(LEADING, position=(9.0, 90.0, 0.8)), id="beside the image"),
+    ],
+)
+def test_only_moving_vehicles_of_the_protocol_are_chosen(tiny_scene, still):
+    assert chosen(with_actors(tiny_scene, still)) is None
+
+
+def test_a_drive_without_tracks_has_no_subject(tiny_scene):
+    assert chosen(with_actors(tiny_scene)) is None
+
+
+def test_nearer_boxes_hide_farther_ones(tiny_scene):
+    van = Actor("van", (6.5, 1.2, 1.1), size=(3.0, 1.0, 2.2), seen=range(1))
+    scene = with_actors(tiny_scene, LEADING, van)
+    alone, counts = pixels_of(scene, LEADING), pixels_of(scene, LEADING, van)
+    assert largest(alone, "leading") == ("leading", 0) and largest(counts, "leading") == ("leading", 1)
+    assert found(chosen(scene)) == ("leading", 1)
+    hidden = chosen(scene, SubjectSettings(key_frame=0))
+    assert 0 < hidden.pixels < 0.8 * alone["leading", 0]
+    frame = scene.frames[0]
+    seconds = (frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6
+    expected = seen_alone(frame, LEADING, seconds) & ~seen_alone(frame, van, seconds)
+    assert (hidden.visible ^ expected).sum() <= 2
+
+
+def ego_vehicle_below(scene: Scene, row: int, folder: Path) -> Path:
+    """Masks (108, 192) of which the ego vehicle's body fills the rows from `row` on."""
+    labels = np.full((108, WIDTH), LABELS["static"], dtype=np.uint8)
+    labels[row:] = LABELS["own_car"]
+    return write_labels(folder, scene, labels)
+
+
+def test_pixels_of_the_ego_mask_do_not_count(tiny_scene, tmp_path):
+    scene = with_actors(tiny_scene, LEADING)
+    free = chosen(scene, SubjectSettings(key_frame=0))
+    recording = recorded(scene, masks=ego_vehicle_below(scene, 70, tmp_path))
+    subject = choose_subject(recording, "CAM_FRONT", SubjectSettings(key_frame=0))
+    assert free.visible[70:].any() and free.visible[:70].any()
+    np.testing.assert_array_equal(subject.visible[:70], free.visible[:70])
+    assert not subject.visible[70:].any() and subject.pixels == free.visible[:70].sum()
+
+
+def test_pixels_behind_the_ego_mask_do_not_count_in_the_choice(tiny_scene, tmp_path):
+    """Its hull without hidden pixels is largest elsewhen: it is nearest, but mostly hidden, in the first key frame."""
+    low = dataclasses.replace(LEADING, size=(4.0, 2.0, 1.0), position=(9.0, 0.3, 0.5), velocity=(7.0, 0.0))
+    scene = with_actors(tiny_scene, low)
+    row = int(np.flatnonzero(chosen(scene).visible.any(axis=1)).min()) + 2
+    subject = choose_subject(recorded(scene, masks=ego_vehicle_below(scene, row, tmp_path)), "CAM_FRONT", ANY)
+    assert found(chosen(scene)) == ("leading", 0)
+    assert subject.frame.sample_index > 0 and subject.visible[row:].sum() == 0
+
+
+def test_a_vehicle_completely_behind_the_ego_mask_is_not_chosen(tiny_scene, tmp_path):
+    scene = with_actors(tiny_scene, LEADING)
+    assert choose_subject(recorded(scene, masks=ego_vehicle_below(scene, 0, tmp_path)), "CAM_FRONT", ANY) is None
+
+
+def test_a_completely_hidden_vehicle_is_not_chosen(tiny_scene):
+    wall = Actor("wall", (7.0, 0.0, 1.5), (4.0, 0.0), size=(0.5, 7.0, 7.0), category="animal")
+    assert chosen(with_actors(tiny_scene, LEADING, wall)) is None
+
+
+def test_images_between_key_frames_are_ignored(tiny_scene):
+    """Were the best key frame an image between two, the second best would be chosen."""
+    scene = with_actors(tiny_scene, dataclasses.replace(LEADING, velocity=(3.6, 0.0)))
+    best = chosen(scene)
+    frames = [
+        dataclasses.replace(frame, is_key_frame=frame.is_key_frame and frame is not best.frame)
+        for frame in scene.frames
+    ]
+    second = chosen(dataclasses.replace(scene, frames=tuple(frames)))
+    assert second.frame.is_key_frame
+    assert abs(second.frame.sample_index - best.frame.sample_index) == 1
+    assert all(frame.is_key_frame for frame in (best.frame, second.frame))
+
+
+def test_the_index_is_that_of_all_images_of_all_cameras(tiny_scene):
+    scene = with_actors(tiny_scene, LEADING)
+    back = [dataclasses.replace(frame, camera="CAM_BACK") for frame in scene.frames[:3]]
+    both = dataclasses.replace(scene, frames=(*back, *scene.frames[3:]))
+    subject = chosen(both)
+    assert (subject.frame.camera, subject.index) == ("CAM_FRONT", 4)
+    assert both.frames[subject.index] is subject.frame
+    assert chosen(both, camera="CAM_BACK").frame.camera == "CAM_BACK"
+    assert chosen(both, camera="CAM_LEFT") is None
+
+
+def test_pixels_are_those_of_the_training_resolution(tiny_scene):
+    scene = with_actors(tiny_scene, LEADING)
+    small, large = chosen(scene, width=96), chosen(scene, width=192)
+    assert small.visible.shape == (54, 96) and large.visible.shape == (108, 192)
+    assert large.pixels / small.pixels == pytest.approx(4.0, rel=0.1)
+
+
+def test_a_requested_track_is_chosen_at_its_largest_even_if_parked(tiny_scene):
+    scene = with_actors(tiny_scene, LEADING, PARKED)
+    subject = chosen(scene, SubjectSettings(track="parked"))
+    assert found(subject) == largest(pixels_of(scene, LEADING, PARKED), "parked")
+    assert subject.label == "parked_other_vehicle"
+
+
+def test_in_a_requested_key_frame_the_largest_vehicle_is_chosen(tiny_scene):
+    scene = with_actors(tiny_scene, LEADING, ONCOMING)
+    counts = pixels_of(scene, LEADING, ONCOMING)
+    for key_frame in (0, 5, 9):
+        then = {key: count for key, count in counts.items() if key[1] == key_frame}
+        assert found(chosen(scene, SubjectSettings(key_frame=key_frame))) == largest(then, "leading", "oncoming")
+
+
+def test_track_and_key_frame_can_be_requested_together(tiny_scene):
+    scene = with_actors(tiny_scene, LEADING, ONCOMING)
+    assert found(chosen(scene, SubjectSettings(track="oncoming", key_frame=6))) == ("oncoming", 6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "asked"),
+    [
+        pytest.param({"track": "nobody"}, ["track nobody"], id="no such track"),
+        pytest.param({"key_frame": 40}, ["key_frame 40"], id="no such key frame"),
+        pytest.param({"track": "late", "key_frame": 1}, ["track late", "key_frame 1"], id="it is not there then"),
+        pytest.param({"track": "behind"}, ["track behind"], id="it is not before the camera"),
+    ],
+)
+def test_a_missing_subject_is_refused_with_the_candidates(tiny_scene, settings, asked):
+    late = dataclasses.replace(LEADING, name="late", position=(12.0, 2.5, 0.8), seen=range(4, 8))
+    behind = dataclasses.replace(LEADING, name="behind", position=(-20.0, 0.0, 0.8))
+    scene = with_actors(tiny_scene, LEADING, late, behind, PARKED)
+    with pytest.raises(ConfigError) as refusal:
+        chosen(scene, SubjectSettings(**settings))
+    message = str(refusal.value)
+    assert message.startswith(f"subjects.{scene.name}: CAM_FRONT")
+    for words in (*asked, "leading in 0-9", "late in 4-7"):
+        assert words in message
+    known = message.split("last key frame:")[1]
+    assert "behind" not in known and "parked" not in known
+
+
+def test_without_moving_vehicles_a_request_is_refused(tiny_scene):
+    with pytest.raises(ConfigError, match=r"key_frame 3.*: none$"):
+        chosen(with_actors(tiny_scene, PARKED), SubjectSettings(key_frame=3, track="nobody"))
+
+
+@pytest.mark.parametrize(
+    ("key_frame", "split"), [(0, "train"), (2, "interpolation"), (6, "interpolation"), (9, "extrapolation")]
+)
+def test_the_record_of_a_subject(tiny_scene, key_frame, split):
+    actor = dataclasses.replace(LEADING, velocity=(4.0, 0.5))
+    scene = with_actors(tiny_scene, actor)
+    subject = chosen(scene, SubjectSettings(key_frame=key_frame))
+    record = json.loads(json.dumps(subject_record(subject, recorded(scene)), allow_nan=False))
+    frame = scene.frames[2 * key_frame]
+    place = actor.place((frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6)
+    away = float(np.linalg.norm(place - frame.camera_to_world[:3, 3]))
+    assert record.pop("distance_m") == pytest.approx(away)
+    assert record.pop("speed_m_s") == pytest.approx(np.hypot(4.0, 0.5))
+    np.testing.assert_allclose(record.pop("object_to_world"), rigid(np.eye(3), place), atol=1e-9)
+    assert record == {
+        "track": "leading",
+        "category": "vehicle.car",
+        "label": "moving_car",
+        "label_value": LABELS["moving_car"],
+        "key_frame": key_frame,
+        "timestamp": frame.timestamp,
+        "image": frame.image_path.rsplit("/", 1)[1],
+        "split": split,
+        "size_m": [4.0, 2.0, 1.6],
+        "pixels": subject.pixels,
+        "origin": scene.origin.tolist(),
+    }
+
+
+def test_the_middle_key_frame_is_that_in_the_middle_of_the_drive(tiny_scene):
+    """Of ten key frames, 0 to 9, the sixth; images between them do not count."""
+    index = tiny_scene.middle_key_frame("CAM_FRONT")
+    assert tiny_scene.frames[index].is_key_frame and tiny_scene.frames[index].sample_index == 5
+    others = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames[:7]]
+    both = dataclasses.replace(tiny_scene, frames=(*others, *tiny_scene.frames[7:]))
+    assert both.frames[both.middle_key_frame("CAM_FRONT")].sample_index == 7
+    assert both.frames[both.middle_key_frame("CAM_BACK")].sample_index == 2
+
+
+@pytest.mark.parametrize("camera", ["CAM_BACK", "CAM_LEFT"])
+def test_a_camera_without_key_frames_is_refused_with_those_that_have_some(tiny_scene, camera):
+    between = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames if not frame.is_key_frame]
+    scene = dataclasses.replace(tiny_scene, frames=(*tiny_scene.frames, *between))
+    with pytest.raises(DatasetError, match=f"{scene.name}.*eval_camera {camera} has no key frame; .* CAM_FRONT$"):
+        scene.middle_key_frame(camera)

@@ -1,0 +1,223 @@
+"""The dynamic objects of a drive as a table and as images with labels."""
+
+import csv
+import dataclasses
+import itertools
+from collections.abc import Collection
+
+import numpy as np
+import pytest
+from helpers.hand_made import actor_record, recording_of
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from drivesplat.errors import ResultError
+from drivesplat.io.array_file import write_arrays
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.scene.evaluation_data import EvaluationData
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.tracks import MIN_ID_LENGTH, short_ids
+from drivesplat.settings.actor_seed import ActorSeedSettings
+from drivesplat.trajectories.actor_record import ActorRecords
+from drivesplat.trajectories.motion import Motion
+from drivesplat.visuals.track_table import (
+    MAX_IMAGES,
+    covering_images,
+    draw_tracks,
+    editable_tracks,
+    subjects_by_image,
+    track_rows,
+    write_tracks,
+)
+
+
+@pytest.fixture(scope="module")
+def recording(tiny_scene) -> EvaluationData:
+    return recording_of(tiny_scene)
+
+
+def rows_of(recording: EvaluationData, editable: Collection[str] = ()) -> list:
+    return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"), editable, ActorSeedSettings())
+
+
+def drawn(recording: EvaluationData, editable: Collection[str] = ()) -> Figure:
+    subjects = subjects_by_image(recording, "CAM_FRONT")
+    rows = track_rows(recording, subjects, editable, ActorSeedSettings())
+    return draw_tracks(recording, subjects, rows, "CAM_FRONT")
+
+
+def texts(figure: Figure) -> list[str]:
+    return [text.get_text() for axis in figure.axes for text in axis.texts]
+
+
+def test_every_dynamic_object_has_a_row_and_moving_ones_come_first(recording):
+    """The tiny street: a car at 4.2 m/s, a walker at 1.2 m/s, a parked truck; a cone cannot move."""
+    rows = rows_of(recording)
+    assert {row.category for row in rows[:2]} == {"vehicle.car", "human.pedestrian.adult"}
+    assert [row.category for row in rows[2:]] == ["vehicle.truck"]
+    by_class = {row.category: row for row in rows}
+    assert [row.moves for row in rows] == [True, True, False]
+    assert by_class["vehicle.car"].speed_mean == pytest.approx(4.2, abs=0.01)
+    assert by_class["human.pedestrian.adult"].speed_max == pytest.approx(1.2, abs=0.01)
+    truck = by_class["vehicle.truck"]
+    assert (truck.length, truck.width, truck.height, truck.speed_max) == (6.0, 2.4, 2.6, 0.0)
+
+
+def test_times_are_those_of_annotations_and_images(recording, tiny_scene):
+    car = next(row for row in rows_of(recording) if row.category == "vehicle.car")
+    track = next(track for track in tiny_scene.tracks if track.id == car.id)
+    assert car.seconds == pytest.approx((track.timestamps[-1] - track.timestamps[0]) * 1e-6)
+    subjects = subjects_by_image(recording, "CAM_FRONT")
+    showing = sum(any(s.box.track_id == car.id for s in seen) for seen in subjects.values())
+    assert showing == len(track.timestamps) and car.seconds_visible == car.seconds, "in all of it"
+    pixels = {
+        recording.frame(i).sample_index: s.pixels for i, seen in subjects.items() for s in seen
+        if s.box.track_id == car.id
+    }  # fmt: skip
+    assert car.pixels == max(pixels.values()) == pixels[car.key_frame]
+
+
+def test_an_object_that_is_never_visible_has_no_key_frame(tiny_scene):
+    behind = [
+        dataclasses.replace(track, object_to_world=_moved(track, [-500.0, 0.0, 0.0])) for track in tiny_scene.tracks
+    ]
+    rows = rows_of(recording_of(dataclasses.replace(tiny_scene, tracks=tuple(behind))))
+    assert rows and all((row.key_frame, row.pixels, row.seconds_visible) == (None, 0, 0.0) for row in rows)
+
+
+def _moved(track, by) -> np.ndarray:
+    poses = track.object_to_world.copy()
+    poses[:, :3, 3] += by
+    return poses
+
+
+def test_the_table_reads_back(recording, tmp_path):
+    rows = rows_of(recording)
+    write_tracks(tmp_path / "tracks.csv", rows)
+    with open(tmp_path / "tracks.csv", encoding="utf-8") as file:
+        read = list(csv.DictReader(file))
+    assert [row["id"] for row in read] == [row.id for row in rows]
+    assert [float(row["speed_max"]) for row in read] == [row.speed_max for row in rows]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultError, match=r"file/tracks\.csv"):
+        write_tracks(tmp_path / "file" / "tracks.csv", rows)
+
+
+def test_only_moving_objects_are_labelled(recording):
+    rows = rows_of(recording)
+    found = set(texts(drawn(recording)))
+    dynamic_tracks = [row.id for row in rows if row.moves and row.pixels >= 100]
+    assert len(dynamic_tracks) == len(found) == 2
+    assert all(any(name.startswith(label) for name in dynamic_tracks) for label in found)
+
+
+def test_editable_tracks_are_those_of_actors_with_points(recording, tmp_path):
+    """The car is an actor, the walker has no points, the truck stands."""
+    car, walker = (next(row.id for row in rows_of(recording) if row.category.startswith(kind))
+                   for kind in ("vehicle.car", "human"))  # fmt: skip
+    track = next(track for track in recording.scene.tracks if track.id == car)
+    actor = actor_record(ActorTrack(car, track.size, Motion.of_track(recording.scene, track)))
+    empty = dataclasses.replace(
+        actor, id=walker, lidar_points=0, points=actor.points[:0], points_rgb=actor.points_rgb[:0]
+    )
+    write_arrays(tmp_path / "actors.npz", ActorRecords([actor, empty]))
+    editable = editable_tracks([str(tmp_path / "actors.npz")])
+    assert editable == {car} and editable_tracks([]) == set()
+    assert {row.category: row.editable for row in rows_of(recording, editable)} == {
+        "vehicle.car": True, "human.pedestrian.adult": False, "vehicle.truck": False
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("actors", "walker", "car"),
+    [
+        (ActorSeedSettings(), "class", "never seen"),
+        (ActorSeedSettings(classes={"pedestrian": "deformable", "car": "background"}), "never seen", "class"),
+        (None, "no method with actors", "no method with actors"),
+    ],
+    ids=["people are background", "cars are background", "vanilla alone"],
+)
+def test_a_track_that_cannot_be_edited_says_why(actors, walker, car, recording):
+    subjects = subjects_by_image(recording, "CAM_FRONT")
+    rows = {row.category: row for row in track_rows(recording, subjects, (), actors)}
+    assert {name: row.not_editable for name, row in rows.items()} == {
+        "vehicle.car": car, "human.pedestrian.adult": walker, "vehicle.truck": "parked"
+    }  # fmt: skip
+    ids = [row.id for row in rows.values()]
+    assert {row.not_editable for row in track_rows(recording, subjects, ids, actors)} == {""}
+
+
+def test_labels_of_objects_behind_each_other_do_not_cover_each_other(tiny_scene, monkeypatch):
+    """Cars that stand half behind each other, each label drawn at its true size."""
+    car = next(track for track in tiny_scene.tracks if track.category == "vehicle.car")
+    places = [[0.3 * i - 3.0, 0.25 * i, 0.0] for i in range(3)]
+    monkeypatch.setattr("drivesplat.visuals.track_table.MIN_PIXELS", 5)
+    row = [
+        dataclasses.replace(car, id=f"{i}" * 12, object_to_world=_moved(car, place)) for i, place in enumerate(places)
+    ]
+    figure = drawn(recording_of(dataclasses.replace(tiny_scene, tracks=tuple(row))))
+    FigureCanvasAgg(figure).draw()
+    found = 0
+    for axis in figure.axes:
+        boxes = [Text.get_window_extent(text) for text in axis.texts]  # without the lines to the outlines
+        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+        found = max(found, len(boxes))
+    assert found == 3
+
+
+def test_what_cannot_be_edited_is_outlined_otherwise(recording):
+    car, walker = (row.id for row in sorted(rows_of(recording)[:2], key=lambda row: row.category, reverse=True))
+    figure = drawn(recording, {car})
+    outlines = {patch.get_linestyle() for axis in figure.axes for patch in axis.patches}
+    assert outlines == {"solid", "dashed"} and "dashed: cannot be edited" in figure.get_suptitle()
+    boxes = {text.get_text(): text.get_bbox_patch().get_facecolor() for axis in figure.axes for text in axis.texts}
+    assert boxes[short_ids([car, walker])[car]] != boxes[short_ids([car, walker])[walker]]
+    whole = drawn(recording, {car, walker})
+    assert {patch.get_linestyle() for axis in whole.axes for patch in axis.patches} == {"solid"}
+    assert "dashed" not in whole.get_suptitle()
+
+
+@pytest.mark.parametrize(
+    ("ids", "length"),
+    [
+        ([], 0),
+        (["a" * 32], MIN_ID_LENGTH),
+        (["12345678aa", "12345678ab"], 10),
+        (["0123456789", "9123456789"], MIN_ID_LENGTH),
+        (["a"], 1),
+    ],
+)
+def test_labels_are_short_and_unique(ids, length):
+    names = short_ids(ids)
+    assert list(names) == ids and len(set(names.values())) == len(ids)
+    assert all(name == names[name] or name.startswith(names[name]) for name in ids)
+    assert {len(name) for name in names.values()} <= {length}
+
+
+def test_without_moving_objects_the_title_says_so(tiny_scene):
+    figure = drawn(recording_of(standing(tiny_scene)))
+    assert "nothing moves" in figure.get_suptitle() and texts(figure) == [] and len(figure.axes) == 1
+
+
+def standing(scene: Scene) -> Scene:
+    tracks = (
+        dataclasses.replace(track, object_to_world=np.repeat(track.object_to_world[:1], len(track.timestamps), axis=0))
+        for track in scene.tracks
+    )
+    return dataclasses.replace(scene, tracks=tuple(tracks))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "expected"),
+    [
+        ({}, []),
+        ({4: {}}, []),
+        ({0: {"a": 5}, 1: {"a": 9}}, [1]),
+        ({0: {"a": 5, "b": 5}, 1: {"a": 900}}, [0]),
+        ({0: {"a": 1}, 1: {"b": 1}, 2: {"a": 1, "c": 1}}, [1, 2]),
+        ({i: {str(i): 1} for i in range(9)}, list(range(MAX_IMAGES))),
+    ],
+)
+def test_few_images_cover_all_objects(pixels, expected):
+    assert covering_images(pixels) == expected

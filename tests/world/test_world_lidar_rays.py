@@ -1,0 +1,244 @@
+"""LiDAR rays, each at its own time, against ray casting on meshes that are posed at that time."""
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.demo_worlds import FRONT, LIDAR, meshes_at, named, names_of, pose_at, recorder_of
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from drivesplat.settings.world import WorldLidarSettings
+from drivesplat.world.optics.lidar import MAX_RANGE, ScanPattern, StreetScan, scan, scan_pattern
+from drivesplat.world.optics.raycast import RayCaster
+from drivesplat.world.recorder import Recorder, Viewpoint
+from drivesplat.world.shapes.mesh import Material, box
+from drivesplat.world.street.objects import EGO_BODY, EGO_PARTS, StreetObject, fixed
+
+TIME_US = 2_000_000
+EVERYBODY = {"vehicles": 3, "pedestrians": 12, "bystanders": 3, "cyclists": 2, "dogs": 2}
+WORLDS = {
+    "straight": {"lidar": {"spins": True, "ego_returns": True}, **EVERYBODY},
+    "bend": {"lidar": {"spins": True, "beams": 64}, "lidar_hz": 10, "bend_deg": 35.0, "grade": 0.06, **EVERYBODY},
+    "at once": {"lidar": {"spins": False}, **EVERYBODY},
+}
+
+
+@pytest.fixture(
+    scope="module", params=["straight", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bend", "at once"))]
+)
+def recorder(request) -> Recorder:
+    return recorder_of(**WORLDS[request.param])
+
+
+@pytest.fixture(scope="module")
+def found(recorder) -> StreetScan:
+    return recorder.scan(LIDAR, TIME_US)
+
+
+def rays_of(recorder: Recorder, step: int, left: float = 0.0) -> tuple[float, np.ndarray, np.ndarray]:
+    """Second, origin (3,) and directions (beams, 3) in the street frame of one step of the azimuth."""
+    pattern = recorder.pattern
+    seconds = TIME_US * 1e-6 + float(pattern.offsets[step])
+    pose = recorder.ego_pose(seconds) @ LIDAR.sensor_to_ego
+    origin = pose[:3, 3] + left * recorder.ego_pose(seconds)[:3, 1]
+    azimuth, elevation = float(pattern.azimuths[step]), pattern.elevations
+    local = np.stack(
+        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=-1
+    )
+    return seconds, origin, local @ pose[:3, :3].T
+
+
+def first_hits(triangles: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Distances (n,) to the first of `triangles` (f, 3, 3), by Embree through trimesh; infinite without one."""
+    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
+    origins = np.tile(origin, (len(directions), 1))
+    points, rays, _ = RayMeshIntersector(mesh).intersects_location(origins, directions, multiple_hits=False)
+    distance = np.full(len(directions), np.inf)
+    distance[rays] = np.linalg.norm(points - origin, axis=1)
+    return distance
+
+
+def by_hand(triangles: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
+    """The distance to the first of `triangles` (f, 3, 3): Moeller and Trumbore (1997), in float64."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    p = np.cross(direction, c - a)
+    determinant = ((b - a) * p).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = ((origin - a) * p).sum(axis=1) / determinant
+        q = np.cross(origin - a, b - a)
+        v, distance = (q @ direction) / determinant, ((c - a) * q).sum(axis=1) / determinant
+    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0)
+    return float(distance[hit].min(initial=np.inf))
+
+
+def steps_of(recorder: Recorder, found: StreetScan) -> np.ndarray:
+    """Steps all round, and some of those that hit each moving object."""
+    steps = set(range(0, found.range.shape[1], 150))
+    for number, item in enumerate(recorder.objects):
+        if item.moves:
+            steps |= set(np.unique(np.nonzero(found.object == number)[1])[1::40].tolist())
+    return np.array(sorted(steps))
+
+
+@pytest.mark.slow
+def test_ranges_are_those_of_meshes_posed_at_each_rays_own_time(recorder, found):
+    static = np.concatenate([meshes_at(item, 0.0) for item in recorder.objects if not item.moves])
+    standing = RayMeshIntersector(
+        trimesh.Trimesh(static.reshape(-1, 3), np.arange(3 * len(static)).reshape(-1, 3), process=False)
+    )
+    moving = [item for item in recorder.objects if item.moves]
+    errors, missed, hit = [], 0, set()
+    for step in steps_of(recorder, found):
+        seconds, origin, directions = rays_of(recorder, int(step))
+        expected = first_hits(np.concatenate([meshes_at(item, seconds) for item in moving]), origin, directions)
+        points, rays, _ = standing.intersects_location(np.tile(origin, (len(directions), 1)), directions, False)
+        expected[rays] = np.minimum(expected[rays], np.linalg.norm(points - origin, axis=1))
+        both = np.isfinite(expected) & np.isfinite(found.range[:, step])
+        missed += int((np.isfinite(expected) != np.isfinite(found.range[:, step])).sum())
+        errors.append(np.abs(expected[both] - found.range[both, step]))
+        hit |= set(found.object[:, step].tolist())
+    error = np.concatenate(errors)
+    far = error > 1e-3  # a ray that grazes an edge may fall on either side of it
+    print(f"{len(error)} rays, greatest error of the others {error[~far].max():.6f} m, {far.sum()} at edges, {missed}")
+    assert len(error) > 500 and far.sum() + missed <= 3e-3 * len(error)
+    seen = {recorder.objects[number].name.split()[0] for number in hit if number >= 0}
+    assert {"scenery", "vehicle", "pedestrian"} <= seen
+
+
+def not_ego(item: StreetObject, left: float) -> bool:
+    """Whether an object is there when the sensor moves `left` metres aside: the ego vehicle is not."""
+    return not left or item.name not in EGO_PARTS
+
+
+@pytest.mark.parametrize("left", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
+def test_some_ranges_are_those_of_every_triangle_tried_in_double_precision(recorder, left):
+    found = recorder.scan(LIDAR, TIME_US, Viewpoint(left=left))
+    numbers = [n for n, item in enumerate(recorder.objects) if item.moves and (found.object == n).any()]
+    rays = [tuple(np.argwhere(found.object == n)[len(np.argwhere(found.object == n)) // 2]) for n in numbers]
+    rays += [(beam, step) for beam in (2, 9, 17, 25) for step in range(40, found.range.shape[1], 411)]
+    good = 0
+    for beam, step in rays:
+        seconds, origin, directions = rays_of(recorder, int(step), left)
+        triangles = np.concatenate([meshes_at(item, seconds) for item in recorder.objects if not_ego(item, left)])
+        good += abs(by_hand(triangles, origin, directions[beam]) - found.range[beam, step]) < 1e-3 or (
+            not np.isfinite(found.range[beam, step])
+        )
+    assert good >= len(rays) - 1, "but for a ray at an edge"
+
+
+def test_the_ego_vehicle_returns_beams_only_where_asked_to_and_no_camera_sees_it():
+    without, own = (recorder_of(lidar={"ego_returns": asked}) for asked in (False, True))
+    assert EGO_BODY not in names_of(without)
+    number = names_of(own).index(EGO_BODY)
+    scans = [recorder.scan(LIDAR, TIME_US) for recorder in (without, own)]
+    hit = scans[1].object == number
+    assert hit.sum() > 100 and (scans[1].range[hit] < scans[0].range[hit]).all()
+    np.testing.assert_array_equal(scans[0].range[~hit], scans[1].range[~hit])
+    to_ego = LIDAR.sensor_to_ego
+    body = own.returns(scans[1], LIDAR, TIME_US)[hit[scans[1].returned], :3].astype(float)
+    in_ego = body @ to_ego[:3, :3].T + to_ego[:3, 3]
+    assert (np.abs(in_ego[:, 1]) < 1.1).all() and (np.abs(in_ego[:, 0] - 1.4) < 2.7).all()
+    np.testing.assert_array_equal(*(recorder.image(FRONT, TIME_US) for recorder in (without, own)))
+
+
+def rear_of_the_car_ahead(recorder: Recorder) -> tuple[float, float]:
+    """How far the rear's returns lie behind the box at the timestamp (metres), and the speed of the car (m/s)."""
+    found, seconds = recorder.scan(LIDAR, TIME_US), TIME_US * 1e-6
+    item = named(recorder, "vehicle 0")
+    own = found.object[found.returned] == names_of(recorder).index("vehicle 0")
+    points = recorder.returns(found, LIDAR, TIME_US)[own, :3].astype(float)
+    to_box = np.linalg.inv(pose_at(item, seconds)) @ recorder.ego_pose(seconds) @ LIDAR.sensor_to_ego
+    rear = (points @ to_box[:3, :3].T + to_box[:3, 3])[:, 0]
+    step = pose_at(item, seconds + 0.01) - pose_at(item, seconds - 0.01)
+    return -item.size[0] / 2 - float(np.quantile(rear, 0.3)), float(np.linalg.norm(step[:3, 3])) / 0.02
+
+
+def test_a_moving_car_ahead_is_displaced_by_its_speed_times_the_rays_time():
+    """The beams point forward 35.5 ms before the timestamp. The sensor's motion is compensated, that of cars is not."""
+    (still, speed), (spun, _) = (rear_of_the_car_ahead(recorder_of(lidar={"spins": s})) for s in (False, True))
+    assert speed > 8.0
+    assert spun - still == pytest.approx(0.0355 * speed, abs=0.02)
+
+
+def test_returns_are_dropped_by_range_and_by_what_they_reflect(recorder, found):
+    """A return needs about 5 % of the light at 100 m, as little as the square of the range allows nearer."""
+    margin = found.intensity / (0.05 * (found.range / MAX_RANGE) ** 2)
+    inside = np.isfinite(found.range) & (found.range > 0.9) & (found.range < MAX_RANGE)
+    assert not found.returned[~inside].any()
+    assert found.returned[inside & (margin > 1.5)].all() and not found.returned[inside & (margin < 0.5)].any()
+    between = found.returned[inside & (margin > 0.7) & (margin < 1.3)]
+    if len(between) > 50:
+        assert 0.2 < between.mean() < 0.8
+    assert (found.range[inside & ~found.returned] > 5.0).any(), "far and grazing rays are lost"
+
+
+PATTERN = scan_pattern(WorldLidarSettings(beams=64), 20)
+
+
+def scanned(objects: list, wet: float = 0.0, pattern: ScanPattern = PATTERN, **lidar) -> StreetScan:
+    """A scan from the origin of a street of `objects`, y ahead."""
+    steps = len(pattern.azimuths)
+    poses, times = np.tile(np.eye(4), (steps, 1, 1)), np.zeros(steps)
+    settings = WorldLidarSettings(beams=64, **lidar)
+    return scan(RayCaster(objects).at(times), pattern, poses, times, settings, wet, np.random.default_rng(0))
+
+
+def plane(material: Material, grey: float = 0.3) -> list:
+    """The ground 1.8 m below the sensor."""
+    return [fixed("ground", box((-200.0, -200.0, -2.8), (200.0, 200.0, -1.8), material, (grey,) * 3))]
+
+
+def wall(material: Material, grey: float = 0.3) -> list:
+    """A wall 10 m ahead, along x."""
+    return [fixed("wall", box((-200.0, 10.0, -50.0), (200.0, 11.0, 50.0), material, (grey,) * 3))]
+
+
+def test_grazing_rays_return_less_than_steep_ones():
+    found = scanned(plane(Material.PLAIN))
+    hit = np.isfinite(found.range)
+    cosine = 1.8 / found.range[hit]
+    reflectivity = found.intensity[hit] / cosine
+    steep, flat = cosine > 0.2, (cosine < 0.15) & (cosine > 0.05)
+    assert reflectivity[flat].mean() == pytest.approx(reflectivity[steep].mean(), rel=0.1), "Lambert's cosine law"
+    assert found.returned[hit][steep].all() and not found.returned[hit & (found.range > 60.0)].any()
+
+
+def test_glass_returns_at_normal_incidence_alone():
+    glass, plain = (scanned(wall(material)) for material in (Material.GLASS, Material.PLAIN))
+    hit = np.isfinite(plain.range)
+    with np.errstate(invalid="ignore"):
+        cosine = np.where(hit, 10.0 / plain.range, 0.0)
+    frontal, oblique = cosine > 0.99, hit & (cosine < 0.8) & (cosine > 0.2)
+    assert glass.intensity[frontal].mean() > 0.3
+    assert glass.intensity[oblique].max() < 0.03 < 0.1 * plain.intensity[frontal].mean() + 0.02
+    assert plain.returned[oblique].all() and 0.02 < (~glass.returned[oblique]).mean() < 0.5
+
+
+def test_a_wet_road_returns_less_than_a_dry_one_and_nothing_else_changes():
+    dry, wet = (scanned(plane(Material.ROAD), wet) for wet in (0.0, 1.0))
+    hit = np.isfinite(dry.range)
+    ratio = wet.intensity[hit] / dry.intensity[hit]
+    cosine = 1.8 / dry.range[hit]
+    assert ratio.max() <= 1.0 and np.median(ratio[cosine < 0.2]) == pytest.approx(0.15, abs=0.02)
+    assert wet.returned.sum() < 0.95 * dry.returned.sum()
+    plain = [scanned(plane(Material.PLAIN), wet).intensity for wet in (0.0, 1.0)]
+    np.testing.assert_array_equal(*plain)
+
+
+def edge_scans(gap: float, grey: float) -> tuple[StreetScan, StreetScan, np.ndarray]:
+    """Scans without and with a divergence of 6 mrad of a plate 2 m wide and high, `gap` metres before a wall of the
+    reflectance `grey`; and which rays (beams, steps) come within their cone of the plate's edge."""
+    plate = fixed("plate", box((-1.0, 10.0, -1.0), (1.0, 10.02, 1.0), Material.PLAIN, (0.4,) * 3))
+    behind = fixed("wall", box((-200.0, 10.0 + gap, -50.0), (200.0, 60.0, 50.0), Material.PLAIN, (grey,) * 3))
+    thin, wide = (scanned([plate, behind], divergence_mrad=mrad) for mrad in (0.0, 6.0))
+    x, y, z = np.moveaxis(PATTERN.directions(), -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        outside = np.maximum(np.abs(x / y), np.abs(z / y)) - 0.1  # in tangents, of the plate's half angles
+    return thin, wide, (y > 0) & (np.abs(outside) < 0.0033)
+
+
+def test_a_wide_beam_returns_another_range_only_at_edges():
+    thin, wide, edge = edge_scans(5.0, 0.05)
+    changed = np.isfinite(thin.range) & np.isfinite(wide.range)
+    changed[changed] = np.abs(thin.range[changed] - wide.range[changed]) > 0.3
+    assert changed.sum() > 0 and not (changed & ~edge & (thin.range < 30.0)).any()
+    np.testing.assert_array_equal(thin.range[~edge & (thin.range < 12.0)], wide.range[~edge & (thin.range < 12.0)])

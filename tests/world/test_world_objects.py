@@ -1,0 +1,191 @@
+"""Objects of the street: as many as configured, each at a place of its own at all times."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.demo_worlds import SENSOR_SETTINGS, SMALL, named, pose_at, recorder_of, world_of
+from helpers.ground_rectangles import EGO_CENTER, EGO_SIZE, gaps, meetings, rectangles
+from helpers.world_digests import digest
+
+from drivesplat.settings.world import WorldSettings
+from drivesplat.world.recorder import Recorder
+
+pytestmark = pytest.mark.slow
+
+EVERYTHING = {"pedestrians": 20, "bystanders": 6, "cyclists": 3, "dogs": 3}
+WORLDS = {
+    "default": {},
+    "others": {"random_seed": 1, "vehicles": 6, "parked": 16, **EVERYTHING},
+    "standing": {"random_seed": 2, "ego": "stands", "vehicles": 6, "parked": 16, **EVERYTHING},
+    "queue": {"random_seed": 3, "traffic": "queue", **EVERYTHING, "cyclists": 0},
+    "bend": {"random_seed": 4, "bend_deg": 35.0, "grade": 0.06, "vehicles": 4, "parked": 16, **EVERYTHING},
+}
+
+
+SLOW = ("standing", "bend")
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in WORLDS]
+)
+def recorder(request) -> Recorder:
+    return recorder_of(**WORLDS[request.param])
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [
+        {"vehicles": 0, "pedestrians": 0, "bystanders": 0, "cyclists": 0, "dogs": 0, "parked": 0},
+        {"vehicles": 1, "pedestrians": 2, "bystanders": 3, "cyclists": 1, "dogs": 2, "parked": 3},
+        {"vehicles": 6, "pedestrians": 24, "bystanders": 12, "cyclists": 4, "dogs": 4, "parked": 16},
+    ],
+)
+@pytest.mark.parametrize("ego", ["drives", "stands"])
+def test_the_street_has_the_configured_number_of_objects(counts, ego):
+    recorder = recorder_of(ego=ego, **counts)
+    names = [item.name for item in recorder.objects]
+    words = {"vehicles": "vehicle", "pedestrians": "pedestrian", "bystanders": "bystander", "cyclists": "cyclist",
+             "dogs": "dog", "parked": "parked"}  # fmt: skip
+    assert {key: sum(name.split()[0] == word for name in names) for key, word in words.items()} == counts
+    assert sum(item.attribute == "vehicle.parked" for item in recorder.objects) == counts["parked"]
+    assert recorder.street.leading == ("vehicle 0" if counts["vehicles"] else None)
+    assert len(set(names)) == len(names)
+
+
+def test_a_queue_takes_the_place_of_free_traffic():
+    recorder = recorder_of(traffic="queue", vehicles=0)
+    ahead = [item for item in recorder.objects if item.name.startswith("vehicle ")]
+    oncoming = [item for item in recorder.objects if item.name.startswith("oncoming ")]
+    assert (len(ahead), len(oncoming)) == (4, 8) and recorder.street.leading == "vehicle 0"
+    nose = recorder.ego_pose(4.0)[0, 3] + EGO_CENTER + EGO_SIZE[0] / 2
+    gap = pose_at(ahead[0], 4.0)[0, 3] - ahead[0].size[0] / 2 - nose
+    assert 3.0 < gap < 7.0, "at close range"
+
+
+def test_settings_of_sensors_and_light_leave_the_street_as_it_is():
+    """`recorder_of` shares a street among worlds that differ in them."""
+    other = {"night": True, "wet": True, "width": 64, "samples_per_pixel": 4, "cameras": ("CAM_BACK",),
+             "sweeps": ("LIDAR_TOP",), "image_hz": 20, "lidar_hz": 10, "readout_s": 0.02, "pose_noise": True,
+             "exposures": {"CAM_BACK": (1.1, 1.0, 0.9)}, "class_maps": True, "truth": {"lidar": True}}  # fmt: skip
+    assert set(other) == SENSOR_SETTINGS
+    worlds = world_of(key_frames=4), world_of(key_frames=4, lidar={"beams": 64, "spins": True}, **other)
+    assert len({digest(Recorder(world)) for world in worlds}) == 1
+
+
+def moved(rectangle: np.ndarray, x: float, y: float) -> np.ndarray:
+    return rectangle + np.array([[[x, y], [0.0, 0.0], [0.0, 0.0]]])
+
+
+def test_rectangles_apart_have_a_positive_gap_and_crossed_ones_none():
+    unit = np.array([[[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]]])
+    turned = np.array([[[3.0, 0.0], [0.7, 0.7], [-0.7, 0.7]]])
+    assert gaps(unit, moved(unit, 2.5, 0.0))[0] == pytest.approx(-1.5)
+    assert gaps(unit, moved(unit, 0.0, 2.5))[0] == pytest.approx(0.5)
+    assert gaps(unit, turned)[0] == pytest.approx(-0.4)
+    assert gaps(unit, moved(turned, 0.5, 0.0))[0] == pytest.approx(0.1)
+
+
+def test_objects_do_not_intersect(recorder):
+    assert meetings(recorder) == []
+
+
+def test_people_and_animals_avoid_lamps_bins_and_trees(recorder):
+    """None of them touches what stands on the sidewalk: scenery from ankle to shoulder height."""
+    scenery, road = named(recorder, "scenery").body.pieces[0], recorder.street.road
+    height = scenery.triangles[..., 2] - road.elevation(scenery.triangles[..., 0])
+    standing = scenery.triangles[((height > 0.15) & (height < 1.4)).any(axis=1) & (np.abs(height) < 4.0).all(axis=1)]
+    points = np.concatenate([standing.reshape(-1, 3), standing.mean(axis=1)])[:, :2]
+    assert len(points) > 500
+    seconds = np.arange(0.0, recorder.world.seconds, 0.2)
+    walkers = [item for item in recorder.objects if (item.category or "").startswith(("human", "animal"))]
+    for walker in walkers:
+        found = rectangles(walker, seconds)
+        near = points[((points > found[:, 0].min(axis=0) - 2.0) & (points < found[:, 0].max(axis=0) + 2.0)).all(axis=1)]
+        offset = near - found[:, :1]
+        inside = [
+            np.abs((offset * half[:, None]).sum(axis=2)) < (half**2).sum(axis=1)[:, None]
+            for half in (found[:, 1], found[:, 2])
+        ]
+        assert not (inside[0] & inside[1]).any(), walker.name
+
+
+@pytest.mark.parametrize("ego", ["drives", "stands"])
+def test_the_leading_car_leads(ego):
+    recorder = recorder_of(ego=ego)
+    leading = named(recorder, "vehicle 0")
+    for seconds in (0.0, 4.0, 9.5):
+        ahead = np.linalg.inv(recorder.ego_pose(seconds)) @ pose_at(leading, seconds)
+        assert ahead[0, 3] > 5.0 and abs(ahead[1, 3]) < 1.0
+
+
+@pytest.mark.parametrize("bend", [0.0, 35.0])
+def test_a_dog_leads_its_owner_by_a_step_and_a_half(bend):
+    recorder = recorder_of(dogs=2, pedestrians=4, bend_deg=bend)
+    for number in (0, 1):
+        dog, owner = (named(recorder, f"{kind} {number}") for kind in ("dog", "pedestrian"))
+        for seconds in (0.0, 3.0, 9.0):
+            to_owner = np.linalg.inv(pose_at(owner, seconds))
+            ahead = (to_owner @ pose_at(dog, seconds))[:3, 3]
+            assert ahead[0] == pytest.approx(1.4, abs=0.1) and abs(ahead[1]) < 0.05
+
+
+def test_cyclists_ride_on_the_road_and_people_beside_it():
+    recorder = recorder_of(cyclists=2, bystanders=2)
+    for item in recorder.objects:
+        side = abs(pose_at(item, 3.0)[1, 3])
+        if item.category == "vehicle.bicycle":
+            assert 2.5 < side < 3.7 and item.attribute == "cycle.with_rider"
+        if item.name.startswith("bystander"):
+            assert side > 9.0 and item.attribute == "pedestrian.standing"
+
+
+def test_bystanders_turn_where_they_stand():
+    item = named(recorder_of(bystanders=1), "bystander 0")
+    poses = item.poses(np.linspace(0.0, 9.0, 40))
+    assert np.ptp(poses[:, :3, 3], axis=0).max() == 0.0
+    yaw = np.degrees(np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])))
+    assert 60.0 < np.ptp(yaw) < 140.0
+
+
+def test_unoccluded_pedestrians_are_wholly_visible():
+    recorder = recorder_of(pedestrians=6, vehicles=0, parked=0, key_frames=8)
+    walkers = [number for number, item in enumerate(recorder.objects) if item.name.startswith("pedestrian")]
+    fractions = np.array([recorder.visible_fractions(index)[walkers] for index in (1, 4, 7)])
+    assert np.median(fractions[fractions > 0.0]) > 0.95
+
+
+def test_hidden_objects_are_not_visible_and_limbs_count():
+    """A van in front of a pedestrian hides them."""
+    recorder = recorder_of(pedestrians=6, parked=16, key_frames=8)
+    fractions = np.array([recorder.visible_fractions(index) for index in (1, 4)])
+    assert fractions.min() == 0.0 and fractions.max() == pytest.approx(1.0)
+
+
+def test_moving_objects_keep_their_length_scale(recorder):
+    """Rigid poses, speeds of vehicles, riders and walkers."""
+    limits = {"human.pedestrian.adult": 1.6, "vehicle.bicycle": 4.5, "vehicle.car": 14.0, "vehicle.truck": 14.0}
+    seconds = np.arange(0.0, recorder.world.seconds, 0.1)
+    for item in (item for item in recorder.objects if item.category in limits):
+        poses = item.poses(seconds)
+        turns = poses[:, :3, :3]
+        np.testing.assert_allclose(turns @ np.swapaxes(turns, 1, 2), np.tile(np.eye(3), (len(turns), 1, 1)), atol=1e-9)
+        steps = [np.linalg.norm(b - a) for a, b in pairwise(poses[:, :3, 3])]
+        assert max(steps) / 0.1 < limits[item.category], item.name
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("width", 10), ("pedestrians", 25), ("cyclists", 5), ("bend_deg", 61.0), ("grade", 0.2), ("readout_s", 0.2),
+     ("key_frame_hz", 5), ("image_hz", 15), ("lidar_hz", 15), ("lidar", {"beams": 16}), ("traffic", "jam"),
+     ("lidar", {"divergence_mrad": 11.0}), ("truth", {"lateral_m": [7.0]}), ("truth", {"cameras": ["LIDAR_TOP"]}),
+     ("cameras", ["CAM_TOP"]), ("exposures", {"CAM_FRONT": [0.0, 1.0, 1.0]})],
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(setting, value):
+    with pytest.raises(ValueError, match=setting):
+        WorldSettings(**{**SMALL, setting: value})
+
+
+def test_image_rates_are_multiples_of_the_key_frames():
+    with pytest.raises(ValueError, match=r"image_hz is 12, no multiple of key_frame_hz \(10\)"):
+        WorldSettings(key_frame_hz=10)

@@ -1,0 +1,256 @@
+"""The truth beside the demo world: depth, instances and classes of each key frame, from every viewpoint."""
+
+import numpy as np
+import pytest
+from helpers.demo_worlds import FRONT, meshes_at, named, recorder_of
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from drivesplat.readers.truth import Truth, TruthFrame, TruthView, read_truth
+from drivesplat.world.optics.imaging import WorldCamera
+from drivesplat.world.optics.raycast import NO_HIT
+from drivesplat.world.output.truth import TruthPlan, key_frames_of
+from drivesplat.world.recorder import Recorder, Viewpoint
+from drivesplat.world.shapes.mesh import SurfaceClass
+from drivesplat.world.tokens import instance_token
+
+KEY_FRAMES, WIDTH, HEIGHT = 6, 160, 90
+OFFSETS = {2.0: "left_2m", -2.0: "right_2m", 4.0: "left_4m"}
+
+
+@pytest.fixture(scope="module")
+def truth(demo_root) -> Truth:
+    return read_truth(demo_root / "truth/truth.json")
+
+
+@pytest.fixture(scope="module")
+def recorded(truth) -> TruthView:
+    found = truth.recorded("CAM_FRONT")
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module", params=[0, 3, 5])
+def index(request) -> int:
+    return request.param
+
+
+@pytest.fixture(params=OFFSETS)
+def lateral(request, truth) -> TruthView:
+    return next(view for view in truth.lateral("CAM_FRONT") if view.left_m == request.param)
+
+
+def png(root, frame: TruthFrame, kind: str) -> np.ndarray:
+    return np.asarray(Image.open(root / "truth" / getattr(frame, kind)))
+
+
+def time_of(index: int) -> int:
+    return index * 500_000 - 35_500
+
+
+def points_of(depth: np.ndarray, camera: WorldCamera) -> np.ndarray:
+    """The street coordinates (h, w, 3) of what each pixel's centre shows."""
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.intrinsics).T
+    in_camera = rays * np.where(np.isfinite(depth), depth, 0.0)[..., None]
+    return in_camera @ camera.pose[:3, :3].T + camera.pose[:3, 3]
+
+
+def test_truth_json_lists_every_view_and_key_frame(truth, demo_tables):
+    assert (truth.scene, truth.width, truth.height, truth.samples_per_pixel) == ("demo", WIDTH, HEIGHT, 1)
+    assert truth.leading == instance_token("demo", "vehicle 0") and truth.pattern is None and truth.scans == ()
+    views = [(view.camera, view.left_m, view.edit, view.without) for view in truth.views]
+    assert views == [("CAM_FRONT", left, None, None) for left in (0.0, *OFFSETS)] + [
+        ("CAM_FRONT", 0.0, None, truth.leading)
+    ]
+    images = [demo_tables.sample[i]["data"]["CAM_FRONT"] for i in range(KEY_FRAMES)]
+    for view in truth.views:
+        assert [frame.token for frame in view.frames] == images
+        assert [frame.key_frame for frame in view.frames] == list(range(KEY_FRAMES))
+
+
+def test_every_file_of_truth_json_is_there_in_the_images_size(truth, demo_root):
+    names = [
+        (kind, name)
+        for view in truth.views
+        for frame in view.frames
+        for kind in ("image", "depth", "instances", "classes")
+        if (name := getattr(frame, kind)) is not None
+    ]
+    assert {name for _, name in names} == {str(p.relative_to(demo_root / "truth")) for p in demo_root.rglob("*.png")
+                                           if "truth" in p.parts}  # fmt: skip
+    for kind, name in names:
+        with Image.open(demo_root / "truth" / name) as image:
+            mode = {"image": "RGB", "depth": "I;16"}.get(kind, "L")
+            assert (image.size, image.mode) == ((WIDTH, HEIGHT), mode), name
+
+
+def test_the_recorded_view_has_no_image_of_its_own_and_all_others_have(truth):
+    for view in truth.views:
+        own = not view.left_m and view.without is None
+        assert all((frame.image is None) == own for frame in view.frames)
+
+
+def test_instances_list_the_annotated_objects(truth, recorded, demo_root, demo_tables):
+    assert {instance["token"] for instance in demo_tables.instance} <= set(truth.instances.values())
+    shown = set()
+    for frame in recorded.frames:
+        shown |= set(np.unique(png(demo_root, frame, "instances")).tolist())
+    assert 0 in shown and len(shown) >= 6
+    assert {str(n) for n in shown - {0}} <= truth.instances.keys()
+
+
+def test_instance_pixels_show_the_listed_object(truth, recorded, demo_root, demo_recorder, index):
+    objects = demo_recorder.geometry(FRONT, time_of(index)).objects
+    shown = png(demo_root, recorded.frames[index], "instances")
+    numbers = {name: int(n) for n, name in truth.instances.items()}
+    for n, item in enumerate(demo_recorder.objects):
+        number = numbers.get(instance_token("demo", item.name), 0)
+        assert (number > 0) == (item.category is not None)
+        if number:
+            np.testing.assert_array_equal(shown == number, objects == n)
+
+
+def test_classes_agree_with_objects(truth, recorded, demo_root, demo_recorder, index):
+    frame = recorded.frames[index]
+    classes, instances = png(demo_root, frame, "classes"), png(demo_root, frame, "instances")
+    assert truth.classes == {str(int(c)): c.name.lower() for c in SurfaceClass}
+    assert {int(n) for n in np.unique(classes)} <= {int(n) for n in truth.classes}
+    expected = {"vehicle.bicycle": "cyclist", "vehicle": "vehicle", "human": "person", "animal": "animal",
+                "movable_object": "object"}  # fmt: skip
+    names = {int(n): token for n, token in truth.instances.items()}
+    categories = {instance_token("demo", item.name): item.category for item in demo_recorder.objects}
+    for number in set(np.unique(instances).tolist()) - {0}:
+        category = categories[names[number]]
+        word = expected.get(category) or expected[category.split(".")[0]]
+        assert {truth.classes[str(c)] for c in np.unique(classes[instances == number])} == {word}, category
+    scenery = {truth.classes[str(c)] for c in np.unique(classes[instances == 0])}
+    assert {"road", "sidewalk", "building", "sky"} <= scenery
+    assert not scenery & {"vehicle", "person", "cyclist", "animal"}
+
+
+def test_classes_of_the_ground_are_those_of_its_strips(recorded, demo_root, demo_recorder, index):
+    """By the distance from the centre line: the road up to 6.4 m, the sidewalk up to 10 m."""
+    frame, camera = recorded.frames[index], demo_recorder.camera(FRONT, time_of(index) * 1e-6)
+    depth = png(demo_root, frame, "depth") / 256.0
+    classes, points = png(demo_root, frame, "classes"), points_of(depth, camera)
+    low = (depth > 0) & (depth < 60) & (np.abs(points[..., 2]) < 0.02) & (png(demo_root, frame, "instances") == 0)
+    aside = np.abs(points[..., 1])
+    for near, far, name in ((0.0, 6.3, SurfaceClass.ROAD), (6.7, 9.9, SurfaceClass.SIDEWALK)):
+        found = classes[low & (aside > near) & (aside < far)]
+        assert len(found) > 20 and (found == name).mean() > 0.95
+
+
+def test_the_depth_image_decodes_to_metres(recorded, demo_root, demo_recorder, index):
+    found, decoded = (
+        demo_recorder.geometry(FRONT, time_of(index)),
+        png(demo_root, recorded.frames[index], "depth") / 256.0,
+    )
+    sky = found.objects == NO_HIT
+    assert (decoded[sky] == 0).all() and 0.02 < sky.mean() < 0.9
+    near = ~sky & (found.depth < 255.0)
+    assert np.abs(decoded[near] - found.depth[near]).max() <= 0.5 / 256 + 1e-6
+    assert (decoded[~sky & (found.depth > 256.0)] == 65535 / 256).all()
+    heights = points_of(decoded, demo_recorder.camera(FRONT, time_of(index) * 1e-6))[-10:, :, 2]
+    assert np.abs(np.median(heights)) < 0.02, "the lower rows show the road"
+
+
+def ego_to_global(tables, sample_data: str) -> np.ndarray:
+    pose = tables.get("ego_pose", tables.get("sample_data", sample_data)["ego_pose_token"])
+    matrix = np.eye(4)
+    w, x, y, z = pose["rotation"]
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), pose["translation"]
+    return matrix
+
+
+def test_camera_poses_agree_with_the_tables(recorded, demo_tables):
+    for frame in recorded.frames:
+        in_ego = np.linalg.inv(ego_to_global(demo_tables, frame.token)) @ np.array(frame.camera_to_global)
+        np.testing.assert_allclose(in_ego[:3, 3], [1.701, 0.016, 1.511], atol=1e-6)
+        assert in_ego[0, 2] > 0.999, "the camera looks ahead"
+
+
+def test_lateral_cameras_lie_to_the_left_and_turn_nowhere(lateral, recorded, demo_tables):
+    for frame, here in zip(lateral.frames, recorded.frames, strict=True):
+        left = ego_to_global(demo_tables, here.token)[:3, 1]
+        before, after = (np.array(f.camera_to_global) for f in (here, frame))
+        np.testing.assert_allclose(after[:3, 3] - before[:3, 3], lateral.left_m * left, atol=1e-9)
+        np.testing.assert_allclose(after[:3, :3], before[:3, :3], atol=1e-12)
+
+
+def stated_camera(frame: TruthFrame, recorded: TruthView, recorder: Recorder) -> WorldCamera:
+    """The camera that truth.json states, brought to the street by the known ego pose."""
+    here = recorder.camera(FRONT, time_of(frame.key_frame) * 1e-6)
+    stated = np.array(recorded.frames[frame.key_frame].camera_to_global)
+    pose = here.pose @ np.linalg.inv(stated) @ np.array(frame.camera_to_global)
+    return WorldCamera(here.intrinsics, here.seconds, pose[None], WIDTH, HEIGHT)
+
+
+def pixels_of(points: np.ndarray, camera: WorldCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column, row and depth (n,) of street points (n, 3)."""
+    to_camera = np.linalg.inv(camera.pose)
+    local = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    pixels = local @ camera.intrinsics.T
+    x, y = np.round(pixels[:, :2] / pixels[:, 2:]).astype(int).T
+    return x, y, local[:, 2]
+
+
+def test_lateral_depth_and_instances_agree_by_reprojection(lateral, recorded, demo_root, demo_recorder, index):
+    """What the recorded view sees lies at the same place of the street in the lateral view of the same time."""
+    frame, here = lateral.frames[index], recorded.frames[index]
+    camera = demo_recorder.camera(FRONT, time_of(index) * 1e-6)
+    decoded = png(demo_root, here, "depth") / 256.0
+    near = (decoded > 0) & (decoded < 100)
+    x, y, depth = pixels_of(points_of(decoded, camera)[near], stated_camera(frame, recorded, demo_recorder))
+    inside = (depth > 0) & (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+    there = png(demo_root, frame, "depth")[y[inside], x[inside]] / 256.0
+    error = np.abs(depth[inside] / np.where(there > 0, there, np.inf) - 1.0)
+    same = error < 0.05
+    assert inside.sum() > 2500
+    assert np.median(error) < 0.01 and same.mean() > 0.5, "a near object hides the rest"
+    for kind, share in (("instances", 0.97), ("classes", 0.93)):
+        a, b = png(demo_root, here, kind)[near][inside], png(demo_root, frame, kind)[y[inside], x[inside]]
+        assert (a == b)[same].mean() > share, kind
+        moved = png(demo_root, here, kind) != png(demo_root, frame, kind)
+        assert moved.mean() > 0.02, "the view is another one"
+
+
+def test_the_lateral_image_is_seen_from_its_stated_pose(lateral, demo_root, demo_recorder, index):
+    found = png(demo_root, lateral.frames[index], "image")
+    view = Viewpoint(left=lateral.left_m)
+    expected = demo_recorder.to_bytes(demo_recorder.picture(FRONT, time_of(index), view).radiance, FRONT, 0)
+    np.testing.assert_array_equal(found, expected)
+    assert (found != demo_recorder.image(FRONT, time_of(index))).any(axis=2).mean() > 0.3
+
+
+def test_the_view_without_the_leading_vehicle_shows_all_others(truth, recorded, demo_root, index):
+    number = next(int(n) for n, token in truth.instances.items() if token == truth.leading)
+    frame, here = truth.without_leading("CAM_FRONT").frames[index], recorded.frames[index]
+    before, after = (png(demo_root, f, "instances") for f in (here, frame))
+    own = before == number
+    assert own.sum() > 100 and not (after == number).any()
+    np.testing.assert_array_equal(before[~own], after[~own])
+    depths = [png(demo_root, f, "depth").astype(float) for f in (here, frame)]
+    np.testing.assert_array_equal(depths[0][~own], depths[1][~own])
+    behind = np.where(depths[1] == 0, np.inf, depths[1])
+    assert (behind[own] >= depths[0][own]).all()
+
+
+def test_key_frames_at_which_the_camera_would_be_inside_an_object_are_left_out():
+    """4 m to the left is the lane of the oncoming vehicle, which passes the ego vehicle after five seconds."""
+    recorder = recorder_of(key_frame_hz=10, image_hz=10, key_frames=80, pedestrians=0, parked=0)
+    aside, oncoming = Viewpoint(left=4.0), named(recorder, "vehicle 1")
+    kept = key_frames_of(recorder, TruthPlan(FRONT, aside, ""))
+    inside, near = [], []
+    for index in range(80):
+        seconds = index * 0.1 - 0.0355
+        pose = recorder.ego_pose(seconds)
+        center = (pose @ FRONT.sensor_to_ego)[:3, 3] + 4.0 * pose[:3, 1]
+        corners = meshes_at(oncoming, seconds).reshape(-1, 3)  # it drives along x, so its box is upright
+        beyond = np.maximum(corners.min(axis=0) - center, center - corners.max(axis=0)).max()
+        inside += [index] if beyond < 0.0 else []
+        near += [index] if beyond < 0.25 else []
+    assert near and not set(kept) & {*inside, *near}
+    assert len(kept) >= 80 - len(near) - 2, "no others but those"
+    assert key_frames_of(recorder, TruthPlan(FRONT, Viewpoint(), "")) == list(range(80))
+    assert key_frames_of(recorder, TruthPlan(FRONT, Viewpoint(without="vehicle 1", left=4.0), "")) == list(range(80))
