@@ -1,1 +1,1 @@
-"""Films and frames of trained models: camera paths, panels, captions, the encoder."""
+"""Films and frames of trained models: panels, captions, the encoder."""

@@ -1,4 +1,5 @@
-"""Poses over time after an edit: paths of objects and of the ego vehicle, the steps that change them, and samples.
+"""Every pose over time: motions of tracks, paths of cameras and of the ego vehicle, and what the steps of an edit
+make of them.
 
 Plain arrays and records: it imports no model and renders nothing.
 """
