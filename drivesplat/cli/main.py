@@ -6,17 +6,21 @@ Each command imports what it needs: `--help` is fast.
 """
 
 import argparse
+import os
+import signal
+import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from drivesplat import WORKFLOW
+from drivesplat import SNAKEFILE, WORKFLOW
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
-from drivesplat.io.this_copy import in_this_copy
+from drivesplat.io.this_copy import in_this_copy, of_the_workflow
 
 RUN = "run"
+BROUGHT_ALONG = ("presets/", "profiles/")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,8 +29,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _require_folder()
         if given[:1] == [RUN]:  # all the rest is Snakemake's
-            from drivesplat.cli.snakemake_run import run_workflow
-
             return run_workflow(given[1:])
         parsed = _parser().parse_args(given)
         with standard_output():
@@ -84,9 +86,14 @@ def _version() -> str:
 
 
 def _demo(parsed: argparse.Namespace) -> int:
-    from drivesplat.cli.snakemake_run import run_demo
+    """Runs the whole workflow on the demo world and prints its figures."""
+    status = run_workflow(["--cores", parsed.cores, "--configfile", "presets/demo.yaml", "--", "all"])
+    if status == 0:
+        from drivesplat.cli.viewer import results_folder
+        from drivesplat.evaluation.summary import print_summary
 
-    return run_demo(parsed.cores)
+        print_summary(results_folder() / "demo" / "metrics.json")
+    return status
 
 
 def _open(parsed: argparse.Namespace) -> int:
@@ -113,3 +120,27 @@ def _setup(_: argparse.Namespace) -> int:
 def _config(parsed: argparse.Namespace) -> int:
     print((WORKFLOW / ("docs/settings.md" if parsed.all else "config.yaml")).read_text(encoding="utf-8"), end="")
     return 0
+
+
+def snakemake_command(arguments: Sequence[str]) -> list[str]:
+    """The command line of Snakemake for the workflow of this copy. Presets and profiles that it brings along are found
+    from any folder; the default profile is that beside the Snakefile, unless the current folder has one."""
+    found = [_found(argument) for argument in arguments]
+    return [sys.executable, "-m", "snakemake", "--snakefile", str(SNAKEFILE), *found]
+
+
+def _found(argument: str) -> str:
+    """An argument, also of the form `--option=value`, with the path of what the workflow brings along."""
+    option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+    return f"{option}{equals}{of_the_workflow(value)}" if value.startswith(BROUGHT_ALONG) else argument
+
+
+def run_workflow(arguments: Sequence[str]) -> int:
+    """Runs Snakemake with the `arguments`. Returns its exit status."""
+    # the current folder is no place to import from: it may be another copy's checkout
+    process = subprocess.Popen(snakemake_command(arguments), env={**os.environ, "PYTHONSAFEPATH": "1"})
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Snakemake gets it, too, and ends its jobs first
+    try:
+        return process.wait()
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -11,9 +11,8 @@ import yaml
 from helpers import REPOSITORY
 
 from drivesplat import SNAKEFILE, WORKFLOW
-from drivesplat.cli import snakemake_run
-from drivesplat.cli.main import main
-from drivesplat.cli.snakemake_run import snakemake_command
+from drivesplat.cli import main as command_line
+from drivesplat.cli.main import main, snakemake_command
 from drivesplat.cli.viewer import chosen_page, exported_pages, results_folder
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation import summary
@@ -40,7 +39,7 @@ def called(monkeypatch) -> list[list[str]]:
         def wait(self) -> int:
             return 0 if "fails" not in calls[-1] else 7
 
-    monkeypatch.setattr(snakemake_run.subprocess, "Popen", Process)
+    monkeypatch.setattr(command_line.subprocess, "Popen", Process)
     return calls
 
 
@@ -73,7 +72,7 @@ def test_demo_runs_everything_and_prints_the_figures(called, folder, monkeypatch
     assert called == [["--cores", "3", "--configfile", demo, "--", "all"]] and printed == [
         Path("mine/demo/metrics.json")
     ]
-    monkeypatch.setattr(snakemake_run, "run_workflow", lambda _: 3)
+    monkeypatch.setattr(command_line, "run_workflow", lambda _: 3)
     assert main(["demo"]) == 3 and len(printed) == 1, "no figures of a demo that has failed"
 
 
