@@ -1,13 +1,21 @@
 """The report as files (HTML page, JSON record and CSV table), and as text for the console."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import markdown
+from markupsafe import Markup
+from snakemake.common import get_report_id
+from snakemake.iocontainers import FILE_HASH_PREFIX_LEN
+
+from drivesplat import WORKFLOW
+from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
+from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import atomic_write, write_json
-from drivesplat.report.archive import address_in_archive
+from drivesplat.report import ghosts_page
 from drivesplat.report.gaps import gap_report, summary_sentences
-from drivesplat.report.ghosts import render_ghosts_page
 from drivesplat.report.html import report_page
 from drivesplat.report.media import collect_media
 from drivesplat.report.tables import (
@@ -22,6 +30,9 @@ from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
 from drivesplat.workflow.report_plan import REPORT_FILES
+
+_LINK = re.compile(r"\[([^\]\n]+)\]\((?!https?:)[^)\s]+\)")
+"""A link to another document, which the page does not come with."""
 
 
 def write_report(
@@ -64,3 +75,17 @@ def console_table(report: dict[str, Any]) -> str:
     tables = [gap_table(report), "Whole images", whole_image_table(report)] if report["rows"] else []
     more = [*aside_tables(report), *lidar_tables(report), *published_tables(report)]
     return "\n".join([title, *tables, *more, *summary_sentences(report), *notes])
+
+
+def address_in_archive(result: Path) -> str:
+    """The address of a result, marked `report` in its rule, from a page beside it in the archive. `result` is the path
+    that its rule declares, relative to the working folder."""
+    return f"../{get_report_id(result)[:FILE_HASH_PREFIX_LEN]}/{result.name}"
+
+
+def render_ghosts_page(document: Path | None = None) -> str:
+    """The page; `document` is by default that of the workflow. Without it, the page names the published fixes only."""
+    document = document or WORKFLOW / GHOSTS_DOCUMENT
+    text = document.read_text(encoding="utf-8") if document.is_file() else ""
+    content = markdown.markdown(_LINK.sub(r"\1", text), extensions=["tables", "sane_lists"])
+    return filled_page(ghosts_page, fixes=PUBLISHED_FIXES, document=GHOSTS_DOCUMENT, content=Markup(content))

@@ -27,12 +27,11 @@ from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, built, default_methods, merged
-from drivesplat.settings.names import require_name, suggestion
+from drivesplat.settings.names import ResultsFolder, require_name, suggestion
 from drivesplat.settings.published import PublishedFigures
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.removed import in_this_version, refuse_removed
 from drivesplat.settings.render import RenderSettings
-from drivesplat.settings.results_folder import ResultsFolder
 from drivesplat.settings.scans import ScanSettings
 from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.visuals import GhostSettings, RemovalSettings, SubjectSettings

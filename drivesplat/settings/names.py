@@ -1,9 +1,14 @@
-"""Checks of names: scenes, methods and datasets name folders, and scene numbers need quotes in YAML."""
+"""Checks of names: scenes, methods and datasets name folders, scene numbers need quotes in YAML, and results have a
+folder of their own."""
 
+import os
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
 
 from drivesplat.settings import not_text, quoted
 from drivesplat.settings.tracks import OTHER_TRACKS
@@ -40,3 +45,23 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     padded = [other for other in names if name and other.lstrip("0") == name.lstrip("0")]
     found = [*padded, *get_close_matches(name, names, n=1)]
     return f"did you mean {found[0]}? " if found else ""
+
+
+def _usable_folder(given: str) -> str:
+    """The folder with ~ expanded and without '.', '..' and '/' that change nothing. Raises ValueError where Snakemake
+    could not use it."""
+    if "://" in given:
+        raise ValueError("results are files of this machine; name a folder, and copy it afterwards")
+    if not given.isprintable() or set(given) & set("{}<>*?[]\\"):
+        raise ValueError("a folder's name cannot hold { } < > * ? [ ] \\ or control characters here")
+    try:
+        folder = os.path.normpath(Path(given).expanduser())
+    except RuntimeError:
+        raise ValueError("there is no such home folder; write the path in full") from None
+    if folder in (".", "/") or Path(folder).name == "..":
+        raise ValueError("results need a folder of their own; name one, as in results/first")
+    return folder
+
+
+ResultsFolder = Annotated[str, Field(min_length=1), AfterValidator(_usable_folder)]
+"""A folder for results, relative to the working directory or absolute."""

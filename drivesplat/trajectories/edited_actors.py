@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import ConfigError
 from drivesplat.scene.track_references import why_fixed
@@ -12,7 +13,6 @@ from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, 
 from drivesplat.trajectories.actor_path import ActorPath, recorded_path
 from drivesplat.trajectories.motion import Motion
 from drivesplat.trajectories.placed_path import placed_motion
-from drivesplat.trajectories.recolouring import color_matrix
 from drivesplat.trajectories.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
 
 MIN_DISTANCE = 0.5
@@ -21,6 +21,10 @@ LOOKAHEAD = 60.0
 """Seconds past the end of a track in which that distance counts."""
 ORIGIN = np.eye(4)[None]
 """The ego pose of a drive that begins at the world's origin."""
+GREY_AXIS = np.full(3, 1.0 / np.sqrt(3.0))
+"""The direction of greys."""
+TO_GREY = np.full((3, 3), 1.0 / 3.0)
+"""Maps a colour to the grey of its mean."""
 
 
 @dataclass(frozen=True)
@@ -203,3 +207,16 @@ def _copied(state: _EditState, actor: EditedActor, copy: Duplicate | Place, path
     if copy.name in state.other_ids:
         raise _StepError(f"the name {copy.name!r} in 'as' is the id of another track; choose another name")
     return state.with_actors(replace(actor, id=copy.name, path=path, edited=True, phase=actor.phase + copy.phase))
+
+
+def color_matrix(change: Recolour) -> np.ndarray:
+    """The matrix (3, 3) that maps RGB colours, as images encode them, to those after a step.
+
+    A linear map applies to every spherical harmonic and to every coefficient of a colour that varies with time, so that
+    shading and highlights stay. The hue is therefore a rotation about the axis of greys, which equals that of HSV for
+    rotations by multiples of 120 degrees, and the saturation is the distance from that axis.
+    """
+    if change.colour is not None:
+        return change.value * np.outer(change.colour, TO_GREY[0])
+    turn = Rotation.from_rotvec(np.radians(change.hue) * GREY_AXIS).as_matrix()
+    return change.value * (TO_GREY + change.saturation * turn @ (np.eye(3) - TO_GREY))

@@ -2,21 +2,22 @@
 
 import logging
 import multiprocessing
+import shutil
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
 
+from drivesplat.errors import ResultError
 from drivesplat.io.storage import Provenance, atomic_write, canonical_json, sha256_text
 from drivesplat.readers.truth import TruthFrame, TruthScan, TruthView
+from drivesplat.scene.images import write_png
 from drivesplat.settings.world import WorldJob, WorldSettings
 from drivesplat.world.marker import prepare_folder
 from drivesplat.world.optics.rig import RigSensor, image_height, key_frame_time, recording_sensors, trigger_times
-from drivesplat.world.output.class_maps import write_class_maps
-from drivesplat.world.output.disk_space import require_space, world_bytes
 from drivesplat.world.output.tables import NuScenesTables
 from drivesplat.world.output.truth import (
     ScanPlan,
@@ -30,6 +31,7 @@ from drivesplat.world.output.truth import (
 )  # fmt: skip
 from drivesplat.world.placed import require_free_places
 from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
+from drivesplat.world.shapes.mesh import SurfaceClass
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +39,13 @@ START_US = 1_767_225_600_000_000
 ANNOTATED_RANGE = 80.0
 """Objects farther from the ego vehicle than this (metres) have no box."""
 JPEG_QUALITY = 95
+SEMANTIC, SKY = "semantic", "sky"
+"""Folders below the dataset's root."""
+UNLABELLED = 255
+JPEG_BYTES, TRUTH_BYTES, CLASS_BYTES = 0.45, 2.6, 0.06
+"""Bytes per pixel: of an image, of all images of a true view, of the class and sky maps of an image."""
+SWEEP_BYTES, SCAN_BYTES = 600_000, 250_000
+"""Bytes of a sweep of 32 beams, and of its truth."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +164,14 @@ def _write_file(file: SensorFile) -> np.ndarray | None:
     return None
 
 
+def write_class_maps(root: Path, camera: str, image: str, classes: np.ndarray) -> None:
+    """Writes the maps of an image from its `classes` (h, w). The sky is 255 in its map and unlabelled in the class map:
+    it has no Gaussians."""
+    sky, name = classes == SurfaceClass.SKY, f"{camera}/{PurePosixPath(image).stem}.png"
+    write_png(root / SKY / name, np.where(sky, 255, 0).astype(np.uint8))
+    write_png(root / SEMANTIC / name, np.where(sky, UNLABELLED, classes).astype(np.uint8))
+
+
 def _visible_fractions(index: int) -> np.ndarray:
     return _worker[0].visible_fractions(index)
 
@@ -167,3 +184,22 @@ def _write_frame(plan: TruthPlan, index: int) -> TruthFrame:
 def _write_scan(plan: ScanPlan, index: int) -> TruthScan:
     recorder, root = _worker
     return write_scan(root, recorder, plan, index)
+
+
+def world_bytes(world: WorldSettings, images: int, sweeps: int, views: int, scans: int) -> int:
+    """The approximate size in bytes of a world of so many images and sweeps, and of true views and scans, which are
+    written for each key frame."""
+    pixels, rays = world.width * image_height(world.width), world.lidar.beams / 32
+    per_image = JPEG_BYTES + (CLASS_BYTES if world.class_maps else 0.0)
+    recorded = images * pixels * per_image + sweeps * SWEEP_BYTES * rays
+    return round(recorded + world.key_frames * (views * pixels * TRUTH_BYTES + scans * SCAN_BYTES * rays))
+
+
+def require_space(root: Path, needed: int) -> None:
+    """Raises ResultError, one line, where the file system of `root` has less free space than `needed` bytes."""
+    free = shutil.disk_usage(root).free
+    if needed > free:
+        raise ResultError(
+            f"{root}: the world takes about {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; free some space, set "
+            "another datasets.<name>.dataroot, or make the world smaller (width, key_frames, cameras)"
+        )

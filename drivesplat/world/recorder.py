@@ -1,10 +1,11 @@
 """Recordings of the street: images, LiDAR sweeps, visibility, and the poses and boxes of the tables."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from drivesplat.scene.images import project
@@ -16,7 +17,7 @@ from drivesplat.world.optics.lidar import ScanPattern, StreetScan, returns, scan
 from drivesplat.world.optics.lighting import Light, daylight, lamplight
 from drivesplat.world.optics.raycast import RayCaster, StreetRays, StreetSnapshot
 from drivesplat.world.optics.rig import SENSORS, RigSensor, image_height, key_frame_time, recording_sensors
-from drivesplat.world.shapes.surface_points import SurfacePoints
+from drivesplat.world.shapes.mesh import ColoredMesh
 from drivesplat.world.street.edited import Variation, edited
 from drivesplat.world.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject
 from drivesplat.world.street.street import build_street
@@ -25,6 +26,8 @@ from drivesplat.world.tokens import instance_token
 STREET_TO_GLOBAL = rigid(Rotation.from_euler("z", 0.62).as_matrix(), np.array([812.4, 1437.9, 0.0]))
 """Far from the origin, as in nuScenes."""
 NIGHT_NOISE = 0.012
+SURFACE_POINTS = 60
+"""Number of points on the surface of a body, by which its visibility is counted."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,32 @@ class Viewpoint:
 
 
 RECORDED = Viewpoint()
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on the surface of a body of rigid pieces: the piece of each (n,), and its place (n, 3) in the piece's
+    frame."""
+
+    pieces: np.ndarray
+    places: np.ndarray
+
+    @classmethod
+    def of(cls, meshes: Sequence[ColoredMesh]) -> "SurfacePoints":
+        """SURFACE_POINTS points on a body of these pieces, spread evenly by area."""
+        triangles = [mesh.triangles for mesh in meshes]
+        pieces = np.repeat(np.arange(len(triangles)), [len(own) for own in triangles])
+        corners = np.concatenate(triangles).reshape(-1, 3)
+        mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+        places, faces = trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)
+        return cls(pieces[faces], np.asarray(places))
+
+    def __len__(self) -> int:
+        return len(self.pieces)
+
+    def at(self, poses: np.ndarray) -> np.ndarray:
+        """The points (n, 3) where the pieces have `poses` (pieces, 4, 4)."""
+        return np.einsum("nij,nj->ni", poses[self.pieces, :3, :3], self.places) + poses[self.pieces, :3, 3]
 
 
 class Recorder:

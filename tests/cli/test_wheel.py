@@ -98,7 +98,7 @@ def test_an_installed_copy_plans_the_demo_in_an_empty_folder(site, tmp_path):
 
 def test_an_installed_copy_has_its_pages_and_document(site, tmp_path):
     code = (
-        "from drivesplat.report.ghosts import render_ghosts_page; from drivesplat import IS_CHECKOUT; "
+        "from drivesplat.report.files import render_ghosts_page; from drivesplat import IS_CHECKOUT; "
         "from drivesplat.io.html_page import filled_page; from drivesplat.export import viewer_page; "
         "assert not IS_CHECKOUT and '<h2' in render_ghosts_page(); print('made')"
     )

@@ -31,8 +31,7 @@ from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit, Recolour
 from drivesplat.settings.render import FilmFormat, TrajectorySettings
 from drivesplat.trajectories.camera_path import film_path
-from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
-from drivesplat.trajectories.recolouring import color_matrix
+from drivesplat.trajectories.edited_actors import EditedActor, color_matrix, edited_actors
 
 LAST = 4.5
 """The tiny drive's first image is at 0, its last at this second."""

@@ -6,8 +6,7 @@ import torch
 from helpers.hand_made import recording_of, round_gaussians
 from helpers.rig_drives import rig_drive
 
-from drivesplat.evaluation.image_metrics import evaluate_groups
-from drivesplat.evaluation.overlaps import overlap_masks, seen_by_others
+from drivesplat.evaluation.image_metrics import evaluate_groups, overlap_masks, seen_by_others
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.evaluation_data import EvaluationData

@@ -34,8 +34,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drivesplat.export.trained_parts import SampledGroup
-from drivesplat.export.viewer import viewer_page
-from drivesplat.export.viewer_images import key_frame_images
+from drivesplat.export.viewer import key_frame_images, viewer_page
 from drivesplat.export.viewer_scene import ViewerContent
 from drivesplat.model.gaussians import Gaussians, concatenate, recolored
 from drivesplat.scene.images import read_image

@@ -5,7 +5,7 @@ import pytest
 from helpers.street_scans import Mover, street_scans
 
 from drivesplat.lidar.ground import GroundMap
-from drivesplat.lidar.objects.ground import MAX_SCANS, ground_of
+from drivesplat.lidar.objects.discover import GROUND_SCANS, ground_of
 
 SECONDS = 0.1 * np.arange(31)
 
@@ -38,7 +38,7 @@ def test_where_nothing_was_returned_the_ground_is_unknown():
 
 def test_long_drives_are_sampled_from_begin_to_end():
     """Places near the first and the last scan are known, however many scans there are."""
-    seconds = 0.05 * np.arange(MAX_SCANS + 40)
+    seconds = 0.05 * np.arange(GROUND_SCANS + 40)
     ground = ground_below(seconds=seconds, speed=20.0)
     for ahead in (5.0, 20.0 * seconds[-1] + 15.0):
         assert ground.height(np.array([ahead, 2.0])) == pytest.approx(0.0, abs=0.05)

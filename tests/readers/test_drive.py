@@ -24,8 +24,8 @@ from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.readers.drive.__main__ import main
+from drivesplat.readers.drive.check import seen_from_above
 from drivesplat.readers.drive.format import Drive, DriveTrack
-from drivesplat.readers.drive.from_above import seen_from_above
 from drivesplat.readers.drive.layout import camera_names, find_root
 from drivesplat.readers.drive.reader import chosen_recordings, max_track_gap, read
 from drivesplat.readers.drive.write import write_drive

@@ -4,7 +4,7 @@ from helpers import REPOSITORY
 from helpers.archives import addresses
 
 from drivesplat.evaluation.published_fixes import PUBLISHED_FIXES
-from drivesplat.report.ghosts import render_ghosts_page
+from drivesplat.report.files import render_ghosts_page
 
 
 def test_the_page_has_the_document_without_links_to_other_documents():

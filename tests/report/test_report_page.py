@@ -15,9 +15,8 @@ from PIL import Image
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_json
 from drivesplat.report.gaps import gap_report
-from drivesplat.report.html import report_page
+from drivesplat.report.html import gap_plot, report_page
 from drivesplat.report.media import MAX_WIDTH, collect_media, data_url, difference_position, read_image
-from drivesplat.report.plot import gap_plot
 from drivesplat.scene.images import write_png
 from drivesplat.settings.report import PICTURES
 

@@ -5,9 +5,8 @@ import pytest
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.edit import Edit, Recolour
-from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.trajectories.edited_actors import EditedActor, color_matrix, edited_actors
 from drivesplat.trajectories.motion import Motion
-from drivesplat.trajectories.recolouring import color_matrix
 
 IDS = ("6e5c0000aaaa", "6e7d0000bbbb", "91ab0000cccc")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivesplat.settings.edit import Recolour
-from drivesplat.trajectories.recolouring import color_matrix
+from drivesplat.trajectories.edited_actors import color_matrix
 
 PAINTS = np.array([[0.8, 0.2, 0.1], [0.1, 0.3, 0.6], [0.5, 0.5, 0.5], [0.9, 0.9, 0.2]])
 

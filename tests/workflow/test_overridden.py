@@ -6,7 +6,7 @@ from helpers import REPOSITORY
 from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.settings.config import load, merged
-from drivesplat.workflow.overridden import without_effect
+from drivesplat.workflow.costs.run_costs import without_effect
 
 DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
 DEMO, REAL = [("demo", ""), ("demo", "vanilla"), ("demo", "street")], [("0061", "vanilla"), ("0061", "street")]

@@ -23,8 +23,7 @@ from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.scans import ScanSettings, ScansJob
-from drivesplat.world.generate import make_world
-from drivesplat.world.output.disk_space import world_bytes
+from drivesplat.world.generate import make_world, world_bytes
 from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
 
 pytestmark = pytest.mark.slow

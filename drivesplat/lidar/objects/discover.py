@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+from drivesplat.lidar.ground import GroundMap
 from drivesplat.lidar.objects.boxes import Discovered, fitted_box
 from drivesplat.lidar.objects.clusters import Chain, Cluster, chains_of, clusters_of
 from drivesplat.lidar.objects.ends import Ends
-from drivesplat.lidar.objects.ground import ground_of
 from drivesplat.lidar.objects.merging import merged, united
 from drivesplat.lidar.objects.seen_empty import seen_empty
 from drivesplat.lidar.objects.separation import separated
@@ -42,6 +42,11 @@ MAX_SEPARATIONS = 8
 """Rounds in which boxes and the returns that belong to them are found by turns."""
 Boxed = tuple[Chain, Discovered]
 """A chain and its box."""
+GROUND_REACH = 40.0
+"""Metres from the sensor within which returns count for the map of the ground: far ahead the beams pass above and below
+the road. The vehicle comes there later, and sees it from near."""
+GROUND_SCANS = 100
+"""Number of scans, evenly spaced, that are enough for that map."""
 
 
 def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
@@ -200,3 +205,15 @@ class Surroundings:
 def _blind_range(scan: RecordedScan) -> float:
     """The range in metres below which returns are not measured, as they are of the ego vehicle; 0 if there are none."""
     return float(scan.scan.ranges[scan.scan.returned & ~scan.measured].max(initial=0.0))
+
+
+def ground_of(scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " _"]]) -> GroundMap:
+    """The map of the ground by the measured returns of scans without those that are `moving`, an array for each
+    scan."""
+    chosen = np.unique(np.linspace(0, len(scans) - 1, GROUND_SCANS).round().astype(int))
+    return GroundMap(np.concatenate([_near_sensor(scans[k], moving[k]) for k in chosen]))
+
+
+def _near_sensor(scan: RecordedScan, moving: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m 3"]:
+    points = scan.points()[~moving]
+    return points[np.linalg.norm(points - scan.sensor_to_world[:3, 3], axis=1) < GROUND_REACH]

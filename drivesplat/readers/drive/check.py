@@ -12,7 +12,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, Drive, structure_of
-from drivesplat.readers.drive.from_above import seen_from_above
 from drivesplat.readers.drive.reader import scene_of
 from drivesplat.readers.drive.sweep_file import columns_sentence
 from drivesplat.readers.image_file import image_fault
@@ -22,6 +21,7 @@ from drivesplat.scene.images import continuous_intrinsics, project, read_image
 from drivesplat.scene.regions import hulls_in
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep
+from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.extract import SceneSource
 
 WIDTH, MAX_WIDTH, FONT = 960, 1920, 14
@@ -36,6 +36,12 @@ OTHER_TIMES = (-1_500_000, 1_500_000)
 """Microseconds from an image to the sweeps that test the poses."""
 SCALE_STEPS = 6
 """Colours in the legend of distances."""
+SIDE_DISTANCE = 50.0
+"""Metres from the LiDAR to the sides of a picture from above."""
+COLORED_HEIGHTS = -2.0, 4.0
+"""Metres relative to the LiDAR at which the colour of returns begins and ends."""
+FOOTPRINT = (0, 2, 6, 4)
+"""The lower corners of a box in order, as indices of `Box.corners`."""
 
 
 class Examined(NamedTuple):
@@ -200,3 +206,30 @@ def _draw_returns(draw: ImageDraw.ImageDraw, points: np.ndarray, frame: Frame, s
 def _color(share: float) -> tuple[int, int, int]:
     """The colour of a distance, as a share of MAX_DEPTH."""
     return int(255 * (1 - share)), int(255 * min(1.0, 2 * share)), int(255 * share)
+
+
+def seen_from_above(scene: Scene, width: int) -> Image.Image:
+    """The middle sweep in a square picture of `width` pixels, x of the world to the right and y up: returns coloured by
+    height, boxes outlined."""
+    image = Image.new("RGB", (width, width))
+    draw, sweep = ImageDraw.Draw(image), sorted(scene.sweeps, key=lambda sweep: sweep.timestamp)[len(scene.sweeps) // 2]
+    center = sweep.sensor_to_world[:3, 3]
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        return (points[:, :2] - center[:2]) * [1, -1] * width / (2 * SIDE_DISTANCE) + width / 2
+
+    if sweep_fault(sweep) is None:
+        points = apply(sweep.sensor_to_world, read_returns(sweep).points)
+        low, high = COLORED_HEIGHTS
+        shares = np.clip((points[:, 2] - center[2] - low) / (high - low), 0.0, 1.0)
+        colors = (255 * np.stack([shares, np.minimum(1.0, 2 * (1 - shares)), 1 - shares], axis=1)).astype(np.uint8)
+        at = np.floor(pixels(points)).astype(np.int64)
+        inside = ((at >= 0) & (at < width)).all(axis=1)
+        canvas = np.zeros((width, width, 3), dtype=np.uint8)
+        canvas[at[inside, 1], at[inside, 0]] = colors[inside]
+        image.paste(Image.fromarray(canvas))
+    for box in boxes_at(scene, sweep.timestamp):
+        corners = pixels(box.corners[list(FOOTPRINT)])
+        draw.polygon([tuple(corner) for corner in corners], outline=(255, 90, 0), width=2)
+    draw.text((8, 8), f"{sweep.lidar} at {sweep.timestamp}, {2 * SIDE_DISTANCE:g} m wide", fill=(255, 255, 255))
+    return image

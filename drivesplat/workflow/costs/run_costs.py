@@ -5,11 +5,13 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import DriveSplatError
+from drivesplat.io.storage import leaves
+from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.costs.estimate import (
     Estimate,
     Expectations,
@@ -23,7 +25,6 @@ from drivesplat.workflow.costs.measured import BENCHMARKS, JobId, read_costs
 from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
 from drivesplat.workflow.named_tracks import edits_left_out
-from drivesplat.workflow.overridden import without_effect
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.snakemake_records import drop_foreign_records
 from drivesplat.workflow.without_cameras import methods_left_out
@@ -133,3 +134,27 @@ def planned_job(name: JobId, job: Any) -> PlannedJob:
 
 def _say(line: str) -> None:
     print(f"drivesplat: {line}", file=sys.stderr, flush=True)
+
+
+def without_effect(config: Config, places: Iterable[tuple[str, str]]) -> list[str]:
+    """One sentence for every setting that is not at its default and that an override replaces in one of `places`: pairs
+    of a scene and a method, or of a scene and an empty name. Overrides of ablation variants are not reported."""
+    given, defaults = leaves(config.model_dump()), leaves(Config().model_dump())
+    changed = {key: value for key, value in given.items() if defaults.get(key) != value}
+    if not changed:
+        return []
+    sentences: dict[str, None] = {}
+    scenes = {(config.dataset_of(scene), method): scene for scene, method in places if scene in config.dataset_names}
+    for (dataset, method), scene in sorted(scenes.items()):
+        below = given
+        layers = [("dataset", dataset, for_scene(config, scene))]
+        if method in config.methods:
+            layers.append(("method", method, for_scene(config, scene, method)))
+        for kind, name, there in layers:
+            used = leaves(there.model_dump())
+            for key, value in changed.items():
+                if used.get(key, value) not in (value, below.get(key)):
+                    where = f"{kind}s.{name}.overrides.{key}"
+                    sentences[f"{key}: {value} does not hold for {kind} {name}, where {where} is {used[key]}"] = None
+            below = used
+    return list(sentences)
