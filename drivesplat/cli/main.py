@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import webbrowser
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,10 +18,11 @@ from pathlib import Path
 from drivesplat import SNAKEFILE, WORKFLOW
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
-from drivesplat.io.this_copy import in_this_copy, of_the_workflow
+from drivesplat.io.this_copy import default_config, in_this_copy, of_the_workflow
 
 RUN = "run"
 BROUGHT_ALONG = ("presets/", "profiles/")
+PAGE, OF_MOVING_OBJECTS = "viewer.html", "parts.mp4"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,7 +91,6 @@ def _demo(parsed: argparse.Namespace) -> int:
     """Runs the whole workflow on the demo world and prints its figures."""
     status = run_workflow(["--cores", parsed.cores, "--configfile", "presets/demo.yaml", "--", "all"])
     if status == 0:
-        from drivesplat.cli.viewer import results_folder
         from drivesplat.evaluation.summary import print_summary
 
         print_summary(results_folder() / "demo" / "metrics.json")
@@ -97,8 +98,6 @@ def _demo(parsed: argparse.Namespace) -> int:
 
 
 def _open(parsed: argparse.Namespace) -> int:
-    from drivesplat.cli.viewer import open_viewer, results_folder
-
     print(open_viewer(parsed.results or results_folder(), parsed.scene, parsed.method))
     return 0
 
@@ -144,3 +143,48 @@ def run_workflow(arguments: Sequence[str]) -> int:
         return process.wait()
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def results_folder() -> Path:
+    """The results folder of the current folder's config.yaml, by default `results`. Raises ConfigError."""
+    from drivesplat.io.yaml_file import read_yaml
+    from drivesplat.settings.config import load
+
+    return Path(load(read_yaml(default_config(Path.cwd()), "config file") or {}).results_dir)
+
+
+def open_viewer(results: Path, scene: str | None, method: str | None) -> str:
+    """Opens the page of a scene and method in the browser; returns what was opened, and which others there are.
+
+    Raises DriveSplatError where there is no such page, or no browser.
+    """
+    pages = exported_pages(results)
+    page = chosen_page(pages, results, scene, method)
+    if not webbrowser.open_new_tab(page.resolve().as_uri()):
+        raise DriveSplatError(f"no browser was found; open {page.resolve()} in one, also on another machine")
+    others = [f"{at[0]} {at[1]}" for at, other in sorted(pages.items()) if other != page]
+    return f"opened {page}" + (f"; there are also: {', '.join(others)}" if others else "")
+
+
+def exported_pages(results: Path) -> dict[tuple[str, str], Path]:
+    """The exported pages below a results folder, by scene and method."""
+    found = sorted(results.glob(f"*/*/{PAGE}"))
+    return {(page.parent.parent.name, page.parent.name): page for page in found}
+
+
+def chosen_page(
+    pages: dict[tuple[str, str], Path], results: Path, scene: str | None = None, method: str | None = None
+) -> Path:
+    """The page of a scene and method: by default of the scene exported last, and there of a method with moving objects.
+    Raises DriveSplatError where there is none."""
+    matching = {at: page for at, page in pages.items() if scene in (None, at[0]) and method in (None, at[1])}
+    if not matching:
+        wanted = f"{results / (scene or '{scene}') / (method or '{method}') / PAGE}"
+        known = ", ".join(f"{at[0]} {at[1]}" for at in sorted(pages)) or "none"
+        raise DriveSplatError(
+            f"there is no {wanted}; exported are: {known}. The workflow exports a scene with "
+            f"`drivesplat run --cores 1 -- {wanted}`; with --results the pages of another folder are opened"
+        )
+    newest = max(matching, key=lambda at: matching[at].stat().st_mtime)[0]
+    of_scene = [page for at, page in matching.items() if at[0] == newest]
+    return max(of_scene, key=lambda page: (page.with_name(OF_MOVING_OBJECTS).is_file(), page.stat().st_mtime))

@@ -1,16 +1,18 @@
-"""Reading and resizing recorded images, and the pixel conventions.
+"""Reading and resizing recorded images, the pixel conventions, and the horizon.
 
 `Scene` intrinsics follow OpenCV (integer coordinates at pixel centres). Rasterizers, projections and masks use the
 continuous convention of COLMAP and gsplat (image corner at (0, 0), centre of the first pixel at (0.5, 0.5)), in which
 resizing scales all coordinates.
 """
 
+import math
 import struct
 import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 from PIL import Image
 
 from drivesplat.errors import DatasetError
@@ -22,6 +24,8 @@ DECODING_ERRORS = (
     OSError, SyntaxError, ValueError, IndexError, OverflowError, struct.error, zlib.error, Image.DecompressionBombError,
 )  # fmt: skip
 """What Pillow raises for files that are no image, or a damaged or absurdly large one."""
+HORIZON_MARGIN = math.radians(1.0)
+"""Minimum angle in radians of a ray below the horizontal plane. Allows for errors of recorded poses."""
 
 
 def target_size(frame: Frame, images: ImageSettings) -> tuple[int, int]:
@@ -135,3 +139,19 @@ def upward_rays(size: tuple[int, int], intrinsics: np.ndarray, camera_to_world: 
         + square[2, 2]
     )
     return (up[0] * x + (up[1] * y + up[2])) / length
+
+
+def below_horizon(
+    K: Float[np.ndarray, "3 3"], camera_to_world: Float[np.ndarray, "4 4"], size: tuple[int, int]
+) -> Bool[np.ndarray, "h w"]:
+    """The pixels of an image of `size` (width, height) whose rays point more than HORIZON_MARGIN below the horizontal
+    plane: they cannot show the sky. `K` is in continuous pixels; the camera is an OpenCV one, and the world's z points
+    up.
+
+    >>> K = np.array([[100.0, 0.0, 2.0], [0.0, 100.0, 2.0], [0.0, 0.0, 1.0]])
+    >>> level = np.eye(4)
+    >>> level[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    >>> below_horizon(K, level, (1, 6))[:, 0].tolist()  # pixels of 0.57 degrees
+    [False, False, False, False, True, True]
+    """
+    return upward_rays(size, K, camera_to_world) < -math.sin(HORIZON_MARGIN)

@@ -21,7 +21,7 @@ from drivesplat.machine.device import choose_device, explain_out_of_memory, flus
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.horizon import below_horizon
+from drivesplat.scene.images import below_horizon
 from drivesplat.scene.masks import NO_MASKS, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
 from drivesplat.scene.scan_record import RecordedScan, read_scans

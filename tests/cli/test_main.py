@@ -12,8 +12,7 @@ from helpers import REPOSITORY
 
 from drivesplat import SNAKEFILE, WORKFLOW
 from drivesplat.cli import main as command_line
-from drivesplat.cli.main import main, snakemake_command
-from drivesplat.cli.viewer import chosen_page, exported_pages, results_folder
+from drivesplat.cli.main import chosen_page, exported_pages, main, results_folder, snakemake_command
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation import summary
 from drivesplat.io.this_copy import in_this_copy

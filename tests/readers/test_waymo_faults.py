@@ -21,7 +21,7 @@ from helpers.waymo_files import tfrecord, write_v1, write_v2
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.waymo.layout import camera_names, find_root, segment_files, table_files
-from drivesplat.readers.waymo.tfrecord import masked_crc
+from drivesplat.readers.waymo.v1 import masked_crc
 from drivesplat.scene.scene import Scene
 
 pytestmark = pytest.mark.usefixtures("uncompared")

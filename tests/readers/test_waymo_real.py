@@ -17,7 +17,7 @@ from PIL import Image
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.waymo.names import CAMERAS
 from drivesplat.readers.waymo.reader import read
-from drivesplat.readers.waymo.tfrecord import records
+from drivesplat.readers.waymo.v1 import tfrecords
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import boxes_at
 
@@ -104,7 +104,7 @@ def test_boxes_project_to_the_rectangles_that_waymo_projected(scene):
 
 def waymos_rectangles() -> Iterator[tuple[int, str, list[float]]]:
     """Camera, label's id, and left, top, right, bottom of each label in field 9 of the frame."""
-    (message,) = records(FILE)
+    (message,) = tfrecords(FILE)
     for labels in fields(message, 9):
         (camera,) = fields(labels, 1)
         for label in fields(labels, 2):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.scene.horizon import MARGIN, below_horizon
+from drivesplat.scene.images import HORIZON_MARGIN, below_horizon
 from drivesplat.scene.rigid import rigid
 
 SIZE = (64, 48)
@@ -27,7 +27,7 @@ def test_far_points_around_the_horizon_are_on_their_side(angles):
     assert mask.any() and not mask.all()
     seen = 0
     for azimuth in np.radians(np.arange(0.0, 360.0, 2.0)):
-        for elevation, expected in ((-MARGIN - 0.02, True), (-MARGIN + 0.02, False)):
+        for elevation, expected in ((-HORIZON_MARGIN - 0.02, True), (-HORIZON_MARGIN + 0.02, False)):
             way = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
             x, y, z = pose[:3, :3].T @ np.array(way) * 1000.0
             if z <= 0.0:

@@ -56,7 +56,7 @@ from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
-from drivesplat.scene.horizon import below_horizon
+from drivesplat.scene.images import below_horizon
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.drifting import DriftingSettings

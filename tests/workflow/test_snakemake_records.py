@@ -7,7 +7,7 @@ import pytest
 from helpers.shared_runs import VANILLA
 from helpers.workflow_copy import WorkflowCopy
 
-from drivesplat.workflow.snakemake_records import drop_foreign_records
+from drivesplat.workflow.snakemake_log import drop_foreign_records
 
 FOREIGN = {"binary": bytes(range(256)), "a list": b"[1, 2]", "a number": b"7"}
 

@@ -3,12 +3,13 @@
 import argparse
 import json
 import sys
+import tempfile
 from pathlib import Path
 
-from drivesplat.errors import DriveSplatError
+from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.io.standard_output import standard_output
-from drivesplat.preprocess.camera_check import camera_warnings
-from drivesplat.preprocess.undistort import distortion_fault
+from drivesplat.preprocess.intrinsics import intrinsics_warnings
+from drivesplat.preprocess.undistort import distortion_fault, undistorted
 from drivesplat.readers.drive.check import column_sentences, examine, summary, what_to_see
 from drivesplat.readers.drive.format import Drive, grouped
 from drivesplat.readers.drive.needed_settings import needed_settings
@@ -69,6 +70,25 @@ def _check(asked: argparse.Namespace) -> int:
 
 def _distortion_faults(scene: Scene | None) -> list[str]:
     return [fault for camera in (scene.cameras if scene else ()) if (fault := distortion_fault(camera))]
+
+
+def camera_warnings(scene: Scene) -> list[str]:
+    """`intrinsics_warnings`, and sentences about cameras whose images contradict their intrinsics, by a trial with some
+    images (`drivesplat.poses.lens`)."""
+    return [*intrinsics_warnings(scene), *_image_warnings(scene)]
+
+
+def _image_warnings(scene: Scene) -> list[str]:
+    try:
+        from drivesplat.poses.lens import lens_warnings, with_tested_images  # imports pycolmap
+    except ImportError as error:
+        return [f"intrinsics are not compared with images: pycolmap or pyceres cannot be imported ({error})"]
+    tested = with_tested_images(scene)
+    with tempfile.TemporaryDirectory(prefix="drivesplat-undistorted-") as folder:
+        try:
+            return lens_warnings(undistorted(tested, Path(folder)))
+        except DatasetError as error:
+            return [f"intrinsics are not compared with images: {error}"]
 
 
 def _schema(_: argparse.Namespace) -> int:

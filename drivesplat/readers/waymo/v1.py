@@ -1,9 +1,12 @@
 """Segments of v1: a TFRecord file with one `Frame` message for each frame."""
 
+import struct
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 from google.protobuf.message import DecodeError
 
@@ -27,7 +30,8 @@ from drivesplat.readers.waymo.segment import (
     frame_name,
     sweep_name,
 )
-from drivesplat.readers.waymo.tfrecord import records
+
+_HEADER, _FOOTER = struct.Struct("<QI"), struct.Struct("<I")
 
 
 def read_segment(files: SegmentFiles) -> Segment:
@@ -75,7 +79,7 @@ def _frames(files: SegmentFiles) -> Iterator[Any]:
     """The frames of a segment's file, in its order."""
     path, frame_of = files.files[FRAMES], message("Frame")
     number = -1
-    for number, record in enumerate(records(path)):
+    for number, record in enumerate(tfrecords(path)):
         try:
             frame = frame_of.FromString(record)
         except DecodeError as error:
@@ -140,3 +144,45 @@ def _matrix(compressed: bytes, channels: int, record: str) -> np.ndarray:
         raise DatasetError(f"{record}: its range image is damaged ({error})") from error
     data = matrix.data[: len(matrix.data) // 4 * 4]
     return cells(np.frombuffer(data, dtype="<f4"), matrix.shape.dims, channels, record)
+
+
+def tfrecords(path: Path) -> Iterator[bytes]:
+    """The records of a TFRecord file, one at a time: uint64 length, its masked CRC-32C, data, their masked CRC-32C, all
+    little-endian. tensorflow/core/lib/io/record_writer.h documents the format, crc32c.h the mask.
+
+    Raises DatasetError naming the record where the file is truncated or a checksum differs.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        number = 0
+        while file.tell() < size:
+            record = f"record {number} of {path}"
+            header = file.read(_HEADER.size)
+            if len(header) < _HEADER.size:
+                raise _truncated(record)
+            length, checksum = _HEADER.unpack(header)
+            if masked_crc(header[:8]) != checksum:
+                raise _altered(record, "length")
+            if length > size - file.tell() - _FOOTER.size:
+                raise _truncated(record)
+            data, footer = file.read(length), file.read(_FOOTER.size)
+            if len(data) < length or len(footer) < _FOOTER.size:
+                raise _truncated(record)
+            if masked_crc(data) != _FOOTER.unpack(footer)[0]:
+                raise _altered(record, "data")
+            yield data
+            number += 1
+
+
+def masked_crc(data: bytes) -> int:
+    """The masked CRC-32C of a record's part."""
+    crc = google_crc32c.value(data)
+    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def _truncated(record: str) -> DatasetError:
+    return DatasetError(f"{record} is truncated; download the file again")
+
+
+def _altered(record: str, part: str) -> DatasetError:
+    return DatasetError(f"{record}: the checksum (CRC-32C) of its {part} differs; download the file again")

@@ -26,7 +26,7 @@ from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
 from drivesplat.workflow.named_tracks import edits_left_out
 from drivesplat.workflow.plan import Plan
-from drivesplat.workflow.snakemake_records import drop_foreign_records
+from drivesplat.workflow.snakemake_log import drop_foreign_records
 from drivesplat.workflow.without_cameras import methods_left_out
 
 COSTS, ESTIMATE = "costs", "estimate"

@@ -10,15 +10,18 @@ import http.client
 import json
 import os
 import re
+import socket
+import threading
 import time
 import urllib.error
 import urllib.request
+from contextlib import suppress
 from email.message import Message
 from pathlib import Path
+from typing import Any
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import sha256_file, write_json
-from drivesplat.readers.nuscenes.download.connection import open_url
 from drivesplat.readers.nuscenes.download.console import announce, byte_progress
 from drivesplat.settings.download import NuscenesMiniSettings
 
@@ -188,3 +191,51 @@ def _discard(part: Path) -> None:
     """Removes the bytes received so far."""
     part.unlink(missing_ok=True)
     _record_of(part).unlink(missing_ok=True)
+
+
+class _Deadline:
+    """For subclasses of HTTPConnection: `timeout` also limits the time until all headers have been received. A socket's
+    timeout limits the silence between two packets, which a server that sends a byte at a time never exceeds."""
+
+    def getresponse(self: Any) -> http.client.HTTPResponse:
+        expired, sock = threading.Event(), self.sock
+
+        def end() -> None:
+            expired.set()
+            with suppress(OSError):  # the server has closed it
+                sock.shutdown(socket.SHUT_RDWR)
+
+        timer = threading.Timer(self.timeout, end)
+        timer.daemon = True
+        timer.start()
+        try:
+            return super().getresponse()
+        except (OSError, http.client.HTTPException) as error:
+            if expired.is_set():
+                raise TimeoutError(f"no complete answer within {self.timeout:g} s") from error
+            raise
+        finally:
+            timer.cancel()
+
+
+class _HttpConnection(_Deadline, http.client.HTTPConnection):
+    pass
+
+
+class _HttpsConnection(_Deadline, http.client.HTTPSConnection):
+    pass
+
+
+class _HttpHandler(urllib.request.HTTPHandler):
+    def http_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(_HttpConnection, request)
+
+
+class _HttpsHandler(urllib.request.HTTPSHandler):
+    def https_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(_HttpsConnection, request)
+
+
+def open_url(request: urllib.request.Request, timeout: float) -> http.client.HTTPResponse:
+    """As `urllib.request.urlopen`, but raises TimeoutError where the headers take longer than `timeout` seconds."""
+    return urllib.request.build_opener(_HttpHandler, _HttpsHandler).open(request, timeout=timeout)

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from helpers.scan_drives import AZIMUTHS, KEY_FRAME_US, STEPS, recorded, room
 
-from drivesplat.lidar.scan_baselines import fused, measured_points, nearest_scan, neighbouring_scans, sensor_to_world
+from drivesplat.evaluation.scan_baselines import (
+    fused,
+    measured_points,
+    nearest_scan,
+    neighbouring_scans,
+    sensor_to_world,
+)
 
 TARGET = recorded(room(), timestamp=KEY_FRAME_US)
 
