@@ -4,7 +4,7 @@ from pathlib import Path
 
 from drivesplat.workflow.job import job
 from drivesplat.io.storage import write_json
-from drivesplat.preprocess.regions import relabelled_masks
+from drivesplat.preprocess.masks import relabelled_masks
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.masks import RegionJob
 

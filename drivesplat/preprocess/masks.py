@@ -1,4 +1,5 @@
-"""The stage `masks`: static, dynamic and sky regions of every image, as PNG files.
+"""The stage `masks`: static, dynamic and sky regions of every image, as PNG files; and the stage `regions`, the masks
+of a scene for other tracks than the annotated ones.
 
 - masks/masks.json: the masks' sources, and the cameras that see the ego vehicle
 - masks/regions/{camera}/{timestamp}.png: labels of `drivesplat.scene.regions.LABELS`
@@ -6,8 +7,9 @@
 - masks/semantic/{camera}/{timestamp}.png: the user's semantic classes, if given
 """
 
+import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import numpy as np
 
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
+from drivesplat.readers.files import link_or_copy
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import (
     continuous_intrinsics,
@@ -26,11 +29,11 @@ from drivesplat.scene.images import (
     upward_rays,
     write_png,
 )
-from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name
+from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name, read_labels, read_masks_record
 from drivesplat.scene.regions import LABELS, fill, hulls_in, label_image, visibility_source
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import Group, frame_groups
-from drivesplat.settings.masks import MaskJob
+from drivesplat.settings.masks import MaskJob, RegionJob
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +55,8 @@ NO_SKY = (
     "scene %s: no sky was found, as is usual at night or in a tunnel: sky losses are disabled; "
     "set masks.sky_folder to use your own masks"
 )
+SHARED = ("sky", "semantic")
+"""The kinds of masks that depend on no track."""
 
 
 def make_masks(
@@ -230,3 +235,27 @@ def _near_returns(
     columns, rows = at[inside].astype(np.int64).T
     hit[rows, columns] = 1
     return cv2.dilate(hit, np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)).astype(bool)
+
+
+def relabelled_masks(scene: Scene, job: RegionJob, masks: Path, folder: Path) -> MasksRecord:
+    """Writes the masks of every image of a scene below `folder`, given those of the stage `masks` in the folder
+    `masks`: regions by the boxes of its tracks, and links to all that depends on no track. Returns their record with
+    other regions. Raises ResultError where one of them is damaged."""
+    made = read_masks_record(masks)
+
+    def label(frame: Frame) -> None:
+        size = target_size(frame, job.images)
+        labels = label_image(scene, frame, size)
+        labels[read_labels(masks, frame.camera, frame.timestamp, size) == LABELS["own_car"]] = LABELS["own_car"]
+        write_png(folder / mask_name("regions", frame.camera, frame.timestamp), labels)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(label, scene.frames))
+    _link_shared(masks, folder, scene.frames)
+    return dataclasses.replace(made, regions="boxes", visibility=visibility_source(scene.tracks))
+
+
+def _link_shared(masks: Path, folder: Path, frames: Iterable[Frame]) -> None:
+    for name in (mask_name(kind, frame.camera, frame.timestamp) for frame in frames for kind in SHARED):
+        if (masks / name).is_file():
+            link_or_copy(masks / name, folder / name)

@@ -1,5 +1,5 @@
-"""What Snakemake logs and records: reasons of jobs, with changed settings by name, the moment when all jobs are planned,
-and records of results that it fails on.
+"""What Snakemake logs and records: reasons of jobs, with changed settings by name, the moment when all jobs are
+planned, and records of results that it fails on.
 
 None is a documented interface: tests/workflow/test_snakemake_log.py and test_snakemake_records.py fail where that
 changes.

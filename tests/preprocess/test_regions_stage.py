@@ -7,8 +7,7 @@ import pytest
 
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_json
-from drivesplat.preprocess.masks import make_masks
-from drivesplat.preprocess.regions import relabelled_masks
+from drivesplat.preprocess.masks import make_masks, relabelled_masks
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.masks import mask_name, read_labels, read_sky_mask
 from drivesplat.scene.regions import LABELS, label_image
