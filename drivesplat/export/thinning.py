@@ -34,11 +34,6 @@ def largest_coverage(gaussians: Gaussians, count: int) -> Bool[Tensor, " n"]:
     return kept
 
 
-def thinned(gaussians: Gaussians, count: int) -> Gaussians:
-    """The `count` Gaussians with the largest coverage, in their order."""
-    return gaussians[largest_coverage(gaussians, count)]
-
-
 def thinned_groups(groups: Mapping[str, SampledGroup], count: int) -> dict[str, SampledGroup]:
     """The groups with their share of the `count` Gaussians with the largest coverage, absent objects included."""
     sets = [group.gaussians for group in groups.values()]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers.hand_made_traffic import some_gaussians
 
-from drivesplat.export.thinning import thinned, thinned_groups
+from drivesplat.export.thinning import largest_coverage, thinned_groups
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians
 
@@ -16,6 +16,10 @@ def gaussians_of(scales: list[list[float]], opacities: list[float]) -> Gaussians
     means = torch.arange(float(count))[:, None].repeat(1, 3)
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     return Gaussians.of(means, quats, torch.tensor(scales), torch.tensor(opacities), torch.zeros(count, 1, 3))
+
+
+def thinned(gaussians: Gaussians, count: int) -> Gaussians:
+    return gaussians[largest_coverage(gaussians, count)]
 
 
 def places(gaussians: Gaussians) -> list[int]:

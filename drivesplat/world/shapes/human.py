@@ -11,8 +11,8 @@ import numpy as np
 from drivesplat.world.shapes.limbs import Ring, limb, links, loft, oriented, placed
 from drivesplat.world.shapes.mesh import Color, ColoredMesh, Material, concatenate, hull, symmetric_hull
 
-THIGH, SHIN, ANKLE, UPPER_ARM, FOREARM, HAND = 0.245, 0.246, 0.039, 0.186, 0.146, 0.108
-LEG, HIP = THIGH + SHIN, THIGH + SHIN + ANKLE
+THIGH, SHIN, ANKLE, UPPER_ARM, FOREARM = 0.245, 0.246, 0.039, 0.186, 0.146
+HIP = THIGH + SHIN + ANKLE
 HIPS = np.array([[0.0, 0.05, 0.0], [0.0, -0.05, 0.0]])
 """Hip joints in the pelvis's frame, left first."""
 WAIST = np.array([[0.0, 0.0, 0.05]])

@@ -154,17 +154,6 @@ def cylinder(start: Numbers, end: Numbers, radius: float, material: Material, co
     return uniform(trimesh.creation.cylinder(radius, segment=[start, end], sections=14), material, color)
 
 
-def capsule(start: Numbers, end: Numbers, radius: float, material: Material, color: Color) -> ColoredMesh:
-    """The points within `radius` of the segment between two points: a limb."""
-    axis = np.subtract(end, start)
-    length = float(np.linalg.norm(axis))
-    mesh = trimesh.creation.capsule(length, radius, count=[8, 8])
-    mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])
-    mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis))
-    mesh.apply_translation(np.add(start, end) / 2)
-    return uniform(mesh, material, color)
-
-
 def ellipsoid(center: Numbers, radii: Numbers, material: Material, color: Color) -> ColoredMesh:
     """The ellipsoid with semi-axes `radii` along x, y, z."""
     mesh = trimesh.creation.icosphere(subdivisions=2)
