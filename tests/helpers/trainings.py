@@ -39,11 +39,11 @@ from drivesplat.settings.train import (
     TrainSettings,
 )
 from drivesplat.settings.train_geometry import FloaterSettings
-from drivesplat.training.run import (
+from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
+from drivesplat.training.stage import (
     TrainingFiles,
     TrainingInputs,
 )
-from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import LidarDepth, TrainingView
 from helpers import REPOSITORY
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of

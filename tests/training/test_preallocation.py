@@ -15,11 +15,12 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training import strategies
-from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier
+from drivesplat.training.graphs.iteration_graphs import IterationGraphs
 from drivesplat.training.losses import loss_terms, road_loss, surface_terms
 from drivesplat.training.optimizers import Optimizers, make_optimizers
 from drivesplat.training.road import driven_road
+from drivesplat.training.schedule import Schedule
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +34,7 @@ def grown(preallocates: bool, steps: int, **changes: Any) -> tuple[SplatModel, D
     torch.manual_seed(0)
     growing = {"mcmc": McmcSettings(refine_every=2, noise_lr=0.0), "cap_max": 400}
     model, settings = a_model(), settings_of("mcmc", **{**growing, **changes})
-    densifier = Densifier(model.parts[0], settings, lambda: preallocates)
+    densifier = Densifier(model.parts[0], Schedule.of(settings, 1), lambda: preallocates)
     (optimizers,) = make_optimizers(model).parts
     means = []
     for step in range(steps):

@@ -32,10 +32,9 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
-from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
+from drivesplat.training.graphs.iteration_graphs import IterationGraphs
+from drivesplat.training.loop import Trainer, train
 from drivesplat.training.optimizers import make_optimizers
-from drivesplat.training.run import TrainingInputs, prepare
-from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import (
     initial_echo,
     load_scans,
@@ -43,8 +42,9 @@ from drivesplat.training.scans import (
     scan_terms,
     with_scan_points,
 )
-from drivesplat.training.train import train
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.schedule import Schedule
+from drivesplat.training.stage import TrainingInputs, prepare
+from drivesplat.training.step import limit_geometry
 
 SCANS = ScanTrainingSettings(per_image=1.0)
 
@@ -63,10 +63,10 @@ def terms_of(picture: ScanPicture, scan, **weights) -> dict[str, float]:
     return {name: float(value) for name, value in scan_terms(picture, scan, model, settings).items()}
 
 
-def scheduled(per_image: float, fine_tune: float = 0.0, images: int = 4, scans: int = 5) -> ScanSchedule:
+def scheduled(per_image: float, fine_tune: float = 0.0, images: int = 4, scans: int = 5) -> Schedule:
     """The schedule of a training with 300 iterations."""
     settings = settings_of(iterations=300, scans=ScanTrainingSettings(per_image=per_image, fine_tune=fine_tune))
-    return ScanSchedule.of(settings, images, scans)
+    return Schedule.of(settings, images, scans)
 
 
 @pytest.mark.parametrize("per_image", [0.0, 0.1, 0.25, 1 / 3, 1.0, 2.5])
@@ -75,7 +75,7 @@ def test_scans_are_spread_evenly_among_all_iterations_with_images(per_image):
     steps = 300 + round(300 * per_image)
     fitted = [schedule.fits_scan(step) for step in range(steps)]
     assert schedule.steps == steps and sum(fitted) == schedule.scans_before(steps) == round(300 * per_image)
-    assert schedule.images_before(steps) == schedule.counted_before(steps) == 300
+    assert schedule.images_before(steps) == schedule.iterations_before(steps) == 300
     assert not any(schedule.fine_tunes(step) for step in range(steps))
     share = per_image / (1.0 + per_image)
     for start in range(0, steps - 30, 30):
@@ -88,7 +88,7 @@ def test_the_last_iterations_fine_tune_the_lidar():
     assert [schedule.fine_tunes(step) for step in (0, 374, 375, 434, 435)] == [False, False, True, True, False]
     assert sum(schedule.fits_scan(step) for step in range(375)) == 75 and schedule.images_before(375) == 300
     assert all(schedule.fits_scan(step) for step in range(375, 435))
-    assert (schedule.scans_before(435), schedule.images_before(435), schedule.counted_before(435)) == (135, 300, 300)
+    assert (schedule.scans_before(435), schedule.images_before(435), schedule.iterations_before(435)) == (135, 300, 300)
     assert not schedule.fits_scan(435), "beyond the end only images are fitted"
 
 
@@ -103,7 +103,7 @@ def test_without_images_every_iteration_fits_a_scan_and_counts():
     schedule = scheduled(0.25, fine_tune=0.2, images=0)
     assert schedule.steps == 300 and all(schedule.fits_scan(step) for step in range(300))
     assert not any(schedule.fine_tunes(step) for step in range(300))
-    assert (schedule.images_before(300), schedule.counted_before(300)) == (0, 300) and schedule.fits_scan(300)
+    assert (schedule.images_before(300), schedule.iterations_before(300)) == (0, 300) and schedule.fits_scan(300)
 
 
 def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
@@ -120,9 +120,9 @@ def test_every_image_is_taken_once_an_epoch_whatever_the_share():
         with_echoes(settings), recorded_views(4), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
     )
     numbers = []
-    for trainer.step in range(16):
-        if not trainer.fits_scan:
-            numbers.append(trainer.images.number(trainer._images_done))
+    for step in range(16):
+        if not trainer.schedule.fits_scan(step):
+            numbers.append(trainer.images.number(step))
     assert len(numbers) == 8 and sorted(numbers[:4]) == sorted(numbers[4:]) == [0, 1, 2, 3]
 
 
@@ -223,9 +223,9 @@ def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[
     recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
     trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=recorded)
     before = {part.name: {k: v.detach().clone() for k, v in learnable(part).items()} for part in model.parts}
-    trainer.step = step
-    assert trainer.fits_scan
-    terms, picture, view = trainer.training_step(with_picture=trainer.fine_tunes)
+    trainer.state.step = step
+    assert trainer.schedule.fits_scan(step)
+    terms, picture, view = trainer.training_step(with_picture=trainer.schedule.fine_tunes(step))
     assert picture is None and view is None and "scan_range" in terms
     trainer.densify(picture)
     changed = {
@@ -245,7 +245,7 @@ def test_scans_leave_the_geometry_alone_where_they_are_told_to(fine_tune):
 def test_fine_tuning_changes_what_the_lidar_alone_sees():
     trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.5)
     assert changed == {"background": {"echoes", *OFFSETS.values()}, "actors": {"echoes"}}
-    assert trainer.step == 9 and trainer.fine_tunes
+    assert trainer.state.step == 9 and trainer.schedule.fine_tunes(9)
     _, before = changed_by_a_scan(7, street=True, fine_tune=0.5)
     assert {"translation", "yaw"} & before["actors"], "tracks are corrected by scans until then"
     assert not before["background"] & {*OFFSETS.values()} and "scales" in before["background"]
@@ -271,12 +271,12 @@ def test_the_rates_of_fine_tuning_decay():
     settings = settings_of(iterations=40, scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.5))
     recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
     trainer = Trainer.begin(with_echoes(settings, offsets=True), recorded_views(4), settings, 0, CPU, scans=recorded)
-    (group,) = trainer.optimizers.parts
-    rates = trainer.model.parts[0].learning_rates()
+    (group,) = trainer.state.optimizers.parts
+    rates = trainer.state.model.parts[0].learning_rates()
 
     def share_of_rate(step: int, name: str) -> float:
-        trainer.step = step
-        trainer._set_learning_rates()
+        trainer.state.step = step
+        trainer.state.begin_step()
         return group[name].param_groups[0]["lr"] / rates[name]
 
     assert [share_of_rate(step, "means") for step in (0, 40)] == pytest.approx([1.0, 0.1]), "ends with the images"
@@ -298,11 +298,11 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
         picture, scan = model.scan(recorded[1].view), recorded[1]
         return model.render(views[0].view).image, float((picture.range - scan.range)[scan.returned].abs().median())
 
-    while not trainer.fine_tunes:
+    while not trainer.schedule.fine_tunes(trainer.state.step):
         _, picture, _ = trainer.training_step(with_picture=False)
         trainer.densify(picture)
     image, error = image_and_error()
-    while trainer.step < trainer.iterations:
+    while trainer.state.step < trainer.schedule.steps:
         _, picture, _ = trainer.training_step(with_picture=True)
         trainer.densify(picture)
     again, better = image_and_error()
@@ -320,10 +320,10 @@ def scan_trainer(factor: float = 0.25) -> Trainer:
 @pytest.mark.parametrize("factor", [0.25, 0.0])
 def test_a_factor_scales_the_gradients_of_what_images_show(factor):
     trainer = scan_trainer(factor)
-    params = trainer.model.parts[0].params
+    params = trainer.state.model.parts[0].params
     for parameter in params.values():
         parameter.grad = torch.ones_like(parameter)
-    trainer._limit_gradients()
+    limit_geometry(trainer.state.model, factor)
     for name in ("means", "quats", "scales", "opacities"):
         if factor:
             assert (params[name].grad == factor).all(), name
@@ -342,10 +342,10 @@ def test_a_factor_scales_the_gradients_of_what_images_show(factor):
 )
 def test_each_kind_of_iteration_learns_its_own_parameters(step, learned):
     trainer = scan_trainer()
-    params = trainer.model.parts[0].params
+    params = trainer.state.model.parts[0].params
     before = {name: parameter.detach().clone() for name, parameter in params.items()}
-    trainer.step = step
-    assert trainer.fits_scan == (step > 0) and trainer.fine_tunes == (step == 600)
+    trainer.state.step = step
+    assert trainer.schedule.fits_scan(step) == (step > 0) and trainer.schedule.fine_tunes(step) == (step == 600)
     trainer.training_step(with_picture=False)
     assert {name for name, parameter in params.items() if not torch.equal(parameter, before[name])} == learned
 
@@ -382,7 +382,7 @@ def test_an_iteration_whose_picture_is_wanted_fits_an_image():
     trainer = Trainer.begin(
         with_echoes(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
     )
-    trainer.step = 1
+    trainer.state.step = 1
     terms, picture, view = trainer.training_step(with_picture=True)
     assert picture is not None and view is not None and "l1" in terms
 
