@@ -128,7 +128,7 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
-FINE_TUNED = ("echoes", *OFFSETS.values())
+FINE_TUNED = ("lidar_logits", *OFFSETS.values())
 """The parameters of Gaussians that only the LiDAR sees."""
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from drivesplat.kernels.road_distance import Road
 from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.time_states import ScanTimeStates, TimeStates
+from drivesplat.model.states import SCAN, ModelStates, want_of
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
@@ -86,7 +86,7 @@ class Trainer:
         capture = clock is UNTIMED and can_capture(settings, images, device, len(scans))
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
-        model.precompute([time for scan in scans for time in ScanTimeStates.times(scan.view.time)])
+        model.precompute([scan.view.time for scan in scans], SCAN)
         return cls(
             model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
             schedule, list(scans), SharedImageInputs(images, model.exposure is not None),
@@ -135,10 +135,10 @@ class Trainer:
         """An iteration with an image, by its CUDA graph or the one for all of its shape, where there is one."""
         factor, shared = self.images.factor(self.step), can_share(view)
         layout = factor, self.sh_degree(), *self._addresses()
-        states = self.model.time_states(view.view.time) if shared else None
-        if states is None:
+        if not shared:
             alone = Recording("image", (factor, number))
             return self._captured(alone, lambda: self._image_step(view, step, rates)[0], layout)
+        states = self.model.states(view.view.time)
         inputs = self.graphs.retry_without_graphs(lambda: self.image_inputs.load(view, states))
         image = Recording("image", inputs.number, self.image_inputs.measured)
         return self._captured(image, lambda: self._image_step(inputs.view, step, rates, inputs.states)[0], layout)
@@ -147,9 +147,9 @@ class Trainer:
         """An iteration with the scan whose turn it is, by its CUDA graph where there is one."""
         number = scan_index(len(self.scans), self.scan_schedule.scans_before(self.step), self.seed)
         scan = self.scans[number]
-        states = self.model.scan_states(scan.view.time) if self.graphs.enabled else None
-        if states is None:
-            return self.graphs.retry_without_graphs(lambda: self._scan_step(scan, None, step, rates))
+        states = self.model.states(scan.view.time, SCAN)
+        if not self.graphs.enabled:
+            return self.graphs.retry_without_graphs(lambda: self._scan_step(scan, states, step, rates))
         inputs = self.graphs.retry_without_graphs(lambda: self.scan_inputs.load(scan, states))
         recording = Recording("scan", inputs.number, MEASURED_SCANS)
         layout = self.fine_tunes, *self._addresses()
@@ -174,14 +174,16 @@ class Trainer:
         view: TrainingView,
         step: int | Tensor,
         rates: Mapping[str, Tensor] | None,
-        states: TimeStates | None = None,
+        states: ModelStates | None = None,
     ) -> tuple[Terms, Picture]:
         """An iteration with a view; `states` are those of its time (None: to be looked up). `step` and `rates` are
         those of `DeviceSchedule.update`; a replay of this reads the values that they hold then."""
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # gradients of an iteration that ran out of memory
         with stage("render"):
-            sets = sets_with_mirrored_objects(self.model, view.view, states)
+            want = want_of(self.model.seen_from(view.view))
+            states = self.model.states(view.view.time, want) if states is None else states
+            sets = sets_with_mirrored_objects(self.model, states, want)
             if self.settings.dropout:
                 sets = with_dropout(sets, self.model, self.settings.dropout)
             picture = self.model.render(
@@ -190,11 +192,10 @@ class Trainer:
                 gaussians=sets,
                 with_depth=view.lidar is not None or self.settings.smoothness_weight > 0,
                 with_objects=self.settings.entropy_weight > 0 and not by_gradient,
-                road=self.road,
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self.settings)
-            terms |= surface_terms(picture.sets, self.model, self.road, self.settings, picture.road_distance)
+            terms |= surface_terms(picture.sets, self.model, self.road, self.settings)
         if by_gradient:
             picture.info["means2d"].retain_grad()
         return self._backward_and_update(terms, step, rates), picture
@@ -202,17 +203,16 @@ class Trainer:
     def _scan_step(
         self,
         scan: TrainingScan,
-        states: ScanTimeStates | None,
+        states: ModelStates,
         step: int | Tensor,
         rates: Mapping[str, Tensor] | None,
     ) -> Terms:
-        """An iteration with a scan, as `_image_step`; `states` are those of its time (None: to be looked up)."""
+        """An iteration with a scan, as `_image_step`; `states` are those of its time."""
         stage, settings = self.clock.stage, self.settings.scans
         self.model.zero_grad()
         with stage("render"):
             before = (scan.range - settings.sight_margin).clamp(min=0.0) if settings.sight_weight else None
-            sets = None if states is None else self.model.sets_at_scan_states(states)
-            picture = self.model.scan(scan.view, gaussians=sets, before=before)
+            picture = self.model.scan(scan.view, gaussians=self.model.sample(states, SCAN), before=before)
         with stage("loss"):
             terms = scan_terms(picture, scan, self.model, self.settings)
             if not self.images.views:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.time_states import TimeStates
+from drivesplat.model.states import ModelStates, copied, tensors_of
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.views import LidarDepth, TrainingView
 
@@ -29,7 +29,7 @@ class ImageInputs:
 
     number: int
     image: TrainingView
-    states: TimeStates
+    states: ModelStates
 
     @property
     def view(self) -> TrainingView:
@@ -52,7 +52,7 @@ class SharedImageInputs:
         cameras = len({image.view.camera for image in self.images.views}) if self.by_camera else 1
         return max(1, min(max(MEASURED // cameras, MEASURED_OF_CAMERA), len(self.images.views) // cameras))
 
-    def load(self, image: TrainingView, states: TimeStates) -> ImageInputs:
+    def load(self, image: TrainingView, states: ModelStates) -> ImageInputs:
         """The inputs of this shape, which hold an image and its time states from now on."""
         given = _tensors(image, states)
         camera = image.view.camera if self.by_camera else None
@@ -65,13 +65,13 @@ class SharedImageInputs:
             _load_depths(own.image.lidar, image.lidar)
         return own
 
-    def _copied(self, image: TrainingView, states: TimeStates) -> ImageInputs:
+    def _copied(self, image: TrainingView, states: ModelStates) -> ImageInputs:
         """New inputs, with the shape of an image and its time states."""
         view = replace(image.view, K=image.view.K.clone(), camera_to_world=image.view.camera_to_world.clone())
         copies = {name: mask.clone() for name, mask in _masks(image).items()}
         lidar = None if image.lidar is None else self._room_for(image.lidar)
         own = replace(image, view=view, pixels=image.pixels.clone(), lidar=lidar, **copies)
-        return ImageInputs(len(self._by_shape), own, [[values.clone() for values in state] for state in states])
+        return ImageInputs(len(self._by_shape), own, copied(states))
 
     def _room_for(self, lidar: LidarDepth) -> LidarDepth:
         """Depth of this kind, with room for that of any image."""
@@ -86,10 +86,10 @@ def can_share(image: TrainingView) -> bool:
     return image.view.shutter is None and image.classes is None
 
 
-def _tensors(image: TrainingView, states: TimeStates) -> list[Tensor]:
+def _tensors(image: TrainingView, states: ModelStates) -> list[Tensor]:
     """All tensors of an image but LiDAR depth, and those of time states, in a fixed order."""
     masks = _masks(image).values()
-    return [image.view.K, image.view.camera_to_world, image.pixels, *masks, *(v for state in states for v in state)]
+    return [image.view.K, image.view.camera_to_world, image.pixels, *masks, *tensors_of(states)]
 
 
 def _masks(image: TrainingView) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.time_states import ScanTimeStates
+from drivesplat.model.states import ModelStates, copied, tensors_of
 from drivesplat.training.scans import TrainingScan
 
 Shape = tuple[tuple[torch.Size, torch.dtype], ...]
@@ -25,12 +25,12 @@ class ScanInputs:
 
     number: int
     scan: TrainingScan
-    states: ScanTimeStates
+    states: ModelStates
 
     @property
     def tensors(self) -> list[Tensor]:
         """All tensors, in a fixed order."""
-        return [*self.scan.tensors, *self.states.tensors]
+        return [*self.scan.tensors, *tensors_of(self.states)]
 
 
 @dataclass
@@ -39,13 +39,13 @@ class SharedScanInputs:
 
     _by_shape: dict[Shape, ScanInputs] = field(default_factory=dict)
 
-    def load(self, scan: TrainingScan, states: ScanTimeStates) -> ScanInputs:
+    def load(self, scan: TrainingScan, states: ModelStates) -> ScanInputs:
         """The inputs of this shape, which hold a scan and its time states from now on."""
-        given = [*scan.tensors, *states.tensors]
+        given = [*scan.tensors, *tensors_of(states)]
         shape = _shape_of(given)
         own = self._by_shape.get(shape)
         if own is None:
-            own = ScanInputs(len(self._by_shape), copy.deepcopy(scan), states.copied())
+            own = ScanInputs(len(self._by_shape), copy.deepcopy(scan), copied(states))
             self._by_shape[shape] = own
         else:
             torch_private.copy_all(own.tensors, given)
