@@ -1,5 +1,6 @@
 """Means over Gaussians that regularizers penalise: opacity and scale (MCMC), and thickness."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -7,14 +8,15 @@ from drivesplat.kernels import triton_support
 
 
 def mean_opacity_and_scale(
-    opacities: Float[Tensor, " n"], scales: Float[Tensor, "n 3"]
+    *sets: tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]],
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """The mean of `opacities`, and the mean of all `scales` (metres), where those of Gaussians with opacity 0 count
-    as 0."""
-    if len(opacities) and triton_support.usable_for(opacities):
+    """The mean opacity, and the mean of all scales (metres), where those of Gaussians with opacity 0 count as 0, over
+    the Gaussians of some sets; of each its opacities and scales are given."""
+    if any(len(own) for own, _ in sets) and triton_support.usable_for(sets[0][0]):
         from drivesplat.kernels.triton.regularizers import MeanOpacityAndScale
 
-        return MeanOpacityAndScale.apply(opacities, scales)
+        return MeanOpacityAndScale.apply(*(values for own in sets for values in own))
+    opacities, scales = sets[0] if len(sets) == 1 else map(torch.cat, zip(*sets, strict=True))
     present = opacities.detach() > 0.0
     return opacities.mean(), (scales * present[:, None]).mean()
 

@@ -20,7 +20,7 @@ DECAY = 0.01
 fraction of the initial rate."""
 FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.5, 6.0
 """Factors of the learning rates at which the fine-tuning of positions, and of all else, begins."""
-FINE_TUNED = ("echoes", *OFFSETS.values())
+FINE_TUNED = ("lidar_logits", *OFFSETS.values())
 """The parameters of Gaussians that only the LiDAR sees."""
 AVERAGED_EVERY = 5
 """Steps from one whose parameters count in the mean to the next."""

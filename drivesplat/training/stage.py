@@ -36,7 +36,7 @@ from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
 from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, evenly_spaced
 from drivesplat.training.road import road_of
-from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
+from drivesplat.training.scans import TrainingScan, initial_lidar_logits, load_scans, with_scan_points
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import Supervision, TrainingView, load_views
 
@@ -179,7 +179,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         mean_sky_color(views),
         inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
-        initial_echo(inputs.scans) if job.train.scans.per_image else None,
+        initial_lidar_logits(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
     )
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
