@@ -41,12 +41,12 @@ from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
 from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import concatenate
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import SCAN
+from drivesplat.model.states import IMAGE, SCAN, Want
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.rendering import captured_frames
@@ -62,7 +62,7 @@ from drivesplat.training import strategies
 from drivesplat.training.augmentation import mirrored_at_random, with_dropout
 from drivesplat.training.graphs import captured_steps
 from drivesplat.training.loop import Trainer
-from drivesplat.training.scans import initial_echo, load_scans
+from drivesplat.training.scans import initial_lidar_logits, load_scans
 
 pytestmark = [
     pytest.mark.gpu,
@@ -170,7 +170,7 @@ def test_film_frames_and_removals_agree_with_the_cpu():
     model = model.to(GPU)
     assert np.percentile(np.abs(film_frame(model, on_gpu) - on_cpu_frame), 99) <= 1
     with torch.no_grad():
-        gaussians = model.gaussians_at(0.0)
+        gaussians = model.at(0.0)
         removed = (gaussians.means[:, 0] < 0) & (gaussians.means[:, 2] < 4)
         before, after, alone = (
             model.render(on_gpu, gaussians=some) for some in (gaussians, gaussians[~removed], gaussians[removed])
@@ -189,11 +189,11 @@ def test_actors_agree_with_the_cpu():
             value += 0.1 * torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
     view = recorded_views(1, width=96, height=64)[0].view
     times = (0.0, 0.3, 1.1, 1.9, 5.0)
-    on_cpu = [model.gaussians_at(time) for time in times]
+    on_cpu = [model.at(time) for time in times]
     alone_on_cpu = model.objects_alpha(model.render(view), view).detach()
     model, on_gpu = model.to(GPU), recorded_views(1, width=96, height=64, device=GPU)[0].view
     for time, expected in zip(times, on_cpu, strict=True):
-        found = model.gaussians_at(time)
+        found = model.at(time)
         for name, values in found.tensors.items():
             torch.testing.assert_close(values.cpu(), expected.tensors[name], rtol=1e-4, atol=1e-5)
     alone = model.objects_alpha(model.render(on_gpu), on_gpu).detach().cpu()
@@ -413,9 +413,9 @@ def test_a_recoloured_actor_has_the_colours_of_the_cpu():
     model = untrained_street(settings_of()).requires_grad_(False)
     matrix = np.array([[0.2, 0.7, 0.1], [0.0, 0.4, 0.3], [0.9, 0.0, 0.2]])
     first, *others = (track.id for track in model.parts[1].timeline.tracks)
-    placements = [ActorPlacement(first, color_matrix=matrix), *(ActorPlacement(other) for other in others)]
-    expected, plain = model.gaussians_with_placements(0.7, placements).sh, model.gaussians_at(0.7).sh
-    found = model.to(GPU).gaussians_with_placements(0.7, placements).sh.cpu()
+    edited = Want(placements=(ActorPlacement(first, color_matrix=matrix), *map(ActorPlacement, others)))
+    expected, plain = model.at(0.7, edited).sh, model.at(0.7).sh
+    found = model.to(GPU).at(0.7, edited).sh.cpu()
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert bool((expected != plain).any())
 
@@ -428,7 +428,7 @@ def test_the_frames_of_a_film_equal_single_frames(street_film, captures, monkeyp
     monkeypatch.setattr(capacity, "MARGIN", 4.0)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     assert len(captures) == 1 and captures[0] is not None
-    edited = [(view, model.gaussians_at(view.time) if i % 2 else None) for i, view in enumerate(views)]
+    edited = [(view, model.at(view.time) if i % 2 else None) for i, view in enumerate(views)]
     by_turns = zip(film_frames(model, [(view, None) for view in views]), film_frames(model, edited), strict=True)
     for together in zip(*by_turns, strict=True):
         assert_frames(list(together), expected)
@@ -474,14 +474,14 @@ def test_frames_of_a_camera_of_the_rig_are_not_captured(street_film, captures):
 
 def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film, monkeypatch, caplog):
     model, views, expected = street_film
-    of_states = SplatModel.sets_at_time_states
+    sample = SplatModel.sample
 
-    def waiting(self, states):
-        found = of_states(self, states)
+    def waiting(self, states, want=IMAGE):
+        found = sample(self, states, want)
         assert all(float(own.means.sum()) < 1e9 for own in found)
         return found
 
-    monkeypatch.setattr(SplatModel, "sets_at_time_states", waiting)
+    monkeypatch.setattr(SplatModel, "sample", waiting)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     (record,) = caplog.records
     assert record.message.startswith("frames of films cannot be captured as a CUDA graph")
@@ -502,8 +502,8 @@ def trained_with(
     """A training of background and cars, people or drifting Gaussians, by every loss term, with or without CUDA graphs,
     rolling shutters, scans, by day or by night."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
-    echo = initial_echo(recorded) if recorded else None
-    model = untrained_drifting(chosen) if drifting else untrained_street(chosen, echo, people)
+    logits = initial_lidar_logits(recorded) if recorded else None
+    model = untrained_drifting(chosen) if drifting else untrained_street(chosen, logits, people)
     for part in model.parts:  # no spheres, whose rotations learn from rounding
         part.params["scales"].data += 0.5 * torch.randn(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)

@@ -39,7 +39,7 @@ def terms_of(model: SplatModel, scan: TrainingScan, inputs: ScanInputs | None = 
 
 
 def test_scans_of_one_shape_share_their_inputs():
-    model, shared = untrained_street(SETTINGS, echo=(0.0, 2.0)), SharedScanInputs()
+    model, shared = untrained_street(SETTINGS, lidar_logits=(0.0, 2.0)), SharedScanInputs()
     scans = load_scans([revolution(0.0, 0.4), revolution(0.6, 1.2)], SETTINGS.scans, CPU)
     expected = [terms_of(model, scan) for scan in scans]
     assert all(abs(expected[0][name] - expected[1][name]) > 1e-4 for name in ("scan_range", "scan_intensity"))
@@ -54,7 +54,7 @@ def test_scans_of_one_shape_share_their_inputs():
 
 def test_scans_of_other_shapes_have_inputs_of_their_own():
     """Without intensity, or without rays that the vehicle blocks."""
-    model, shared, full = untrained_street(SETTINGS, echo=(0.0, 2.0)), SharedScanInputs(), revolution(0.0, 0.4)
+    model, shared, full = untrained_street(SETTINGS, lidar_logits=(0.0, 2.0)), SharedScanInputs(), revolution(0.0, 0.4)
     silent = replace(full, scan=replace(full.scan, intensities=None))
     scans = load_scans([full, silent, replace(full, blocked=np.zeros_like(full.blocked)), full], SETTINGS.scans, CPU)
     numbers = [shared.load(scan, model.states(scan.view.time, SCAN)).number for scan in scans]
@@ -76,7 +76,7 @@ def held_by(value: object, path: str = "scan") -> dict[str, torch.Tensor]:
 def test_the_tensors_of_a_scan_are_all_that_it_holds():
     """Also what a rendering has cached. One that `tensors` forgot would keep the values of the first scan."""
     (scan,) = load_scans([revolution(0.0, 0.4)], SETTINGS.scans, CPU)
-    terms_of(untrained_street(SETTINGS, echo=(0.0, 2.0)), scan)
+    terms_of(untrained_street(SETTINGS, lidar_logits=(0.0, 2.0)), scan)
     known, held = {values.data_ptr() for values in scan.tensors}, held_by(scan)
     assert len(held) > 30 and any("borders" in name for name in held)
     assert [name for name, values in held.items() if values.data_ptr() not in known] == []

@@ -250,7 +250,7 @@ def test_an_iteration_with_dropout_leaves_out_static_gaussians_and_others_next_t
         _, picture, _ = trainer.training_step()
         left_out.append(picture.shapes.opacities[still] == 0.0)
     assert all(0.1 < float(mask.float().mean()) < 0.5 for mask in left_out) and not torch.equal(*left_out)
-    assert (trainer.state.model.gaussians_at(0.0).opacities[still] > 0.0).all()
+    assert (trainer.state.model.at(0.0).opacities[still] > 0.0).all()
 
 
 @pytest.mark.parametrize(("limit", "farthest"), [(50.0, 50.0), (None, 7e5)])
@@ -275,7 +275,7 @@ def test_a_training_applies_the_flatness_and_road_losses():
     poses[:, 2, 3], poses[:, 0, 3] = 4.5, [-1.0, 1.0]
     road = driven_road(poses, settings.road)
     trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, road)
-    before = trainer.state.model.gaussians_at(0.0)
+    before = trainer.state.model.at(0.0)
     terms, *_ = trainer.training_step()
     torch.testing.assert_close(terms["flatness"], 0.2 * before.scales.amin(dim=1).mean())
     assert float(terms["road"].detach()) > 0.0
