@@ -41,9 +41,9 @@ from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
 from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import concatenate
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import RollingShutter, View
