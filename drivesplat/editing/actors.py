@@ -8,7 +8,7 @@ import numpy as np
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.trajectory import recorded_frames
 from drivesplat.scene.motion import HALF_STEP, Motion

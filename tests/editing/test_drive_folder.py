@@ -30,7 +30,7 @@ from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_driv
 from drivesplat.editing.render_plan import image_render_plan
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.storage import unwritable
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.readers.drive.check import check, whole_scene

@@ -32,7 +32,7 @@ from drivesplat.editing.film import EditFiles, Still, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import read_footage
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame

@@ -31,9 +31,9 @@ from drivesplat.export.trained_parts import SampledGroup, sampled_shapes, traine
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_scene import ViewerContent, modes_array
 from drivesplat.kernels.placement import LocalGaussians
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import concatenate
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 
 EDITED = {"walked": 0.7, "scale": 1.25, "phase": 0.3}

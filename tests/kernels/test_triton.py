@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from drivesplat.kernels.echoes import echo_values
 from helpers import REPOSITORY
 from helpers.patience import PATIENCE_S
 from helpers.trainings import ALL_TERMS, guided_views, settings_of, untrained_street
@@ -29,7 +30,6 @@ from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
 from drivesplat.kernels.depth_error import mean_depth_error
-from drivesplat.kernels.echoes import echo_values
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.finite import NEVER, record_not_finite
 from drivesplat.kernels.gsplat_private import sh_basis

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from drivesplat.model.track_penalties import track_penalties
 from helpers.hand_made import about_z, actors_of, looking_at, motion_through, track_of
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +15,6 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
-from drivesplat.model.track_penalties import track_penalties
 from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings
 from drivesplat.training.optimizers import make_optimizers

@@ -10,12 +10,12 @@ from helpers.hand_made import actor_record, actors_of, motion_through, track_of
 from helpers.records import training_record_of
 
 from drivesplat.kernels.quaternions import rotation_matrix
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.build import ModelInit, build_model, definitions, rebuild_model
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.lattice import Lattice, Undeformed, roughness
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.motion import HALF_STEP
 from drivesplat.settings.deformable import GaitSettings, LatticeSettings
