@@ -118,9 +118,8 @@ def test_labels_are_the_actors_that_contribute_most_and_boxes_of_what_stands_in_
     intensity = found.rendered.intensities
     for name, kind in ((AHEAD, "vehicle"), (truck.id, "wall")):
         rays = found.objects == names.index(name)
-        assert np.median(intensity[rays]) == pytest.approx(
-            float(torch.tensor(LIDAR_LOGITS[kind][0]).sigmoid()), abs=0.03
-        )
+        expected = float(torch.tensor(LIDAR_LOGITS[kind][0]).sigmoid())
+        assert np.median(intensity[rays]) == pytest.approx(expected, abs=0.03)
     assert (found.objects[~found.returned] == NO_OBJECT).all()
 
 

@@ -130,13 +130,8 @@ def untrained_street(
     """Background, two cars and a sky; with `lidar_logits` of intensity and returns, for a LiDAR, too, with the offsets
     that settings want. `people`: what the cars are deforms."""
     still = untrained(settings, sky=True, lidar_logits=lidar_logits, offsets=settings.scans.fine_tune > 0)
-    moving: Actors = actors_of(
-        *cars(),
-        count=25,
-        settings=settings.deformable if people else settings.actors,
-        shaken=False,
-        lidar_logits=lidar_logits,
-    )
+    own = settings.deformable if people else settings.actors
+    moving: Actors = actors_of(*cars(), count=25, settings=own, shaken=False, lidar_logits=lidar_logits)
     if people:
         params = {name: value.detach() for name, value in moving.params.items()}
         moving = Deformable(params, moving.timeline.tracks, settings.deformable, settings.gaussians)
