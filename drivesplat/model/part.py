@@ -160,7 +160,7 @@ class Part(nn.Module, ABC):
 
 
 def preallocate(part: Part, rows: int) -> None:
-    """Declares so many rows at the end of a part preallocated (`drivesplat.training.cuda_graph.preallocation`)."""
+    """Declares so many rows at the end of a part preallocated (`drivesplat.training.graphs.preallocation`)."""
     part.preallocated = rows
     part.count_on_device.fill_(part.row_count - rows)
 
