@@ -101,9 +101,7 @@ class Monitor:
         )
 
     def scalars(self, step: int, values: dict[str, float], advanced: int) -> None:
-        with self._writing():
-            for name, value in values.items():
-                self._writer.add_scalar(name, value, step)
+        self.psnrs(step, values)
         self._bar.update(advanced)
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
 

@@ -92,6 +92,17 @@ def test_the_last_iterations_fine_tune_the_lidar():
     assert not schedule.fits_scan(435), "beyond the end only images are fitted"
 
 
+def test_fractions_of_a_training_count_its_scans_and_not_its_fine_tuning():
+    """Of 435 steps: learning rates, degrees, densification and averages end with the last image, step 375."""
+    schedule = scheduled(0.25, fine_tune=0.2)
+    assert schedule.settings.iterations == 300, "settings keep their meaning"
+    assert [schedule.progress(step) for step in (0, 75, 375)] == [0.0, 0.2, 1.0]
+    assert [schedule.step_at(fraction) for fraction in (0.0, 0.5, 1.0)] == [0, 187, 375]
+    assert [schedule.fine_tuned(step) for step in (375, 405)] == [0.0, 0.5]
+    every = schedule.step_at(schedule.settings.sh_every)
+    assert [schedule.sh_degree(step, 2) for step in (every - 1, every, 2 * every, 400)] == [0, 1, 2, 2]
+
+
 def test_nothing_is_fine_tuned_without_scans():
     for changes in ({"scans": 0}, {"per_image": 0.0}):
         schedule = scheduled(**{"per_image": 0.25, "fine_tune": 0.2, **changes})
