@@ -133,7 +133,7 @@ def _iterate(run: "TrainingRun", monitor: Monitor) -> None:
             monitor.progress(state.step, terms)
             if with_picture and picture is not None and image is not None:
                 monitor.image(state.step, image, run.without_dropout(picture, image))
-            monitor.psnrs(state.step, run.psnrs())
+            monitor.write(state.step, run.psnrs())
             run.probe()
             if run.save_due:
                 run.save()
