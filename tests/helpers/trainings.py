@@ -108,9 +108,9 @@ def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
 
 
 def untrained(
-    settings: TrainSettings, sky: bool = False, echo: tuple[float, float] | None = None, offsets: bool = False
+    settings: TrainSettings, sky: bool = False, logits: tuple[float, float] | None = None, offsets: bool = False
 ) -> SplatModel:
-    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, echo=echo, offsets=offsets)
+    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, lidar_logits=logits, offsets=offsets)
     return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
 
 
@@ -125,13 +125,17 @@ def cars() -> list[ActorTrack]:
 
 
 def untrained_street(
-    settings: TrainSettings, echo: tuple[float, float] | None = None, people: bool = False
+    settings: TrainSettings, logits: tuple[float, float] | None = None, people: bool = False
 ) -> SplatModel:
-    """Background, two cars and a sky; with `echo`, logits of intensity and returns, for a LiDAR, too, with the offsets
+    """Background, two cars and a sky; with `logits` of intensity and returns for a LiDAR, too, with the offsets
     that settings want. `people`: what the cars are deforms."""
-    still = untrained(settings, sky=True, echo=echo, offsets=settings.scans.fine_tune > 0)
+    still = untrained(settings, sky=True, logits=logits, offsets=settings.scans.fine_tune > 0)
     moving: Actors = actors_of(
-        *cars(), count=25, settings=settings.deformable if people else settings.actors, shaken=False, echo=echo
+        *cars(),
+        count=25,
+        settings=settings.deformable if people else settings.actors,
+        shaken=False,
+        lidar_logits=logits,
     )
     if people:
         own = {name: value.detach() for name, value in moving.params.items()}
