@@ -24,8 +24,8 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import RayGrid
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.loop import TrainingFolders, train
 from drivesplat.training.scans import TrainingScan
-from drivesplat.training.train import TrainingFolders, train
 from drivesplat.training.views import TrainingView
 
 ITERATIONS = 4

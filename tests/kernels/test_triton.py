@@ -48,7 +48,7 @@ from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.model.view_colors import all_view_colors, rasterizer_colors
 from drivesplat.settings.train import McmcSettings
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.loop import Trainer
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

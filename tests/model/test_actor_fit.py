@@ -19,7 +19,7 @@ from drivesplat.rasterization import rasterize
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.loop import Trainer
 from drivesplat.training.views import TrainingView
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -100,7 +100,7 @@ def fit(actors: Actors, views: list[TrainingView], iterations: int = 200) -> Non
     trainer = Trainer.begin(SplatModel([actors], None), views, settings, 0, torch.device("cpu"))
     for _ in range(iterations):
         trainer.training_step()
-        trainer.step += 1
+        trainer.state.step += 1
 
 
 def distances(actors: Actors, thing: Thing, pose: np.ndarray, time: float) -> np.ndarray:

@@ -25,8 +25,9 @@ from drivesplat.settings.drifting import DriftingSeedSettings, DriftingSettings
 from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainJob, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier
+from drivesplat.training.loop import Trainer
 from drivesplat.training.optimizers import make_optimizers
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.schedule import Schedule
 from drivesplat.training.views import TrainingView
 
 COUNT = 7
@@ -256,7 +257,7 @@ def test_densification_copies_motion_and_life_with_each_gaussian(monkeypatch):
     before = rows()
     (optimizers,) = make_optimizers(SplatModel([part], None)).parts
     assert {"velocities", "peaks", "spans"} <= optimizers.keys()
-    Densifier(part, settings).after_step(1, optimizers, {}, slice(0, 40))
+    Densifier(part, Schedule.of(settings, 1)).after_step(1, optimizers, {}, slice(0, 40))
     assert len(part) == 50 and {len(value) for value in part.params.values()} == {50}
     assert rows() <= before and len(rows()) <= 30
 
@@ -313,7 +314,7 @@ def test_what_moves_is_learned_with_its_velocity_and_shown_between_the_images():
         trainer = Trainer.begin(model, recorded(looking_on(train)), settings, 0, torch.device("cpu"))
         for _ in range(200):
             trainer.training_step()
-            trainer.step += 1
+            trainer.state.step += 1
         with torch.no_grad():
             shown = [
                 (model.render(it.view).image - it.pixels / 255.0).square().mean()

@@ -31,14 +31,12 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
-from drivesplat.training.dropout import dropout_share
+from drivesplat.training.augmentation import choose_mirrored, dropout_share
 from drivesplat.training.exposure_init import initial_gains
-from drivesplat.training.mirroring import choose_mirrored
-from drivesplat.training.probes import NO_PROBES, Probes
-from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
+from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
+from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, evenly_spaced
 from drivesplat.training.road import road_of
 from drivesplat.training.scans import TrainingScan, initial_lidar_logits, load_scans, with_scan_points
-from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import Supervision, TrainingView, load_views
 
