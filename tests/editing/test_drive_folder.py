@@ -21,6 +21,7 @@ from helpers.hand_made_street import (
     straight,
     street_model,
 )
+from helpers.samples import sampled_with
 from nuscenes.nuscenes import NuScenes
 from nuscenes.utils.geometry_utils import view_points
 from PIL import Image, ImageDraw
@@ -88,7 +89,7 @@ def shown_by(model: SplatModel, frame: Frame, scene: Scene, placed: list[ActorPl
         frame.height,
         time=scene.seconds(frame.timestamp),
     )
-    return film_frame(model, view, model.gaussians_with_placements(view.time, placed)).astype(int)
+    return film_frame(model, view, sampled_with(model, view.time, placed)).astype(int)
 
 
 def as_read(folder: Path) -> Scene:
