@@ -16,10 +16,17 @@ from torch.nn.functional import normalize, one_hot
 
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.object_poses import corrected
-from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, mirrored, of_owners, place
+from drivesplat.kernels.placement import (
+    LocalGaussians,
+    ObjectPoses,
+    colors_in_object,
+    colors_in_world,
+    mirrored,
+    of_owners,
+    place,
+)
 from drivesplat.kernels.quaternions import rotation_matrix
-from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
-from drivesplat.kernels.track_penalties import sums_of_squares
+from drivesplat.kernels.regularizers import sums_of_squares
 from drivesplat.model.actor_placements import ActorPlacement, Posed, placement_sets, with_colors, with_placements
 from drivesplat.model.gaussians import Gaussians, concatenate, no_colors
 from drivesplat.model.harmonics import rotation_of_harmonics_by
