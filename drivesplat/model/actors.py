@@ -137,8 +137,9 @@ class Actors(Part):
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state;
         velocities by the actors HALF_STEP seconds before and after."""
         p, (means, *shapes) = self.params, self._in_world(now)
-        colors = no_colors(means)
-        if want.colors:
+        if not want.colors:
+            colors = no_colors(means)
+        else:
             side = None if self.mirrored is None else now.state.side
             # colors rotate by a few degrees: their gradient would add only noise to the track
             rotations = rotation_of_harmonics_by(now.poses.quats, p["shN"].shape[2] + 1, side)
@@ -148,7 +149,7 @@ class Actors(Part):
         return Gaussians(means, *shapes, *colors, velocities, logits)
 
     def posed(self, time_state: Sequence[Tensor]) -> Posed:
-        """The actors at their annotated poses with learned corrections."""
+        """The actors at their annotated poses with learned corrections, by the tensors of a time in a `state`."""
         state = TimeState(*time_state)
         corrections = self._annotated_actor, self.shared["yaw"], self.shared["translation"]
         quats, translations = corrected(state.quats, state.translations, state.weights, *corrections)
