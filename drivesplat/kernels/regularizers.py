@@ -1,10 +1,12 @@
-"""Means over Gaussians that regularizers penalise: opacity and scale (MCMC), and thickness."""
+"""What regularizers penalise: the mean opacity and scale (MCMC) and the thickness of Gaussians, and the corrections of
+tracks."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drivesplat.kernels import triton_support
+from drivesplat.kernels.constants import constant
 
 
 def mean_opacity_and_scale(
@@ -29,3 +31,22 @@ def mean_thickness(scales: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
 
         return MeanThickness.apply(scales)
     return scales.min(dim=1).values.mean()
+
+
+def sums_of_squares(
+    shifts: Float[Tensor, "m 3"],
+    yaw: Float[Tensor, " m"],
+    neighbours: Int[Tensor, "q 3"],
+    sigma_shift: float,
+    sigma_yaw: float,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Of corrections of positions (metres) and headings (radians), in units of their sigmas: the sum of their squares,
+    and that of their second differences, for which `neighbours` are all triples of consecutive annotations."""
+    if triton_support.usable_for(yaw):
+        from drivesplat.kernels.triton.track_penalties import SumsOfSquares
+
+        return SumsOfSquares.apply(shifts, yaw, neighbours, 1.0 / sigma_shift, 1.0 / sigma_yaw)
+    off = torch.cat([shifts, yaw[:, None]], dim=1) / constant((sigma_shift,) * 3 + (sigma_yaw,), yaw.device)
+    threes = off.index_select(0, neighbours.flatten()).reshape(-1, 3, 4)
+    bends = (threes * constant((1.0, -2.0, 1.0), yaw.device)[:, None]).sum(dim=1)
+    return off.flatten().dot(off.flatten()), bends.flatten().dot(bends.flatten())

@@ -16,10 +16,17 @@ from torch.nn.functional import normalize, one_hot
 
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.object_poses import corrected
-from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, mirrored, of_owners, place
+from drivesplat.kernels.placement import (
+    LocalGaussians,
+    ObjectPoses,
+    colors_in_object,
+    colors_in_world,
+    mirrored,
+    of_owners,
+    place,
+)
 from drivesplat.kernels.quaternions import rotation_matrix
-from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
-from drivesplat.kernels.track_penalties import sums_of_squares
+from drivesplat.kernels.regularizers import sums_of_squares
 from drivesplat.model.actor_placements import ActorPlacement, Posed, placement_sets, with_colors, with_placements
 from drivesplat.model.gaussians import Gaussians, concatenate, no_colors
 from drivesplat.model.harmonics import rotation_of_harmonics_by
@@ -130,8 +137,9 @@ class Actors(Part):
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state;
         velocities by the actors HALF_STEP seconds before and after."""
         p, (means, *shapes) = self.params, self._in_world(now)
-        colors = no_colors(means)
-        if want.colors:
+        if not want.colors:
+            colors = no_colors(means)
+        else:
             side = None if self.mirrored is None else now.state.side
             # colors rotate by a few degrees: their gradient would add only noise to the track
             rotations = rotation_of_harmonics_by(now.poses.quats, p["shN"].shape[2] + 1, side)
@@ -141,7 +149,7 @@ class Actors(Part):
         return Gaussians(means, *shapes, *colors, velocities, logits)
 
     def posed(self, time_state: Sequence[Tensor]) -> Posed:
-        """The actors at their annotated poses with learned corrections."""
+        """The actors at their annotated poses with learned corrections, by the tensors of a time in a `state`."""
         state = TimeState(*time_state)
         corrections = self._annotated_actor, self.shared["yaw"], self.shared["translation"]
         quats, translations = corrected(state.quats, state.translations, state.weights, *corrections)

@@ -123,7 +123,7 @@ class GaussianSets(tuple[Gaussians, ...]):
 
     @property
     def are_apart(self) -> bool:
-        """Whether `shapes` have not been computed, which copies them."""
+        """Whether `shapes`, a copy of all of them, has not been computed."""
         return "shapes" not in self.__dict__
 
 

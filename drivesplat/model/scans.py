@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drivesplat.errors import ResultError
-from drivesplat.kernels.lidar_response import lidar_response
+from drivesplat.kernels.view_colors import lidar_response
 from drivesplat.model.gaussians import Gaussians, GaussianSets
 from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan

@@ -10,9 +10,8 @@ from helpers.samples import sampled, sampled_with
 from scipy.spatial.transform import Rotation
 from torch.nn.functional import one_hot
 
-from drivesplat.kernels.placement import ObjectPoses
+from drivesplat.kernels.placement import ObjectPoses, colors_in_object
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix, turned
-from drivesplat.kernels.time_varying_colors import colors_in_object
 from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.actors import Actors, track_penalties
 from drivesplat.model.harmonics import rotated

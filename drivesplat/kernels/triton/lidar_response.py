@@ -16,7 +16,7 @@ BLOCK = 256
 
 
 class LidarResponse(torch.autograd.Function):
-    """`drivesplat.kernels.lidar_response.lidar_response`. Gradients reach the logits."""
+    """`drivesplat.kernels.view_colors.lidar_response`. Gradients reach the logits."""
 
     @staticmethod
     def forward(ctx: Any, logits: Tensor, means: Tensor, sensor: Tensor) -> Tensor:
