@@ -10,6 +10,7 @@ from gsplat import MCMCStrategy
 from gsplat.strategy import ops
 from helpers.densification import ALL, a_model, a_view, settings_of, train_step
 from helpers.hand_made import actors_of, motion_through, round_gaussians, track_of
+from helpers.samples import sampled
 
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import cpu_strategies
@@ -165,7 +166,7 @@ def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
     assert len(model) == 100
     moved = part.params["means"].detach()[:30]
     assert ((moved[:, None] - living).abs().amax(dim=2).amin(dim=1) == 0).all()
-    assert (part.sample(part.state(0.0)).opacities > 0.005).all()
+    assert (sampled(part, 0.0).opacities > 0.005).all()
 
 
 def test_relocation_hardly_changes_what_is_seen():
@@ -254,7 +255,7 @@ def test_the_default_strategy_resets_opacities_every_so_many_iterations():
     brightest = []
     for step in range(1, 4):
         train_step(model, densifier, step, optimizers)
-        brightest.append(float(model.parts[0].sample(model.parts[0].state(0.0)).opacities.detach().max()))
+        brightest.append(float(sampled(model.parts[0], 0.0).opacities.detach().max()))
     assert min(brightest[:2]) > 0.05
     assert brightest[2] == pytest.approx(0.01, rel=1e-3), "twice prune_opacity, as in 3DGS"
 
@@ -341,7 +342,7 @@ def test_each_part_grows_by_the_gradients_of_its_own_rows(wanting):
     trainer.densify(
         Picture(GaussianSets([together]), nothing, nothing, nothing[..., 0], None, screen_gradients(strengths))
     )
-    grown = [part.sample(part.state(0.0))[count:] for part, count in zip(model.parts, before, strict=True)]
+    grown = [sampled(part, 0.0)[count:] for part, count in zip(model.parts, before, strict=True)]
     assert torch.equal(torch.cat([new.means for new in grown]), together.means[wanting])
     assert len(grown[0]) == sum(row < 30 for row in wanting)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, track_of
+from helpers.samples import sampled
 from skimage.metrics import structural_similarity
 
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
@@ -128,7 +129,7 @@ def test_colour_terms_are_weighted_l1_and_ssim():
 def test_regularizers_are_weighted_means_over_all_gaussians():
     picture, view = a_case(model := a_model())
     terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=0.03, scale_reg=0.07))
-    gaussians = model.parts[0].sample(model.parts[0].state(0.0))
+    gaussians = sampled(model.parts[0], 0.0)
     torch.testing.assert_close(terms["opacity_reg"], 0.03 * gaussians.opacities.mean())
     torch.testing.assert_close(terms["scale_reg"], 0.07 * gaussians.scales.mean())
 
@@ -137,7 +138,7 @@ def test_regularizers_of_several_parts_weigh_every_gaussian_alike():
     parts = [a_model(gaussians=n).parts[0] for n in (3, 9)]
     picture, view = a_case(model := SplatModel(parts, None))
     terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=1.0))
-    opacities = torch.cat([part.sample(part.state(0.0)).opacities for part in parts])
+    opacities = torch.cat([sampled(part, 0.0).opacities for part in parts])
     torch.testing.assert_close(terms["opacity_reg"], opacities.mean())
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.densification import ALL, a_model, a_view, settings_of, train_step
+from helpers.samples import sampled
 from helpers.trainings import ALL_TERMS, EndedError, EndingViews, guided_views, trained, untrained_street
 from helpers.trainings import settings_of as settings_of_training
 
@@ -63,12 +64,12 @@ def test_preallocated_rows_learn_nothing():
     part = model.parts[0]
     rows, moved = slice(len(part), None), part.params["means"].detach().clone()
     before = {name: values[rows].detach().clone() for name, values in part.params.items()}
-    shown = part.sample(part.state(0.0))
+    shown = sampled(part, 0.0)
     assert part.preallocated == 50 and not shown.opacities[rows].any() and not shown.scales[rows].any()
     train_step(model, densifier, 5, optimizers, learns_size=True)
     assert part.preallocated == 50 and not torch.equal(part.params["means"], moved)
     with torch.no_grad():
-        preallocated = part.sample(part.state(0.0))[torch.arange(part.row_count) >= len(part)]
+        preallocated = sampled(part, 0.0)[torch.arange(part.row_count) >= len(part)]
         alone = model.render(a_view(), gaussians=preallocated)
     assert not alone.image.any() and not alone.alpha.any()
     for name, values in part.params.items():
@@ -127,7 +128,7 @@ def test_preallocated_rows_have_no_weight_in_the_road_loss():
     with torch.no_grad():
         part.params["means"][len(part) :] = torch.tensor([0.0, 0.0, 0.2])
     road = driven_road(np.tile(np.eye(4), (1, 1, 1)), RoadSettings())
-    shown, settings = part.sample(part.state(0.0)), TrainSettings(road_weight=1.0)
+    shown, settings = sampled(part, 0.0), TrainSettings(road_weight=1.0)
     there = shown[torch.arange(part.row_count) < len(part)]
     with_them, alone = (float(surface_terms([own], model, road, settings)["road"].detach()) for own in (shown, there))
     assert with_them == pytest.approx(alone)
@@ -150,7 +151,7 @@ def test_preallocated_rows_do_not_change_flatness():
     model, _, _, _ = grown(True, 4)
     part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
     found = surface_terms(model.render(a_view()).sets, model, None, settings)
-    expected = part.sample(part.state(0.0))[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
+    expected = sampled(part, 0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
     assert part.preallocated and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
 
 

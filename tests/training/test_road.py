@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, round_gaussians, track_of
 from helpers.records import training_record_of
+from helpers.samples import sampled
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.regularizers import mean_thickness
@@ -311,7 +312,7 @@ def test_terms_are_weighted_and_apply_to_static_parts_only():
     model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
     terms = surface_terms(picture.sets, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
-    still = model.parts[0].sample(model.parts[0].state(0.0))
+    still = sampled(model.parts[0], 0.0)
     torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
     torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known()))
     assert float(terms["road"].detach()) > 0.0
@@ -333,7 +334,7 @@ def test_flatness_makes_the_shortest_axis_shorter_and_no_other():
     part = round_gaussians(np.zeros((2, 3)), sizes=0.2)
     with torch.no_grad():
         part.params["scales"] += torch.log(torch.tensor([[1.0, 0.5, 2.0], [3.0, 2.0, 0.25]]))
-    flat = mean_thickness(part.sample(part.state(0.0)).scales)
+    flat = mean_thickness(sampled(part, 0.0).scales)
     assert float(flat.detach()) == pytest.approx(0.2 * (0.5 + 0.25) / 2)
     flat.backward()
     assert (part.params["scales"].grad > 0).tolist() == [[False, True, False], [False, False, True]]
