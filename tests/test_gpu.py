@@ -41,11 +41,12 @@ from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
 from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import concatenate
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import IMAGE, SCAN, Want
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.rendering import captured_frames
@@ -56,12 +57,12 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainSettings
 from drivesplat.settings.train_objects import DeformableSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training import step as step_module
 from drivesplat.training import strategies
-from drivesplat.training import trainer as trainer_module
-from drivesplat.training.dropout import with_dropout
-from drivesplat.training.mirroring import sets_with_mirrored_objects
-from drivesplat.training.scans import initial_echo, load_scans
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.augmentation import mirrored_at_random, with_dropout
+from drivesplat.training.graphs import captured_steps
+from drivesplat.training.loop import Trainer
+from drivesplat.training.scans import initial_lidar_logits, load_scans
 
 pytestmark = [
     pytest.mark.gpu,
@@ -169,7 +170,7 @@ def test_film_frames_and_removals_agree_with_the_cpu():
     model = model.to(GPU)
     assert np.percentile(np.abs(film_frame(model, on_gpu) - on_cpu_frame), 99) <= 1
     with torch.no_grad():
-        gaussians = model.gaussians_at(0.0)
+        gaussians = model.at(0.0)
         removed = (gaussians.means[:, 0] < 0) & (gaussians.means[:, 2] < 4)
         before, after, alone = (
             model.render(on_gpu, gaussians=some) for some in (gaussians, gaussians[~removed], gaussians[removed])
@@ -188,11 +189,11 @@ def test_actors_agree_with_the_cpu():
             value += 0.1 * torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
     view = recorded_views(1, width=96, height=64)[0].view
     times = (0.0, 0.3, 1.1, 1.9, 5.0)
-    on_cpu = [model.gaussians_at(time) for time in times]
+    on_cpu = [model.at(time) for time in times]
     alone_on_cpu = model.objects_alpha(model.render(view), view).detach()
     model, on_gpu = model.to(GPU), recorded_views(1, width=96, height=64, device=GPU)[0].view
     for time, expected in zip(times, on_cpu, strict=True):
-        found = model.gaussians_at(time)
+        found = model.at(time)
         for name, values in found.tensors.items():
             torch.testing.assert_close(values.cpu(), expected.tensors[name], rtol=1e-4, atol=1e-5)
     alone = model.objects_alpha(model.render(on_gpu), on_gpu).detach().cpu()
@@ -412,9 +413,9 @@ def test_a_recoloured_actor_has_the_colours_of_the_cpu():
     model = untrained_street(settings_of()).requires_grad_(False)
     matrix = np.array([[0.2, 0.7, 0.1], [0.0, 0.4, 0.3], [0.9, 0.0, 0.2]])
     first, *others = (track.id for track in model.parts[1].timeline.tracks)
-    placements = [ActorPlacement(first, color_matrix=matrix), *(ActorPlacement(other) for other in others)]
-    expected, plain = model.gaussians_with_placements(0.7, placements).sh, model.gaussians_at(0.7).sh
-    found = model.to(GPU).gaussians_with_placements(0.7, placements).sh.cpu()
+    edited = Want(placements=(ActorPlacement(first, color_matrix=matrix), *map(ActorPlacement, others)))
+    expected, plain = model.at(0.7, edited).sh, model.at(0.7).sh
+    found = model.to(GPU).at(0.7, edited).sh.cpu()
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert bool((expected != plain).any())
 
@@ -427,7 +428,7 @@ def test_the_frames_of_a_film_equal_single_frames(street_film, captures, monkeyp
     monkeypatch.setattr(capacity, "MARGIN", 4.0)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     assert len(captures) == 1 and captures[0] is not None
-    edited = [(view, model.gaussians_at(view.time) if i % 2 else None) for i, view in enumerate(views)]
+    edited = [(view, model.at(view.time) if i % 2 else None) for i, view in enumerate(views)]
     by_turns = zip(film_frames(model, [(view, None) for view in views]), film_frames(model, edited), strict=True)
     for together in zip(*by_turns, strict=True):
         assert_frames(list(together), expected)
@@ -473,14 +474,14 @@ def test_frames_of_a_camera_of_the_rig_are_not_captured(street_film, captures):
 
 def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film, monkeypatch, caplog):
     model, views, expected = street_film
-    of_states = SplatModel.sets_at_time_states
+    sample = SplatModel.sample
 
-    def waiting(self, states):
-        found = of_states(self, states)
+    def waiting(self, states, want=IMAGE):
+        found = sample(self, states, want)
         assert all(float(own.means.sum()) < 1e9 for own in found)
         return found
 
-    monkeypatch.setattr(SplatModel, "sets_at_time_states", waiting)
+    monkeypatch.setattr(SplatModel, "sample", waiting)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     (record,) = caplog.records
     assert record.message.startswith("frames of films cannot be captured as a CUDA graph")
@@ -501,8 +502,8 @@ def trained_with(
     """A training of background and cars, people or drifting Gaussians, by every loss term, with or without CUDA graphs,
     rolling shutters, scans, by day or by night."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
-    echo = initial_echo(recorded) if recorded else None
-    model = untrained_drifting(chosen) if drifting else untrained_street(chosen, echo, people)
+    logits = initial_lidar_logits(recorded) if recorded else None
+    model = untrained_drifting(chosen) if drifting else untrained_street(chosen, logits, people)
     for part in model.parts:  # no spheres, whose rotations learn from rounding
         part.params["scales"].data += 0.5 * torch.randn(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
@@ -517,13 +518,14 @@ def trained_with(
         losses = [
             float(torch.stack(list(continued(trainer).values())).sum()) for _ in range(iterations_done or iterations)
         ]
-    trainer.guard.check("nowhere")
+    trainer.state.guard.check("nowhere")
     return trainer, losses
 
 
 def steps_of(trainer: Trainer) -> dict[str, int]:
     """The number of steps of each optimizer."""
-    return {name: int(optimizer.state[optimizer.parameter]["step"]) for name, optimizer in trainer.optimizers.all()}
+    optimizers = trainer.state.optimizers.all()
+    return {name: int(optimizer.state[optimizer.parameter]["step"]) for name, optimizer in optimizers}
 
 
 def continued(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
@@ -542,14 +544,14 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, night
     eager, theirs = trained_with(False, shutters=shutters, night=night, sh_every=0.5)
     assert not caplog.records, "nothing was refused"
     graphs = len(captured.images.views) if shutters else 1
-    assert len(captured.graphs._graphs) == graphs and not eager.graphs._graphs
+    assert len(captured.steps.graphs._graphs) == graphs and not eager.steps.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
     assert mine[-1] < 0.8 * mine[0] and steps_of(captured) == steps_of(eager)
-    before = untrained_street(captured.settings).state_dict()
-    for name, value in ((name, value) for name, value in eager.model.state_dict().items() if name in before):
+    before = untrained_street(captured.schedule.settings).state_dict()
+    for name, value in ((name, value) for name, value in eager.state.model.state_dict().items() if name in before):
         moved = (value.cpu() - before[name]).abs().float()
         if moved.any() and not name.endswith(("scales", "quats")):
-            apart = (captured.model.state_dict()[name] - value).abs().cpu()
+            apart = (captured.state.model.state_dict()[name] - value).abs().cpu()
             assert float(apart.quantile(0.5)) <= 0.1 * float(moved.max()), name
 
 
@@ -557,16 +559,16 @@ def test_people_are_captured_and_learn_what_they_learn_without_graphs(caplog):
     captured, mine = trained_with(True, people=True)
     eager, theirs = trained_with(False, people=True)
     assert not caplog.records, "nothing was refused"
-    assert len(captured.graphs._graphs) == 1 and not eager.graphs._graphs
+    assert len(captured.steps.graphs._graphs) == 1 and not eager.steps.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
-    assert captured.model.parts[1].shared["lattice"].abs().max() > 1e-4
+    assert captured.state.model.parts[1].shared["lattice"].abs().max() > 1e-4
 
 
 def test_drifting_gaussians_are_captured_and_learn_what_they_learn_without_graphs(caplog):
     captured, mine = trained_with(True, drifting=True)
     eager, theirs = trained_with(False, drifting=True)
     assert not caplog.records, "nothing was refused"
-    assert len(captured.graphs._graphs) == 1 and not eager.graphs._graphs
+    assert len(captured.steps.graphs._graphs) == 1 and not eager.steps.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
     assert mine[-1] < mine[0]
 
@@ -577,11 +579,11 @@ def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, cap
     moving = {"linear": np.array([3.0, 0.5, 0.0]), "angular": np.array([0.0, 0.0, 0.3])}
     recorded = [replace(scan_of_a_wall(x), seconds=x, **moving) for x in (0.5, 1.0, 1.5)]
     beside = ScanTrainingSettings(per_image=1.0, **limits)
-    monkeypatch.setattr(trainer_module, "MEASURED_SCANS", 2)
+    monkeypatch.setattr(captured_steps, "MEASURED_SCANS", 2)
     captured, mine = trained_with(True, recorded=recorded, scans=beside)
     eager, theirs = trained_with(False, recorded=recorded, scans=beside)
     assert not caplog.records, "nothing was refused"
-    assert len(captured.graphs._graphs) == 2 and not eager.graphs._graphs
+    assert len(captured.steps.graphs._graphs) == 2 and not eager.steps.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
     assert steps_of(captured) == steps_of(eager), "a replay that created a state again would count from 0"
     assert mine[-1] < mine[1], "scans"
@@ -590,23 +592,27 @@ def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, cap
 
 def test_a_replayed_graph_reports_gradients_that_are_not_finite():
     trainer, _ = trained_with(True, iterations_done=10)
-    assert trainer.graphs._graphs
-    trainer.model.parts[0].params["opacities"].data[0] = torch.nan
+    assert trainer.steps.graphs._graphs
+    trainer.state.model.parts[0].params["opacities"].data[0] = torch.nan
     with capture_stream(GPU):
         continued(trainer)
     with pytest.raises(TrainingError, match=r"iteration 11: .*gradient of background opacities"):
-        trainer.guard.check("nowhere")
+        trainer.state.guard.check("nowhere")
 
 
 def test_captured_velocities_are_those_of_the_actors_that_own_the_gaussians_at_a_replay():
     actors = untrained_street(TrainSettings()).parts[1].to(GPU)
+
+    def velocities() -> torch.Tensor:
+        return actors.sample(actors.state(1.5, SCAN), SCAN).velocities
+
     with capture_stream(GPU):
-        before = actors.velocities(1.5)
-        graph = capture(lambda: actors.velocities(1.5), [], new_pool(), GPU, "velocities")
+        before = velocities()
+        graph = capture(velocities, [], new_pool(), GPU, "velocities")
         assert graph is not None
         actors.params["owner"].fill_(1)
         graph.replay()
-        after = actors.velocities(1.5)
+        after = velocities()
     assert torch.equal(graph.result, after) and not torch.equal(after, before)
 
 
@@ -615,12 +621,12 @@ def test_graphs_stay_valid_through_relocation_and_growth_into_preallocated_rows(
     grows = {"mcmc": McmcSettings(noise_lr=0.0, refine_every=12), "refine_start": 0.0, "refine_stop": 0.9}
     settings = {"iterations": 60, "cap_max": 10_000, **grows}
     trainer, losses = trained_with(True, iterations_done=40, **settings)
-    part = trainer.model.parts[0]
-    count, known, preallocated = len(part), dict(trainer.graphs._graphs), part.preallocated
+    part = trainer.state.model.parts[0]
+    count, known, preallocated = len(part), dict(trainer.steps.graphs._graphs), part.preallocated
     assert known and preallocated and losses[-1] < losses[0]
     with capture_stream(GPU):
         continued(trainer, 10)  # step 48 is among them
-        assert len(part) > count and part.preallocated < preallocated and trainer.graphs._graphs == known
+        assert len(part) > count and part.preallocated < preallocated and trainer.steps.graphs._graphs == known
         terms = continued(trainer, 10)
         assert part.preallocated == 0 and part.row_count == len(part), "densification has stopped"
     assert all(bool(torch.isfinite(value)) for value in terms.values())
@@ -632,14 +638,14 @@ def test_a_growing_training_learns_the_same_by_cuda_graphs(monkeypatch):
     (captured, mine), (eager, theirs) = (
         trained_with(capture, 60, cap_max=10_000, **grows) for capture in (True, False)
     )
-    assert [len(part) for part in captured.model.parts] == [len(part) for part in eager.model.parts]
-    assert captured.model.parts[0].preallocated and not eager.model.parts[0].preallocated
+    assert [len(part) for part in captured.state.model.parts] == [len(part) for part in eager.state.model.parts]
+    assert captured.state.model.parts[0].preallocated and not eager.state.model.parts[0].preallocated
     assert mine[-1] == pytest.approx(theirs[-1], rel=0.1) and mine[-1] < 0.8 * mine[0]
 
 
 def test_each_replay_drops_out_other_gaussians():
     model = untrained_street(settings_of()).to(GPU)
-    sets = model.sets_at(0.5)
+    sets = model.sample(model.states(0.5))
     before = concatenate(sets).opacities
 
     def dropped_out() -> torch.Tensor:
@@ -655,17 +661,17 @@ def test_each_replay_drops_out_other_gaussians():
     torch.cuda.synchronize()
     assert all(a.any() and not torch.equal(a, b) for a, b in pairwise(left_out))
     trainer, losses = trained_with(True, dropout=0.1)
-    assert len(trainer.graphs._graphs) == 1 and losses[-1] < losses[0]
+    assert len(trainer.steps.graphs._graphs) == 1 and losses[-1] < losses[0]
 
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_each_replay_mirrors_objects_at_random(degree):
     model = untrained_street(settings_of(deformable=DeformableSettings(sh_degree=degree)), people=True)
     model.parts[1].mirrored = torch.full((2,), 0.5)
-    view, states = recorded_views(1, device=GPU)[0].view, model.to(GPU).time_states(0.5)
+    states = model.to(GPU).states(0.5)
 
     def shown() -> torch.Tensor:
-        return sets_with_mirrored_objects(model, view, states)[1].means
+        return model.sample(mirrored_at_random(model, states))[1].means
 
     torch.manual_seed(0)
     with capture_stream(GPU), torch.no_grad():
@@ -691,36 +697,36 @@ def test_a_training_with_mirrored_people_is_captured(degree, monkeypatch, caplog
     monkeypatch.setitem(globals(), "untrained_street", mirrored)
     trainer, losses = trained_with(True, people=True, deformable=DeformableSettings(sh_degree=degree))
     assert not caplog.records, "nothing was refused"
-    assert len(trainer.graphs._graphs) == 1 and losses[-1] < losses[0]
+    assert len(trainer.steps.graphs._graphs) == 1 and losses[-1] < losses[0]
 
 
 def test_overflowed_lists_are_detected(monkeypatch):
     monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
     monkeypatch.setattr(capacity, "MARGIN", 1.0)
     trainer, _ = trained_with(True, iterations=8)
-    trainer.model.parts[0].params["scales"].data += 1.0
+    trainer.state.model.parts[0].params["scales"].data += 1.0
     with capture_stream(GPU):
         continued(trainer, 4)
-    assert any(map(overflowed, trainer.graphs._graphs.values()))
-    trainer.graphs.check()
-    assert not any(map(overflowed, trainer.graphs._graphs.values()))
+    assert any(map(overflowed, trainer.steps.graphs._graphs.values()))
+    trainer.steps.graphs.check()
+    assert not any(map(overflowed, trainer.steps.graphs._graphs.values()))
     monkeypatch.setattr(capacity, "MARGIN", 1.5)
     with capture_stream(GPU):
         continued(trainer, 2 * len(trainer.images.views))
-    assert trainer.graphs.enabled and len(trainer.graphs._graphs) == 1
+    assert trainer.steps.graphs.enabled and len(trainer.steps.graphs._graphs) == 1
 
 
 def test_a_training_that_cannot_be_captured_goes_on_without_graphs(monkeypatch, caplog):
     """As where a term of the loss asks the device something."""
 
-    def counting(*args, terms=trainer_module.loss_terms):
+    def counting(*args, terms=step_module.loss_terms):
         found = terms(*args)
         assert float(found["l1"]) >= 0.0
         return found
 
-    monkeypatch.setattr(trainer_module, "loss_terms", counting)
+    monkeypatch.setattr(step_module, "loss_terms", counting)
     trainer, losses = trained_with(True, iterations=12)
     assert torch.rand(3, device=GPU).any(), "random numbers can still be drawn"
     (record,) = caplog.records
     assert record.message.startswith("iterations cannot be captured as a CUDA graph")
-    assert not trainer.graphs.enabled and losses[-1] < losses[0] and all(map(math.isfinite, losses))
+    assert not trainer.steps.graphs.enabled and losses[-1] < losses[0] and all(map(math.isfinite, losses))

@@ -46,7 +46,7 @@ from drivesplat.settings.train import TrainJob
 from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.settings.world import WorldJob
 from drivesplat.training.road import lidar_road
-from drivesplat.training.run import TrainingFiles, read_inputs, run_training
+from drivesplat.training.stage import TrainingFiles, read_inputs, run_training
 from drivesplat.trajectories.actor_record import ActorRecords
 from drivesplat.workflow.stages import stage_settings
 
@@ -134,7 +134,7 @@ def drive(tiny_root, tmp_path_factory) -> EvaluationData:
 @pytest.fixture
 def no_colors_of_what_is_unseen(monkeypatch):
     """`train` without its last step, which street.py leaves out."""
-    monkeypatch.setattr("drivesplat.training.run.fill_unseen", lambda model, views: None)
+    monkeypatch.setattr("drivesplat.training.stage.fill_unseen", lambda model, views: None)
 
 
 def test_it_is_short_and_stands_alone():

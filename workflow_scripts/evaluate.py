@@ -6,7 +6,7 @@ from drivesplat.evaluation.evaluate import evaluate_method, read_evaluation_inpu
 from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.scene.images import write_image
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.training.run import read_summary
+from drivesplat.training.stage import read_summary
 
 with job(snakemake, dataset=("images", "sweeps")) as current:
     files = current.input

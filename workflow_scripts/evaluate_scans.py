@@ -4,7 +4,7 @@ from drivesplat.workflow.job import job
 from drivesplat.evaluation.evaluate_scans import evaluate_scans, read_scan_evaluation_inputs
 from drivesplat.io.storage import write_json
 from drivesplat.settings.evaluate import EvaluateScansJob
-from drivesplat.training.run import read_summary
+from drivesplat.training.stage import read_summary
 
 with job(snakemake, dataset=("sweeps",)) as current:
     files = current.input

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from drivesplat.workflow.job import job
 from drivesplat.settings.train import TrainJob
-from drivesplat.training.run import TrainingFiles, read_inputs, run_training
+from drivesplat.training.stage import TrainingFiles, read_inputs, run_training
 
 with job(snakemake, dataset=("images",)) as current:
     files = current.input

@@ -37,8 +37,8 @@ from drivesplat.kernels.gsplat_private import cpu_strategies
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
-from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.probes import NO_PROBES, Probes
+from drivesplat.training.step import ITERATION, UNTIMED, Clock
 
 CHECKPOINT = "ckpt.npz"
 

@@ -49,10 +49,10 @@ from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import CoarseToFineSettings
-from drivesplat.training.clock import UNTIMED, Clock
+from drivesplat.training.loop import TrainingFolders, train
 from drivesplat.training.probes import Probes
-from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
-from drivesplat.training.train import TrainingFolders, train
+from drivesplat.training.stage import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
+from drivesplat.training.step import UNTIMED, Clock
 from drivesplat.workflow.gpus import hold_gpu
 
 Times = dict[str, Any]

@@ -1,4 +1,4 @@
-"""A clock of the stages of an iteration (`drivesplat.training.clock`)."""
+"""A clock of the stages of an iteration (`drivesplat.training.step`)."""
 
 import time
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from drivesplat.training.clock import ITERATION, Clock
+from drivesplat.training.step import ITERATION, Clock
 
 OTHER = "other"
 """The part of an iteration outside its stages."""

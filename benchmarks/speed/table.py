@@ -16,7 +16,7 @@ from drivesplat.evaluation.comparison import (
     markdown_table,
     measured_groups,
 )
-from drivesplat.training.clock import ITERATION
+from drivesplat.training.step import ITERATION
 
 LEGEND = (
     "Loop: seconds of the training loop. Whole: seconds from parser.pkl to the written files. PSNR in dB on held-out "

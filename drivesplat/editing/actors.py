@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene

@@ -12,9 +12,10 @@ from drivesplat.editing.actors import actor_placements, other_objects, recorded_
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.editing.unseen_sides import UNSEEN, unseen_sides
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import Want
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, film_size, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
@@ -118,7 +119,7 @@ def edited_frames(
 ) -> Iterator[np.ndarray]:
     """The rendering of each view with the actors placed in it and no others, (h, w, 3) uint8 each."""
     pairs = zip(views, placed, strict=True)
-    return film_frames(model, ((view, model.gaussians_with_placements(view.time, actors)) for view, actors in pairs))
+    return film_frames(model, ((view, model.at(view.time, Want(placements=tuple(own)))) for view, own in pairs))
 
 
 class Still:

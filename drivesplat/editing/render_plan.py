@@ -16,7 +16,7 @@ from drivesplat.editing.actors import (
 )
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.shown_objects import ShownObjects
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.images import continuous_intrinsics, target_size

@@ -3,7 +3,7 @@ now is."""
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.objects_met import TrackedBoxes
 from drivesplat.model.scans import ScanView, group_met, view_of_scan
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import SCAN
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.scene import Scene, Track
@@ -90,13 +91,13 @@ class ScanRenderPlan:
         time = np.array([sensor.seconds])
         present = [i for i, actor in enumerate(self.actors) if actor.present(time)[0]]
         (placed,) = actor_placements([self.actors[i] for i in present], time)
-        gaussians = model.gaussians_with_placements(sensor.seconds, placed, with_velocities=True, with_echoes=True)
+        gaussians = model.at(sensor.seconds, replace(SCAN, placements=tuple(placed)))
         rendered = model.scan(view, gaussians=gaussians).rendered()
         objects = np.full(rendered.ranges.shape, NO_OBJECT, dtype=np.int16)
         found = SimulatedScan(sensor, rendered, objects)
         if placed:
             numbers = np.array([*present, NO_OBJECT], dtype=np.int16)  # the last is what -1 finds
-            met = group_met(gaussians, view, model.placement_of_rows(placed)).cpu().numpy()
+            met = group_met(gaussians, view, gaussians.placement).cpu().numpy()
             objects[found.returned] = numbers[met[found.returned]]
         static = objects[found.returned] == NO_OBJECT
         objects[found.returned] = np.where(static, self._boxes_met(found), objects[found.returned])

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drivesplat.editing.actors import actor_placements
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import Want
 from drivesplat.model.view import View
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import fill, hull_of
@@ -85,13 +86,14 @@ class ShownObjects:
         now = np.array([view.time])
         present = [actor for actor in self.actors if actor.present(now)[0]]
         (placements,) = actor_placements(present, now)
-        gaussians = self.model.gaussians_with_placements(view.time, placements)
-        placed = [part.placement_of_rows(placements) for part in self.model.parts]
-        found = []
+        want = Want(placements=tuple(placements))
+        sets = self.model.sample(self.model.states(view.time, want), want)
+        gaussians, found = concatenate(sets), []
         if with_actors:
-            owner = torch.cat(placed)
-            found += [_seen_object(self, gaussians, owner == i, actor, view) for i, actor in enumerate(present)]
-        part_of_row = torch.cat([torch.full_like(rows, i) for i, rows in enumerate(placed)])
+            rows = [gaussians.placement == i for i in range(len(present))]
+            found += [_seen_object(self, gaussians, *one, view) for one in zip(rows, present, strict=True)]
+        device = gaussians.means.device
+        part_of_row = torch.cat([torch.full((len(own),), i, device=device) for i, own in enumerate(sets)])
         for item, parts in zip(self.others, self.parts, strict=True):
             if parts and item.present(now)[0]:
                 rows = _in_box(gaussians, item.poses(now)[0], item.size) & self._rows_of(parts, part_of_row)

@@ -16,6 +16,7 @@ from drivesplat.lidar.moved_sensor import moved, sensor_poses_of
 from drivesplat.model.removal import removal_of
 from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import SCAN
 from drivesplat.readers.truth import Truth, TruthScan, truth_arrays
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan import Scan, ScanRays, wrapped
@@ -147,7 +148,7 @@ def removal_scan_metrics(
             continue
         measured = True
         view = view_of_scan(scan, beam_spread, device)
-        gaussians = model.gaussians_at(view.time, with_velocities=True, with_echoes=True)
+        gaussians = model.at(view.time, SCAN)
         kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
         for key, shown in (("removed", kept), ("not_removed", gaussians)):
             rendered = model.scan(view, gaussians=shown).rendered()

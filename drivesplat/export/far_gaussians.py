@@ -188,7 +188,7 @@ def _visibility(
         contributions = _contributions(model, view)[rows].double()
         largest = torch.maximum(largest, contributions)
         total += contributions[:, None]
-        weighted += contributions[:, None] * model.seen_from(view).camera_to_world[:3, 3]
+        weighted += contributions[:, None] * view.camera_to_world[:3, 3]
     return largest, weighted / total.clamp_min(1e-30)
 
 

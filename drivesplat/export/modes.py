@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.export.sampled_motion import SampledShapes
 from drivesplat.export.trained_parts import SampledGroup
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 
 MIN_SHARE = 0.03
@@ -76,9 +76,8 @@ def _fitted(model: SplatModel, name: str, shown: Gaussians, shapes: SampledShape
 def _model_weights(model: SplatModel, track_id: str, gait: Gait) -> Float[np.ndarray, "t k"]:
     walked = [None] * len(gait.seconds) if gait.walked is None else gait.walked.tolist()
     placements = [ActorPlacement(track_id, scale=gait.scale, walked=way, phase=gait.phase) for way in walked]
-    found = model.shape_weights(gait.seconds.tolist(), placements)
-    assert found is not None, "the track has shapes"
-    return found.cpu().numpy()
+    of_parts = (part.shape_weights(gait.seconds.tolist(), placements) for part in model.parts)
+    return next(found for found in of_parts if found is not None).cpu().numpy()
 
 
 def _turns(quats: Float[np.ndarray, "t n 4"], shown: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "t n 3"]:

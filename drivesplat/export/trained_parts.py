@@ -59,7 +59,7 @@ def shown_timestamp(scene: Scene, time_s: float | None) -> int:
 def trained_gaussians(model: SplatModel, scene: Scene, time_s: float | None = None) -> Gaussians:
     """All Gaussians of a model in world coordinates at the shown time (`shown_timestamp`), except those of absent
     objects."""
-    gaussians = model.gaussians_at(scene.seconds(shown_timestamp(scene, time_s)))
+    gaussians = model.at(scene.seconds(shown_timestamp(scene, time_s)))
     return gaussians[_finite(gaussians, "all parts together") & ((gaussians.opacities != 0) | ~model.moving())]
 
 
@@ -87,7 +87,8 @@ def trained_groups(
 def sampled_shapes(model: SplatModel, track_id: str, motion: SampledMotion) -> SampledShapes | None:
     """The shapes of an object of a model while it is present; None for a rigid one."""
     seconds = shape_seconds(motion)
-    shapes = model.shapes(track_id, seconds.tolist())
+    of_parts = (part.shapes(track_id, seconds.tolist()) for part in model.parts)
+    shapes = next((found for found in of_parts if found is not None), None)
     return None if shapes is None else SampledShapes(seconds, *(values.cpu().numpy() for values in shapes))
 
 

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from drivesplat.kernels import triton_support
 from drivesplat.kernels.projection import ProjectedGaussians
-from drivesplat.kernels.road_distance import ROUGHNESS, Road
 
 
 class ColoredGaussians(NamedTuple):
@@ -33,37 +32,20 @@ class PinholeCamera(NamedTuple):
     height: int
 
 
-class SetOnRoad(NamedTuple):
-    """A `road`, and the `index` of the set whose Gaussians may belong to it."""
-
-    index: int
-    road: Road
-
-
 class ProjectedWithColors(NamedTuple):
-    """The n Gaussians of several sets, one set after the other, in the image of one camera: `gaussians`; the `values`
-    to composite, RGB and, where it is wanted, depth in metres; the mean opacity and scale (metres) of all of them
-    (`drivesplat.kernels.regularizers.mean_opacity_and_scale`); and the distance of one set from a road
-    (`drivesplat.kernels.road_distance.road_distance`), None where it is not wanted. Of Gaussians out of view only the
-    opacity and the radius, 0, are defined. Depth has a gradient in `values` alone."""
+    """The n Gaussians of several sets, one set after the other, in the image of one camera: `gaussians`; and the
+    `values` to composite, RGB and, where it is wanted, depth in metres. Of Gaussians out of view only the opacity and
+    the radius, 0, are defined. Depth has a gradient in `values` alone."""
 
     gaussians: ProjectedGaussians
     values: Float[Tensor, "1 n v"]
-    mean_opacity: Float[Tensor, ""]
-    mean_scale: Float[Tensor, ""]
-    road_distance: Float[Tensor, ""] | None = None
 
 
 def project_with_colors(
-    sets: Sequence[ColoredGaussians],
-    camera: PinholeCamera,
-    degrees: Sequence[int],
-    with_depth: bool,
-    on_road: SetOnRoad | None = None,
+    sets: Sequence[ColoredGaussians], camera: PinholeCamera, degrees: Sequence[int], with_depth: bool
 ) -> ProjectedWithColors | None:
-    """Projection, colors and means in one pass over each set, and their gradients in another, instead of several
-    kernels and a copy of all sets. `degrees` are those up to which harmonics of each set are evaluated. The gradients
-    of the distance from a road are added to the others where a Gaussian belongs to the road.
+    """Projection and colors in one pass over each set, and their gradients in another, instead of several kernels and a
+    copy of all sets. `degrees` are those up to which harmonics of each set are evaluated.
 
     Equals `drivesplat.kernels.projection.project` on a GPU without `antialiased`, and
     `drivesplat.kernels.view_colors.view_colors`. Returns None where the kernel does not apply; it needs Triton, degrees
@@ -80,15 +62,7 @@ def project_with_colors(
     from drivesplat.kernels.triton.colored_projection import ColoredProjection
 
     pose, size = (camera.viewmat, camera.K, camera.camera_to_world), (camera.width, camera.height)
-    options = size, tuple(degrees), with_depth, _road_options(on_road, sets)
-    *projected, values, opacity, scale, distance = ColoredProjection.apply(
-        *pose, *options, *(tensor for own in sets for tensor in own)
+    *projected, values = ColoredProjection.apply(
+        *pose, size, tuple(degrees), with_depth, *(tensor for own in sets for tensor in own)
     )
-    return ProjectedWithColors(ProjectedGaussians(*projected), values, opacity, scale, distance)
-
-
-def _road_options(on_road: SetOnRoad | None, sets: Sequence[ColoredGaussians]) -> tuple[int, Road, float] | None:
-    """The index of a set on a road, the road and its roughness; None where the road has no cell or the set is empty."""
-    if on_road is None or not len(on_road.road.weights) or not len(sets[on_road.index].means):
-        return None
-    return on_road.index, on_road.road, ROUGHNESS
+    return ProjectedWithColors(ProjectedGaussians(*projected), values)

@@ -1,8 +1,10 @@
-"""View-dependent colors of Gaussians from spherical harmonics."""
+"""What sensors see of Gaussians by the direction towards them: colors from spherical harmonics, and for a LiDAR
+intensity and the probability of a return."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from drivesplat.kernels import triton_support
 
@@ -53,3 +55,18 @@ def fused_view_colors(
     from drivesplat.kernels.triton.view_colors import TritonViewColors
 
     return TritonViewColors.apply(means, sh0, shN, camera_to_world, degree)
+
+
+def lidar_response(
+    logits: Float[Tensor, "n 4 2"], means: Float[Tensor, "n 3"], sensor: Float[Tensor, "3"]
+) -> Float[Tensor, "n 2"]:
+    """Intensity and the probability of a return, both in [0, 1], of n Gaussians at `means` for a LiDAR at `sensor`
+    (metres, world coordinates): the sigmoids of logits[:, 0] + direction @ logits[:, 1:], with the unit vector from the
+    sensor to the Gaussian. Gradients reach `logits` alone."""
+    if triton_support.usable_for(logits) and logits.dtype == torch.float32:
+        from drivesplat.kernels.triton.lidar_response import LidarResponse
+
+        return LidarResponse.apply(logits, means.detach(), sensor.detach())
+    toward = normalize(means.detach() - sensor, dim=-1)
+    along = (toward[:, :, None] * logits[:, 1:]).sum(dim=1)  # a GPU multiplies small matrices slowly
+    return torch.sigmoid(logits[:, 0] + along)

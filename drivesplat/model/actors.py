@@ -16,19 +16,27 @@ from torch.nn.functional import normalize, one_hot
 
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.object_poses import corrected
-from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, mirrored, of_owners, place
+from drivesplat.kernels.placement import (
+    LocalGaussians,
+    ObjectPoses,
+    colors_in_object,
+    colors_in_world,
+    mirrored,
+    of_owners,
+    place,
+)
 from drivesplat.kernels.quaternions import rotation_matrix
-from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
-from drivesplat.model.actor_placements import placement_sets, with_colors, with_placements
-from drivesplat.model.gaussians import Gaussians, concatenate, without_colors
+from drivesplat.kernels.regularizers import sums_of_squares
+from drivesplat.model.actor_placements import ActorPlacement, Posed, placement_sets, with_colors, with_placements
+from drivesplat.model.gaussians import Gaussians, concatenate, no_colors
 from drivesplat.model.harmonics import rotation_of_harmonics_by
-from drivesplat.model.parameters import init_params, learning_rates, make_parameters
-from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
+from drivesplat.model.parameters import fade, init_params, learning_rates, make_parameters
+from drivesplat.model.part import Part, PartDefinition, RigidGroup
+from drivesplat.model.states import IMAGE, State, Want
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
-from drivesplat.model.track_penalties import track_penalties
 from drivesplat.settings.train import GaussianSettings
-from drivesplat.settings.train_objects import ActorSettings
-from drivesplat.trajectories.motion import HALF_STEP, Motion
+from drivesplat.settings.train_objects import ActorSettings, TrackSettings
+from drivesplat.trajectories.motion import HALF_STEP
 
 MAX_SPREAD = 0.6
 """Maximum standard deviation of a Gaussian along an axis of its box, as a fraction of half the size of the box with its
@@ -59,6 +67,7 @@ class Actors(Part):
     ):
         super().__init__()
         self.timeline = Timeline(tracks, settings.fourier)
+        self.ids = [track.id for track in tracks]
         self.params = make_parameters(params)
         annotations = sum(len(track.motion.times) for track in tracks)
         corrections = {"translation": torch.zeros(annotations, 3), "yaw": torch.zeros(annotations)}
@@ -83,12 +92,12 @@ class Actors(Part):
         settings: ActorSettings,
         gaussians: GaussianSettings,
         classes: int = 0,
-        echo: tuple[float, float] | None = None,
+        lidar_logits: tuple[float, float] | None = None,
     ) -> "Actors":
         """Initialised from every track's points (p, 3) in its object's frame and their colours (p, 3) in [0, 1]; see
         `init_params`."""
         own = gaussians.model_copy(update={"sh_degree": settings.sh_degree})
-        sets = [init_params(p, c, own, classes, echo) for p, c in zip(points, colors, strict=True)]
+        sets = [init_params(p, c, own, classes, lidar_logits) for p, c in zip(points, colors, strict=True)]
         params = {key: torch.cat([s[key] for s in sets]) for key in sets[0]}
         for key in ("sh0", "shN"):
             constant = params[key][:, None]
@@ -97,27 +106,58 @@ class Actors(Part):
         params["owner"] = torch.repeat_interleave(torch.arange(len(sets)), torch.tensor([len(p) for p in points]))
         return cls(params, tracks, settings, gaussians)
 
-    def precompute(self, times: Sequence[float]) -> None:
-        self.timeline.precompute(times, self.params["means"].device)
+    def precompute(self, times: Sequence[float], want: Want = IMAGE) -> None:
+        every = [time + seconds for time in times for seconds in _apart(want)]
+        self.timeline.precompute(every, self.params["means"].device)
 
-    def time_state(self, time: float) -> TimeState:
-        return self.timeline.at(time, self.params["means"].device)
+    def state(self, time: float, want: Want = IMAGE) -> State:
+        device = self.params["means"].device
+        return State(*(self.timeline.at(time + seconds, device) for seconds in _apart(want)))
 
-    def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+    def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
+        now = self.posed(state.now)
+        with torch.no_grad():
+            around = [self.posed(known) for known in state[1:] if known is not None] if want.velocities else []
+        if want.placements is None:
+            return self._placed(want, now, *around)
+        sets, owner = [], self.params["owner"]
+        for chosen, rows in placement_sets(self.ids, owner, want.placements):  # few, so all actors for each copy
+            own = [want.placements[i] for i in chosen]
+            beside = [self._moved(known, [placement.beside(i) for placement in own]) for i, known in enumerate(around)]
+            found = self._placed(want, self._moved(now, own), *beside)
+            if want.colors:
+                found = with_colors(found, self.ids, owner, own)
+            numbers = owner.new_full((len(self.ids),), -1)
+            for i, placement in zip(chosen, own, strict=True):
+                numbers[self.ids.index(placement.source)] = i
+            sets.append(replace(found, placement=numbers[owner])[rows])
+        return concatenate(sets)
+
+    def _placed(self, want: Want, now: Posed, *around: Posed) -> Gaussians:
+        """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state;
+        velocities by the actors HALF_STEP seconds before and after."""
+        p, (means, *shapes) = self.params, self._in_world(now)
+        if not want.colors:
+            colors = no_colors(means)
+        else:
+            side = None if self.mirrored is None else now.state.side
+            # colors rotate by a few degrees: their gradient would add only noise to the track
+            rotations = rotation_of_harmonics_by(now.poses.quats, p["shN"].shape[2] + 1, side)
+            colors = colors_in_world(p["sh0"], p["shN"], now.state.series, rotations, p["owner"], self._owns)
+        velocities = self._velocities(*around) if want.velocities else None
+        logits = self._lidar_logits(now.poses) if want.lidar and "lidar_logits" in p else None
+        return Gaussians(means, *shapes, *colors, velocities, logits)
+
+    def posed(self, time_state: Sequence[Tensor]) -> Posed:
+        """The actors at their annotated poses with learned corrections, by the tensors of a time in a `state`."""
         state = TimeState(*time_state)
-        return self.placed(state, self.poses(state))
-
-    def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
-        state = TimeState(*time_state)
-        poses = self.poses(state)
-        echoes = self._echoes(poses) if "echoes" in self.params else None
-        return without_colors(*self._in_world(state, poses), echoes)
-
-    def poses(self, state: TimeState) -> ObjectPoses:
-        """The annotated poses of the actors with their learned corrections."""
         corrections = self._annotated_actor, self.shared["yaw"], self.shared["translation"]
         quats, translations = corrected(state.quats, state.translations, state.weights, *corrections)
-        return ObjectPoses(quats, translations, self._sizes, state.present.to(self._sizes.dtype))
+        return Posed(state, ObjectPoses(quats, translations, self._sizes, state.present.to(self._sizes.dtype)))
+
+    def _moved(self, known: Posed, placements: Sequence[ActorPlacement]) -> Posed:
+        """The actors at placements; rigid ones have no limbs that would follow a path."""
+        return Posed(known.state, with_placements(known.poses, self.ids, placements))
 
     def local(self, state: TimeState) -> LocalGaussians:
         """The Gaussians in the frames of their objects at a time state."""
@@ -125,94 +165,23 @@ class Actors(Part):
         return LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
 
     @torch.no_grad()
-    def velocities_between(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Float[Tensor, "n 3"]:
-        states = TimeState(*before), TimeState(*after)
-        return self._velocities(*((state, self.poses(state)) for state in states))
+    def _velocities(self, before: Posed, after: Posed) -> Float[Tensor, "n 3"]:
+        """The velocities of its Gaussians, m/s; 0 for actors that are absent before or after."""
+        there = of_owners(before.poses.presence * after.poses.presence, self._owns)[:, None]
+        return there * (self._in_world(after)[0] - self._in_world(before)[0]) / (2.0 * HALF_STEP)
 
-    def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
-        return self._echoes(self.poses(TimeState(*time_state))) if "echoes" in self.params else None
-
-    def _velocities(
-        self, before: tuple[TimeState, ObjectPoses], after: tuple[TimeState, ObjectPoses]
-    ) -> Float[Tensor, "n 3"]:
-        """The velocities of its Gaussians, m/s, by states and poses HALF_STEP seconds before and after; 0 for actors
-        that are absent then."""
-        there = of_owners(before[1].presence * after[1].presence, self._owns)[:, None]
-        return there * (self._in_world(*after)[0] - self._in_world(*before)[0]) / (2.0 * HALF_STEP)
-
-    def _echoes(self, poses: ObjectPoses) -> Float[Tensor, "n 4 2"]:
-        """The echoes of actors at these poses along directions in the world."""
-        own, turns = self.params["echoes"], rotation_matrix(poses.quats.detach())
+    def _lidar_logits(self, poses: ObjectPoses) -> Float[Tensor, "n 4 2"]:
+        """Those of actors at these poses along directions in the world."""
+        own, turns = self.params["lidar_logits"], rotation_matrix(poses.quats.detach())
         turned = (of_owners(turns, self._owns)[..., None] * own[:, None, 1:]).sum(dim=2)  # faster than small matrices
         return torch.cat([own[:, :1], turned], dim=1)
 
-    def _in_world(self, state: TimeState, poses: ObjectPoses) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _in_world(self, now: Posed) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means, unit quaternions, scales and opacities of its Gaussians in the world, mirrored by a state's `side`."""
-        local = self.local(state)
+        local = self.local(now.state)
         if self.mirrored is not None:
-            local = mirrored(local, of_owners(state.side, self._owns))
-        return place(local, poses, self.params["owner"], self._owns)
-
-    def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
-        state, known = self.time_state(time), self._known
-        poses, sets = self.poses(state), []
-        for chosen, rows in self._sets(placements):  # few: transforming all actors for each copy costs little
-            own = [placements[i] for i in chosen]
-            there = self._state_with(state, own), with_placements(poses, known, own)
-            sets.append(with_colors(self.placed(*there), known, self.params["owner"], own)[rows])
-        return concatenate(sets)
-
-    @torch.no_grad()
-    def velocities_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Float[Tensor, "m 3"]:
-        recorded, known, sets = self._beside(time), self._known, []
-        for chosen, rows in self._sets(placements):
-            beside = []
-            for number, state in enumerate(recorded):
-                own = [placements[i].beside(number) for i in chosen]
-                beside.append((self._state_with(state, own), with_placements(self.poses(state), known, own)))
-            sets.append(self._velocities(*beside)[rows])
-        return torch.cat(sets)
-
-    def echoes_with_placements(
-        self, time: float, placements: Sequence[ActorPlacement]
-    ) -> Float[Tensor, "m 4 2"] | None:
-        if "echoes" not in self.params:
-            return None
-        poses, known = self.poses(self.time_state(time)), self._known
-        placed = (
-            (with_placements(poses, known, [placements[i] for i in chosen]), rows)
-            for chosen, rows in self._sets(placements)
-        )
-        return torch.cat([self._echoes(of_set)[rows] for of_set, rows in placed])
-
-    def placement_of_rows(self, placements: Sequence[ActorPlacement]) -> Int[Tensor, " m"]:
-        numbers, known = [], self._known
-        for chosen, rows in self._sets(placements):
-            of_actors = self.params["owner"].new_full((len(known),), -1)
-            for i in chosen:
-                of_actors[known.index(placements[i].source)] = i
-            numbers.append(of_actors[self.params["owner"]][rows])
-        return torch.cat(numbers)
-
-    def _sets(self, placements: Sequence[ActorPlacement]) -> list[tuple[list[int], slice | Bool[Tensor, " n"]]]:
-        return placement_sets(self._known, self.params["owner"], placements)
-
-    @property
-    def _known(self) -> list[str]:
-        """The ids of its tracks."""
-        return [track.id for track in self.timeline.tracks]
-
-    def _state_with(self, state: TimeState, placements: Sequence[ActorPlacement]) -> TimeState:
-        """The time state that placements give their actors; rigid ones have no limbs that would follow a path."""
-        return state
-
-    def placed(self, state: TimeState, poses: ObjectPoses) -> Gaussians:
-        """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
-        p, side = self.params, None if self.mirrored is None else state.side
-        # colors rotate by a few degrees: their gradient would add only noise to the track
-        rotations = rotation_of_harmonics_by(poses.quats, p["shN"].shape[2] + 1, side)
-        colors = colors_in_world(p["sh0"], p["shN"], state.series, rotations, p["owner"], self._owns)
-        return Gaussians(*self._in_world(state, poses), *colors)
+            local = mirrored(local, of_owners(now.state.side, self._owns))
+        return place(local, now.poses, self.params["owner"], self._owns)
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
@@ -226,11 +195,6 @@ class Actors(Part):
             if not captured:  # a captured matrix has no values before a replay
                 self._known_owners = owner, torch_private.write_count(owner), matrix
         return matrix
-
-    def harmonics(self, state: TimeState) -> Float[Tensor, "n k 3"]:
-        """The colour coefficients at a time state, in the object's frame: the sum over i of f_i cos(i pi t / T), t
-        running from 0 to T over the actor's annotations (equation 5 of the paper)."""
-        return colors_in_object(self.params["sh0"], self.params["shN"], state.series, self._owns)
 
     def learning_rates(self) -> dict[str, float]:
         tracks = self._settings.tracks
@@ -251,7 +215,7 @@ class Actors(Part):
         """Fades Gaussians with centres outside their box, and shrinks those that spread beyond it. A LiDAR cannot tell
         a piece of road that moves with a car from road that stands still; without the limit such Gaussians may grow."""
         p, reach = self.params, of_owners(self._reach, self._owns)
-        self.fade((p["means"].abs() > reach).any(dim=1))
+        fade(p, (p["means"].abs() > reach).any(dim=1))
         axes = rotation_matrix(normalize(p["quats"], dim=1)) * torch.exp(p["scales"])[:, None]
         excess = (axes.norm(dim=2) / (MAX_SPREAD * reach)).amax(dim=1, keepdim=True)
         p["scales"].sub_(excess.clamp(min=1.0).log())
@@ -270,26 +234,30 @@ class Actors(Part):
         return [self.timeline.tracks[i].id for i in sorted(broken)]
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
-        known = self._known
-        return self.params["owner"] == known.index(track_id) if track_id in known else None
+        return self.params["owner"] == self.ids.index(track_id) if track_id in self.ids else None
 
     @torch.no_grad()
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
-        state = self.time_state(time)
+        p, state = self.params, TimeState(*self.state(time).now)
         means, quats, scales, opacities = self.local(state)
-        local = Gaussians.of(means, quats, torch.exp(scales), torch.sigmoid(opacities), self.harmonics(state))
-        return {
-            track.id: RigidGroup(local[self.params["owner"] == i], motion)
-            for i, (track, motion) in enumerate(zip(self.timeline.tracks, self.motions(), strict=True))
-        }
+        colors = colors_in_object(p["sh0"], p["shN"], state.series, self._owns)
+        local = Gaussians.of(means, quats, torch.exp(scales), torch.sigmoid(opacities), colors)
+        motions = self.timeline.corrected(*(self.shared[key].double().cpu().numpy() for key in ("translation", "yaw")))
+        return {name: RigidGroup(local[p["owner"] == i], motions[i]) for i, name in enumerate(self.ids)}
 
-    @torch.no_grad()
-    def motions(self) -> list[Motion]:
-        """The motion of every track with its learned corrections."""
-        shifts, turns = (self.shared[key].double().cpu().numpy() for key in ("translation", "yaw"))
-        motions = []
-        for track, own in zip(self.timeline.tracks, self.timeline.owned, strict=True):
-            poses = track.motion.object_to_world.copy()
-            poses[:, :3, 3] += shifts[own]
-            motions.append(replace(track.motion, object_to_world=poses, turns=turns[own]))
-        return motions
+
+def _apart(want: Want) -> tuple[float, ...]:
+    """The seconds from a time to those of its states."""
+    return (0.0, -HALF_STEP, HALF_STEP) if want.velocities else (0.0,)
+
+
+def track_penalties(
+    translation: Float[Tensor, "m 3"], yaw: Float[Tensor, " m"], neighbours: Int[Tensor, "q 3"], settings: TrackSettings
+) -> dict[str, Float[Tensor, ""]]:
+    """The penalties of learned corrections of tracks: their mean square, and that of their second differences along the
+    tracks, both in units of the expected annotation error. `neighbours` are all triples of consecutive annotations."""
+    size, bend = sums_of_squares(translation, yaw, neighbours, settings.sigma_translation, settings.sigma_yaw)
+    penalties = {"track_size": settings.l2_weight / max(1, len(yaw)) * size}
+    if len(neighbours):
+        penalties["track_bend"] = settings.smoothness_weight / len(neighbours) * bend
+    return penalties

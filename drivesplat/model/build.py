@@ -35,15 +35,15 @@ MIN_SEED_POINTS = 4
 class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
-    (3,) of every camera in `exposed`, whose exposure is learned, the initial logits of LiDAR's intensity and return
-    (`echo`; None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
+    (3,) of every camera in `exposed`, whose exposure is learned, the initial `lidar_logits` of intensity and return
+    (None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
     sky_color: np.ndarray
     classes: int = 0
     exposed: dict[str, np.ndarray] = field(default_factory=dict)
-    echo: tuple[float, float] | None = None
+    lidar_logits: tuple[float, float] | None = None
     scans: int = 0
 
     @property
@@ -134,8 +134,8 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
         settings.gaussians,
         record.scene_scale,
         init.classes,
-        init.echo,
-        init.echo is not None and settings.scans.fine_tune > 0,
+        init.lidar_logits,
+        init.lidar_logits is not None and settings.scans.fine_tune > 0,
     )
 
 
@@ -148,7 +148,9 @@ def _init_drifting(init: ModelInit, settings: TrainSettings) -> Part | None:
     count = max(MIN_SEED_POINTS, int(own.seed.fraction * own.fraction * settings.cap_max))
     seed = drifting_seed(record, own.seed, count, np.random.default_rng(0))
     seconds = min(times), max(times)
-    return Drifting.from_seed(seed, own, settings.gaussians, record.scene_scale, seconds, init.classes, init.echo)
+    return Drifting.from_seed(
+        seed, own, settings.gaussians, record.scene_scale, seconds, init.classes, init.lidar_logits
+    )
 
 
 _MAKERS = {Background.name: _init_background, Drifting.name: _init_drifting}
@@ -172,7 +174,7 @@ def _init_objects(
     points, colors = [actor.points[rows] for actor, rows in chosen], [actor.points_rgb[rows] for actor, rows in chosen]
     resolved = own.for_scene(sum(limits), len(actors), init.views)
     colors = [values / 255.0 for values in colors]
-    return kind.from_points(tracks, points, colors, resolved, settings.gaussians, init.classes, init.echo)
+    return kind.from_points(tracks, points, colors, resolved, settings.gaussians, init.classes, init.lidar_logits)
 
 
 def actor_cap(actor: ActorRecord, settings: ActorSettings, pixels_per_gaussian: float) -> int:

@@ -1,6 +1,6 @@
 """The content of checkpoint.npz, and the trained model in it.
 
-The stage `train` makes it (`drivesplat.training.run`).
+The stage `train` makes it (`drivesplat.training.stage`).
 """
 
 from dataclasses import dataclass

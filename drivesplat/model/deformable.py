@@ -16,11 +16,11 @@ from torch.nn.functional import normalize
 
 from drivesplat.kernels.placement import LocalGaussians
 from drivesplat.kernels.quaternions import turned
-from drivesplat.model.actor_placements import with_walked
+from drivesplat.model.actor_placements import ActorPlacement, Posed, with_walked
 from drivesplat.model.actors import Actors
 from drivesplat.model.lattice import Lattice, Undeformed
 from drivesplat.model.parameters import make_parameters
-from drivesplat.model.part import ActorPlacement, Shapes
+from drivesplat.model.part import Shapes
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import DeformableSettings
@@ -59,8 +59,9 @@ class Deformable(Actors):
         strides = [settings.gait.stride_of(track.object_class) * float(track.size[2]) for track in tracks]
         self.register_buffer("_strides", torch.tensor(strides), persistent=False)
 
-    def _state_with(self, state: TimeState, placements: Sequence[ActorPlacement]) -> TimeState:
-        return with_walked(state, self._known, placements, self.cycle_lengths)
+    def _moved(self, known: Posed, placements: Sequence[ActorPlacement]) -> Posed:
+        walked = with_walked(known.state, self.ids, placements, self.cycle_lengths)
+        return super()._moved(known._replace(state=walked), placements)
 
     @property
     def cycle_lengths(self) -> Float[Tensor, " a"]:
@@ -99,7 +100,7 @@ class Deformable(Actors):
         if rows is None:
             return None
         self.precompute(times)
-        locals_ = [self.local(self.time_state(time)) for time in times]
+        locals_ = [self.local(TimeState(*self.state(time).now)) for time in times]
         quats = normalize(torch.stack([local.quats[rows] for local in locals_]), dim=-1)
         return Shapes(torch.stack([local.means[rows] for local in locals_]), quats)
 
@@ -107,14 +108,14 @@ class Deformable(Actors):
     def shape_weights(
         self, times: Sequence[float], placements: Sequence[ActorPlacement]
     ) -> Float[Tensor, "t k"] | None:
-        if not placements or placements[0].source not in self._known:
+        if not placements or placements[0].source not in self.ids:
             return None
         self.precompute(times)
         states = [
-            self._state_with(self.time_state(time), [placement])
+            with_walked(TimeState(*self.state(time).now), self.ids, [placement], self.cycle_lengths)
             for time, placement in zip(times, placements, strict=True)
         ]
-        basis = torch.stack([self.basis(state)[self._known.index(placements[0].source)] for state in states])
+        basis = torch.stack([self.basis(state)[self.ids.index(placements[0].source)] for state in states])
         return torch.cat([torch.ones_like(basis[:, :1]), basis], dim=1)
 
     def learning_rates(self) -> dict[str, float]:

@@ -7,7 +7,6 @@ Gaussians return, so that PVG can represent the static world with them, too; her
 """
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,9 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.model.drifting_seed import DriftingSeed
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, no_colors
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import GEOMETRY, Part, PartDefinition, RigidGroup
+from drivesplat.model.states import IMAGE, State, Want
 from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train import GaussianSettings
 
@@ -65,14 +65,14 @@ class Drifting(Part):
         extent: float,
         seconds: tuple[float, float],
         classes: int = 0,
-        echo: tuple[float, float] | None = None,
+        lidar_logits: tuple[float, float] | None = None,
     ) -> "Drifting":
         """Initialised from a seed of a `settings.seed.fraction` of its maximum number; see `init_params`."""
         own, count = settings.seed, len(seed.positions)
         start = gaussians.model_copy(update={"init_opacity": own.opacity})
         span = math.log(max(own.span - settings.min_span, 0.01 * settings.min_span))
         params = {
-            **init_params(seed.positions, seed.colors, start, classes, echo),
+            **init_params(seed.positions, seed.colors, start, classes, lidar_logits),
             "scales": torch.from_numpy(np.log(seed.scales)).float()[:, None].repeat(1, 3),
             "velocities": torch.from_numpy(seed.velocities).float(),
             "peaks": torch.from_numpy(seed.peaks).float(),
@@ -80,21 +80,22 @@ class Drifting(Part):
         }
         return cls(params, settings, gaussians, extent, seconds, max(count, round(count / own.fraction)))
 
-    def time_state(self, time: float) -> Sequence[Tensor]:
+    def state(self, time: float, want: Want = IMAGE) -> State:
         """The time, and the time that decides on opacities."""
         means, (first, last) = self.params["means"], self._seconds
-        return means.new_full((), time), means.new_full((), min(max(time, first), last))
+        return State((means.new_full((), time), means.new_full((), min(max(time, first), last))))
 
-    def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+    def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
         p = self.params
-        time, lived = time_state
+        time, lived = state.now
         return Gaussians(
             p["means"] + (time - p["peaks"])[:, None] * p["velocities"],
             p["quats"],
             torch.exp(p["scales"]),
             self._opacities(lived),
-            p["sh0"],
-            p["shN"],
+            *((p["sh0"], p["shN"]) if want.colors else no_colors(p["means"])),
+            velocities=p["velocities"].detach() if want.velocities else None,
+            lidar_logits=p.get("lidar_logits") if want.lidar else None,
         )
 
     def _opacities(self, time: Float[Tensor, ""]) -> Float[Tensor, " n"]:
@@ -108,12 +109,6 @@ class Drifting(Part):
         """The life span of each Gaussian in seconds."""
         return self._settings.min_span + torch.exp(self.params["spans"])
 
-    def velocities_between(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Float[Tensor, "n 3"]:
-        return self.params["velocities"].detach()
-
-    def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
-        return self.params.get("echoes")
-
     def learning_rates(self) -> dict[str, float]:
         own = self._settings
         rates = {"means": own.lr_means, "velocities": own.lr_velocities, "peaks": own.lr_peaks, "spans": own.lr_spans}
@@ -125,5 +120,5 @@ class Drifting(Part):
     @torch.no_grad()
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         """Those that are present at the time, as one static group."""
-        gaussians = self.at(time)
+        gaussians = self.sample(self.state(time))
         return {self.name: RigidGroup(gaussians[gaussians.opacities != 0], None)}

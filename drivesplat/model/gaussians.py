@@ -17,8 +17,10 @@ from drivesplat.kernels.spherical_harmonics import SH_C0
 class Gaussians:
     """n Gaussians: `means` and `scales` in metres, `quats` w, x, y, z, `opacities` in [0, 1], and spherical harmonics
     of RGB colours: `sh0` of degree 0, `shN` of the degrees above. `velocities` (m/s) are None where they are not known
-    or all 0. `echoes` are what a LiDAR measures of them, linear functions of the direction from the sensor: the logits
-    of intensity and of a return are echoes[:, 0] + direction @ echoes[:, 1:]; None without LiDAR."""
+    or all 0. `lidar_logits` are what a LiDAR measures of them, linear functions of the direction from the sensor: the
+    logits of intensity and of a return are lidar_logits[:, 0] + direction @ lidar_logits[:, 1:]; None without LiDAR.
+    `placement` is the index of the placement of each one's object, -1 without an object; None where objects are as
+    recorded."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -27,7 +29,8 @@ class Gaussians:
     sh0: Float[Tensor, "n 1 3"]
     shN: Float[Tensor, "n k_less_1 3"]
     velocities: Float[Tensor, "n 3"] | None = None
-    echoes: Float[Tensor, "n 4 2"] | None = None
+    lidar_logits: Float[Tensor, "n 4 2"] | None = None
+    placement: Int[Tensor, " n"] | None = None
 
     @classmethod
     def of(
@@ -76,8 +79,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     if len(sets) == 1:
         return sets[0]
     degree = max(s.sh_degree for s in sets)
-    sets = [with_sh_degree(s, degree) for s in sets]
-    sets = _alike_in_velocities(sets)
+    sets = _alike([with_sh_degree(s, degree) for s in sets])
     shared = [name for name in sets[0].tensors if all(name in s.tensors for s in sets)]
     return Gaussians(**{name: torch.cat([s.tensors[name] for s in sets]) for name in shared})
 
@@ -89,19 +91,25 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 
 
 def concatenate_shapes(sets: Sequence[Gaussians]) -> Gaussians:
-    """Several sets as one, as `concatenate`, without colours and echoes."""
-    tensors = [own.tensors for own in _alike_in_velocities(sets)]
+    """Several sets as one, as `concatenate`, with geometry, opacity and velocities alone."""
+    tensors = [own.tensors for own in _alike(sets)]
     names = [name for name in ("means", "quats", "scales", "opacities", "velocities") if name in tensors[0]]
     joined = {n: torch.cat([own[n] for own in tensors]) if len(sets) > 1 else tensors[0][n] for n in names}
     velocities = joined.pop("velocities", None)
-    return replace(without_colors(**joined, echoes=None), velocities=velocities)
+    return Gaussians(*joined.values(), *no_colors(joined["means"]), velocities)
 
 
-def _alike_in_velocities(sets: Sequence[Gaussians]) -> Sequence[Gaussians]:
-    """The same sets, with velocities of 0 where others have some."""
-    if all(own.velocities is None for own in sets):
-        return sets
-    return [replace(own, velocities=torch.zeros_like(own.means)) if own.velocities is None else own for own in sets]
+def _alike(sets: Sequence[Gaussians]) -> Sequence[Gaussians]:
+    """The same sets, with velocities of 0 and placements of -1 where others have some."""
+    some = {name for own in sets for name in own.tensors}
+    for name, missing in (("velocities", torch.zeros_like), ("placement", _unplaced)):
+        if name in some:
+            sets = [own if name in own.tensors else replace(own, **{name: missing(own.means)}) for own in sets]
+    return sets
+
+
+def _unplaced(means: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
+    return means.new_full((len(means),), -1, dtype=torch.long)
 
 
 class GaussianSets(tuple[Gaussians, ...]):
@@ -113,9 +121,14 @@ class GaussianSets(tuple[Gaussians, ...]):
         within `torch.no_grad`."""
         return concatenate_shapes(self)
 
+    @property
+    def are_apart(self) -> bool:
+        """Whether `shapes`, a copy of all of them, has not been computed."""
+        return "shapes" not in self.__dict__
 
-def without_colors(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, echoes: Tensor | None) -> Gaussians:
-    """Gaussians whose coefficients are 0, of degree 0, for sensors that see no colours: copying the coefficients of a
-    million Gaussians takes time."""
+
+def no_colors(means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 1 3"], Float[Tensor, "n 0 3"]]:
+    """Coefficients `sh0` and `shN` that are 0, of degree 0, for sensors that see no colours: copying the coefficients
+    of a million Gaussians takes time."""
     black = means.new_zeros(1, 1, 3).expand(len(means), 1, 3)
-    return Gaussians(means, quats, scales, opacities, black, black[:, :0], echoes=echoes)
+    return black, black[:, :0]

@@ -2,14 +2,16 @@
 
 `means` (n, 3) metres, `scales` (n, 3) log metres, `quats` (n, 4) w, x, y, z, `opacities` (n,) logits, `sh0` and `shN`
 spherical harmonics of degree 0 and of the degrees above; with semantic classes also `classes` (n, c) logits; with LiDAR
-also `echoes` (n, 4, 2), see `drivesplat.model.gaussians.Gaussians`, their directions in the frame of the Gaussians, and
-where a LiDAR sees Gaussians elsewhere than cameras do, OFFSETS of their geometry.
+also `lidar_logits` (n, 4, 2), see `drivesplat.model.gaussians.Gaussians`, their directions in the frame of the
+Gaussians, and where a LiDAR sees Gaussians elsewhere than cameras do, OFFSETS of their geometry.
 """
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
@@ -23,6 +25,8 @@ OFFSETS = {
     "opacities": "lidar_opacities",
 }
 """The parameters that a LiDAR adds to others, by the names of these."""
+FADED = 1e-4
+"""Opacity of a faded Gaussian, below the threshold at which every strategy removes or relocates it."""
 _ROWS = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}
 """The shapes of rows of what all Gaussians have; `shN` for degree 0."""
 
@@ -32,11 +36,11 @@ def init_params(
     colors: np.ndarray,
     settings: GaussianSettings,
     classes: int = 0,
-    echo: tuple[float, float] | None = None,
+    lidar_logits: tuple[float, float] | None = None,
     offsets: bool = False,
 ) -> dict[str, Tensor]:
     """Parameters of Gaussians initialised at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1], equal logits for
-    all `classes`, the logits `echo` of intensity and return (None: no LiDAR), and OFFSETS of 0 if wanted."""
+    all `classes`, `lidar_logits` of intensity and return (None: no LiDAR), and OFFSETS of 0 if wanted."""
     neighbours = min(4, len(positions))
     distances = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0].reshape(len(positions), -1)[:, 1:]
     spacing = np.sqrt(np.mean(distances**2, axis=1)) if neighbours > 1 else np.ones(len(positions))
@@ -53,15 +57,16 @@ def init_params(
         "sh0": ((torch.from_numpy(np.asarray(colors)).float() - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3),
         **({"classes": torch.zeros(count, classes)} if classes else {}),
-        **({} if echo is None else {"echoes": _echoes(count, echo)}),
+        **({} if lidar_logits is None else {"lidar_logits": _isotropic(count, lidar_logits)}),
         **({name: torch.zeros_like(geometry[of]) for of, name in OFFSETS.items()} if offsets else {}),
     }
 
 
-def _echoes(count: int, logits: tuple[float, float]) -> Tensor:
-    echoes = torch.zeros(count, 4, 2)
-    echoes[:, 0] = torch.tensor(logits)
-    return echoes
+def _isotropic(count: int, logits: tuple[float, float]) -> Tensor:
+    """The same logits in all directions."""
+    found = torch.zeros(count, 4, 2)
+    found[:, 0] = torch.tensor(logits)
+    return found
 
 
 def make_parameters(params: dict[str, Tensor]) -> nn.ParameterDict:
@@ -72,6 +77,13 @@ def make_parameters(params: dict[str, Tensor]) -> nn.ParameterDict:
             for key, value in params.items()
         }
     )
+
+
+@torch.no_grad()
+def fade(params: Mapping[str, Tensor], rows: Bool[Tensor, " n"]) -> None:
+    """Makes Gaussians nearly transparent."""
+    opacities, faded = params["opacities"], torch.logit(torch.tensor(FADED)).item()
+    opacities.masked_fill_(rows & (opacities > faded), faded)
 
 
 def require_rows(params: dict[str, Tensor], fourier: int | None = None, owners: int = 0) -> None:
@@ -99,4 +111,4 @@ def learning_rates(settings: GaussianSettings, extent: float) -> dict[str, float
     rates = {"means": settings.lr_means * extent, "scales": settings.lr_scales, "quats": settings.lr_quats}
     rates |= {"opacities": settings.lr_opacities, "sh0": settings.lr_sh0, "shN": settings.lr_shN}
     of_lidar = {offset: rates[name] for name, offset in OFFSETS.items()}
-    return {**rates, **of_lidar, "classes": settings.lr_classes, "echoes": settings.lr_echoes}
+    return {**rates, **of_lidar, "classes": settings.lr_classes, "lidar_logits": settings.lr_lidar_logits}

@@ -6,48 +6,22 @@ Each part owns its parameters, their learning rates and its densification. A met
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from drivesplat.model.gaussians import Gaussians, without_colors
+from drivesplat.model.actor_placements import ActorPlacement
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.states import IMAGE, State, Want
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.trajectories.motion import HALF_STEP, Motion
+from drivesplat.trajectories.motion import Motion
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
 """The parameters of every Gaussian that images and LiDAR scans share."""
-FADED = 1e-4
-"""Opacity of a faded Gaussian, below the threshold at which every strategy removes or relocates it."""
-
-
-@dataclass(frozen=True)
-class ActorPlacement:
-    """An edited pose of an object at one time: the Gaussians of the track `source`, scaled by `scale` about the box
-    centre, at `object_to_world` (4, 4) in world metres (None: the recorded pose), their RGB colours mapped by
-    `color_matrix` (3, 3) (None: as trained). `around` are the poses HALF_STEP seconds before and after an edited one,
-    which give velocities; None: the object stands. `walked` is the length (metres) of the object's path until then,
-    which the limbs of deformable objects follow, and `walked_around` HALF_STEP seconds before and after; None: as
-    recorded at the time. Their gait is ahead by `phase` cycles."""
-
-    source: str
-    object_to_world: np.ndarray | None = None
-    scale: float = 1.0
-    color_matrix: np.ndarray | None = None
-    around: tuple[np.ndarray, np.ndarray] | None = None
-    walked: float | None = None
-    walked_around: tuple[float, float] | None = None
-    phase: float = 0.0
-
-    def beside(self, number: int) -> "ActorPlacement":
-        """The placement HALF_STEP seconds before (0) or after (1)."""
-        pose = self.object_to_world if self.around is None else self.around[number]
-        walked = self.walked if self.walked_around is None else self.walked_around[number]
-        return replace(self, object_to_world=pose, walked=walked)
 
 
 @dataclass(frozen=True)
@@ -100,92 +74,35 @@ class Part(nn.Module, ABC):
     cap_max: int | None = None
     """Maximum number of Gaussians in densification; None: that of the training's settings."""
     params: nn.ParameterDict
+    preallocated = 0
+    """The number of rows at the end that are not Gaussians yet; 0 outside training. See `preallocate`."""
     count_on_device: Float[Tensor, ""]
     """The number of its Gaussians in device memory; valid only with `preallocated` rows."""
 
     def __init__(self) -> None:
         super().__init__()
         self.shared = nn.ParameterDict()
-        self._preallocated = 0
         self.register_buffer("count_on_device", torch.zeros(()), persistent=False)
         self.register_buffer("mirrored", None, persistent=False)
 
-    def precompute(self, times: Sequence[float]) -> None:
-        """Precomputes state for the given times, which may be faster for many times together than one by one."""
+    def precompute(self, times: Sequence[float], want: Want = IMAGE) -> None:
+        """Precomputes the states of times, which may be faster for many times together than one by one."""
 
-    def at(self, time: float) -> Gaussians:
-        """Its Gaussians in world coordinates at a time in seconds since the first image.
+    def state(self, time: float, want: Want = IMAGE) -> State:
+        """What its Gaussians depend on at a time in seconds since the first image, beside parameters, as tensors on its
+        device. A part without anything of that kind, as a static one, does not override this."""
+        return State()
 
-        Always `self.row_count` rows in one order; a Gaussian that is absent then has opacity 0. A part without time
-        states overrides this.
+    @abstractmethod
+    def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
+        """Its Gaussians in world coordinates, with what is wanted. Velocities have no gradient; they are None for a
+        static part, as `lidar_logits` are for one that was not trained with LiDAR.
+
+        Always `self.row_count` rows in one order; a Gaussian that is absent at the time has opacity 0. With placements,
+        an object without one is absent, and further placements of one object are appended as extra rows. Otherwise the
+        sample depends on the state's tensors and on parameters alone and does not synchronise with the device, so that
+        a CUDA graph of it can be replayed after the state of another time is copied into these tensors.
         """
-        return self.at_time_state(self.time_state(time))
-
-    def time_state(self, time: float) -> Sequence[Tensor] | None:
-        """The state of its Gaussians at a time as tensors on its device, of the same shapes at every time:
-        `at_time_state` of it equals `at`. None for a part without such a state."""
-        return None
-
-    def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
-        """Its Gaussians by a `time_state`. Depends on these tensors alone and does not synchronise with the device, so
-        that a CUDA graph of it can be replayed after the tensors of another time are copied into them. Raises
-        NotImplementedError for a part without time states."""
-        raise NotImplementedError(f"the part {self.name!r} has no time states")
-
-    def velocities(self, time: float) -> Float[Tensor, "n 3"] | None:
-        """The velocities of its Gaussians in the world at a time, m/s, without gradient; None for a static part."""
-        states = self._beside(time)
-        return None if any(state is None for state in states) else self.velocities_between(*states)
-
-    def _beside(self, time: float) -> tuple[Sequence[Tensor] | None, Sequence[Tensor] | None]:
-        """The time states HALF_STEP seconds before and after a time."""
-        return self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
-
-    def velocities_between(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Float[Tensor, "n 3"] | None:
-        """As `velocities`, by the time states HALF_STEP seconds before and after the time. Depends on these tensors
-        alone, as `at_time_state`."""
-        return None
-
-    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
-        """What a LiDAR measures of its Gaussians at a time, along directions in the world (`Gaussians.echoes`); None
-        for a part that was not trained with LiDAR."""
-        state = self.time_state(time)
-        return None if state is None else self.echoes_at_time_state(state)
-
-    def echoes_at_time_state(self, time_state: Sequence[Tensor]) -> Float[Tensor, "n 4 2"] | None:
-        """As `echoes`, by a `time_state`. Depends on these tensors alone, as `at_time_state`."""
-        return None
-
-    def seen_by_lidar(self, gaussians: Gaussians) -> Gaussians:
-        """Its Gaussians where a LiDAR sees them, by those that cameras see (`at`)."""
-        return gaussians
-
-    def scanned_at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
-        """Its Gaussians where a LiDAR sees them, with echoes but without colours, by a `time_state`. Depends on these
-        tensors alone, as `at_time_state`."""
-        seen, echoes = self.seen_by_lidar(self.at_time_state(time_state)), self.echoes_at_time_state(time_state)
-        return without_colors(seen.means, seen.quats, seen.scales, seen.opacities, echoes)
-
-    def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
-        """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one
-        object are appended as extra rows."""
-        return self.at(time)
-
-    def velocities_with_placements(
-        self, time: float, placements: Sequence[ActorPlacement]
-    ) -> Float[Tensor, "m 3"] | None:
-        """The `velocities` of all rows of `with_placements`."""
-        return self.velocities(time)
-
-    def echoes_with_placements(
-        self, time: float, placements: Sequence[ActorPlacement]
-    ) -> Float[Tensor, "m 4 2"] | None:
-        """The `echoes` of all rows of `with_placements`."""
-        return self.echoes(time)
-
-    def placement_of_rows(self, placements: Sequence[ActorPlacement]) -> Int[Tensor, " m"]:
-        """The index of the placement that each row of `with_placements` belongs to; -1 for none."""
-        return torch.full((self.row_count,), -1, device=self.params["means"].device)
 
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:
@@ -198,7 +115,7 @@ class Part(nn.Module, ABC):
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         """Its Gaussians with the colours of a time as rigid groups: one static group, or one for every track. Names are
         unique in a model."""
-        return {self.name: RigidGroup(self.at(time), None)}
+        return {self.name: RigidGroup(self.sample(self.state(time)), None)}
 
     def shapes(self, track_id: str, times: Sequence[float]) -> Shapes | None:
         """The shapes of a track's Gaussians at `times`, in the order of its rigid group; None for what is rigid."""
@@ -217,12 +134,6 @@ class Part(nn.Module, ABC):
 
     def confine(self) -> None:
         """Fades Gaussians at places where this part must not have any."""
-
-    @torch.no_grad()
-    def fade(self, rows: Bool[Tensor, " n"]) -> None:
-        """Makes Gaussians nearly transparent."""
-        opacities, faded = self.params["opacities"], torch.logit(torch.tensor(FADED)).item()
-        opacities.masked_fill_(rows & (opacities > faded), faded)
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """The mask of a track's rows; None where this part does not know the track as an object."""
@@ -247,16 +158,11 @@ class Part(nn.Module, ABC):
         """The number of rows of each of `params`."""
         return len(self.params["means"])
 
-    @property
-    def preallocated(self) -> int:
-        """The number of rows at the end that are not Gaussians yet (`drivesplat.training.cuda_graph.preallocation`);
-        0 outside training."""
-        return self._preallocated
 
-    @preallocated.setter
-    def preallocated(self, rows: int) -> None:
-        self._preallocated = rows
-        self.count_on_device.fill_(self.row_count - rows)
+def preallocate(part: Part, rows: int) -> None:
+    """Declares so many rows at the end of a part preallocated (`drivesplat.training.graphs.preallocation`)."""
+    part.preallocated = rows
+    part.count_on_device.fill_(part.row_count - rows)
 
 
 def active_fraction(parts: Iterable[Part]) -> float | Float[Tensor, ""]:

@@ -6,7 +6,6 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.gaussians import Gaussians, GaussianSets
 
 
@@ -16,9 +15,7 @@ class Picture:
     in the model's own colours (premultiplied by their `alpha`), `depth` in metres or None; `objects_alpha`, the alpha
     of the parts with objects alone, None where it needs a second rendering. What is opaque may hide objects behind it
     in `objects_alpha`. `surface_depth`, in metres or None, is that of the surfaces shown, 0 where there are none; it
-    has no gradient (`drivesplat.rasterization.rasterize`). `means_of_sets` are the mean opacity and scale (metres) of
-    the sets, and `road_distance` (metres) is the mean distance of the static set from a road; None where they were not
-    computed beside the image.
+    has no gradient (`drivesplat.rasterization.rasterize`).
     """
 
     sets: GaussianSets
@@ -29,16 +26,8 @@ class Picture:
     info: dict[str, Any]
     objects_alpha: Float[Tensor, "h w"] | None = None
     surface_depth: Float[Tensor, "h w"] | None = None
-    means_of_sets: tuple[Float[Tensor, ""], Float[Tensor, ""]] | None = None
-    road_distance: Float[Tensor, ""] | None = None
 
     @property
     def shapes(self) -> Gaussians:
         """The sets one after the other, without their colours."""
         return self.sets.shapes
-
-    def mean_opacity_and_scale(self) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Of the Gaussians of all sets: see `drivesplat.kernels.regularizers.mean_opacity_and_scale`."""
-        if self.means_of_sets is not None:
-            return self.means_of_sets
-        return mean_opacity_and_scale(self.shapes.opacities, self.shapes.scales)

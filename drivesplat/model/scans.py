@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from drivesplat.errors import ResultError
-from drivesplat.kernels.echoes import echo_values
-from drivesplat.kernels.regularizers import mean_opacity_and_scale
+from drivesplat.kernels.view_colors import lidar_response
 from drivesplat.model.gaussians import Gaussians, GaussianSets
 from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
@@ -59,10 +58,6 @@ class ScanPicture:
     alpha: Float[Tensor, "b a"]
     alpha_before: Float[Tensor, "b a"] | None
 
-    def mean_opacity_and_scale(self) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Of the Gaussians of all sets: see `drivesplat.kernels.regularizers.mean_opacity_and_scale`."""
-        return mean_opacity_and_scale(self.sets.shapes.opacities, self.sets.shapes.scales)
-
     def rendered(self) -> RenderedScan:
         """The same as arrays."""
         tensors = (self.range, 1.0 - self.returned, self.intensity)
@@ -79,13 +74,14 @@ def view_of_scan(recorded: RecordedScan, beam_spread: tuple[float, float], devic
 
 
 def scan_picture(sets: GaussianSets, view: ScanView, before: Float[Tensor, "b a"] | None = None) -> ScanPicture:
-    """The scan of sets of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets
-    nothing, or that the vehicle blocks, is not returned. Raises ResultError for Gaussians without echoes."""
+    """The scan of sets of Gaussians with `lidar_logits`; with `alpha_before` the ranges `before` (metres). A ray that
+    meets nothing, or that the vehicle blocks, is not returned. Raises ResultError for Gaussians without these logits.
+    """
     values, sensor = [], view.sensor_to_world[:3, 3]
-    for own in sets:  # two values of each Gaussian are concatenated, not its eight echoes
-        if own.echoes is None:
+    for own in sets:  # two values of each Gaussian are concatenated, not its eight coefficients
+        if own.lidar_logits is None:
             raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
-        values.append(echo_values(own.echoes, own.means, sensor))
+        values.append(lidar_response(own.lidar_logits, own.means, sensor))
     rendering = _rasterized(sets.shapes, view, torch.cat(values), before)
     intensity, returned = rendering.values.unbind(dim=-1)
     if view.blocked is not None:

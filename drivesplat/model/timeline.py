@@ -1,7 +1,7 @@
 """The annotated state of all actors at one time, as tensors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +82,16 @@ class Timeline:
             for i in range(first + 1, last)
         ]
         return torch.tensor(triples, dtype=torch.long).reshape(-1, 3)
+
+    def corrected(self, shifts: Float[np.ndarray, "m 3"], turns: Float[np.ndarray, " m"]) -> list[Motion]:
+        """The motion of each track with corrections of its annotations: metres along the world's axes, and radians
+        about the object's vertical axis."""
+        motions = []
+        for track, own in zip(self.tracks, self.owned, strict=True):
+            poses = track.motion.object_to_world.copy()
+            poses[:, :3, 3] += shifts[own]
+            motions.append(replace(track.motion, object_to_world=poses, turns=turns[own]))
+        return motions
 
     def at(self, time: float, device: torch.device) -> TimeState:
         """The state at a time in seconds since the scene's first image."""

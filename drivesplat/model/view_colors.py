@@ -10,7 +10,6 @@ from drivesplat.kernels.colored_projection import (
     ColoredGaussians,
     PinholeCamera,
     ProjectedWithColors,
-    SetOnRoad,
     project_with_colors,
 )
 from drivesplat.kernels.view_colors import fused_view_colors, view_colors
@@ -31,21 +30,17 @@ def rasterizer_colors(sets: Sequence[Gaussians], view: View, sh_degree: int | No
 
 
 def projected_sets(
-    sets: Sequence[Gaussians],
-    view: View,
-    sh_degree: int | None = None,
-    with_depth: bool = False,
-    on_road: SetOnRoad | None = None,
+    sets: Sequence[Gaussians], view: View, sh_degree: int | None = None, with_depth: bool = False
 ) -> ProjectedWithColors | None:
     """Several sets, one after the other, projected and with the colours that the view's camera sees, by harmonics up to
-    `sh_degree`, and the distance of a set from a road. None for a rolling shutter, and where there is no kernel for it
+    `sh_degree`. None for a rolling shutter, and where there is no kernel for it
     (`drivesplat.kernels.colored_projection.project_with_colors`)."""
     if view.shutter is not None:
         return None
     given = [ColoredGaussians(own.means, own.quats, own.scales, own.opacities, own.sh0, own.shN) for own in sets]
     camera = PinholeCamera(view.viewmat, view.camera_to_world, view.K, view.width, view.height)
     degrees = [_up_to(own.sh_degree, sh_degree) for own in sets]
-    return project_with_colors(given, camera, degrees, with_depth, on_road)
+    return project_with_colors(given, camera, degrees, with_depth)
 
 
 def all_view_colors(gaussians: Gaussians, view: View) -> Float[Tensor, "n 3"]:

@@ -2,7 +2,7 @@
 one CUDA graph.
 
 Python takes 2 to 4 ms to launch the hundred kernels of a frame, longer than the GPU takes to run them. A replay costs a
-few copies: of the camera, and of the parts' time states.
+few copies: of the camera, and of the parts' states.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from drivesplat.kernels import capacity, triton_support
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool, retry_without_graphs
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.time_states import TimeStates
+from drivesplat.model.states import ModelStates, copied, tensors_of
 from drivesplat.model.view import View
 from drivesplat.rendering.color_bytes import to_uint8
 
@@ -81,8 +81,10 @@ class GpuFrameRenderer:
     def _planned(self, wanted: FrameInput) -> PendingFrame:
         """A frame with planned capacities, by the entries that earlier frames needed."""
         view, gaussians = wanted
-        states = self._time_states(view) if gaussians is None else None
-        if states is not None and (frame_graph := self._graph_for(view, states)) is not None:
+        # of a camera of the rig, Python looks up its pose, exposure and rolling shutter: such frames are not captured
+        captured = self._captures and gaussians is None and view.camera is None and view.shutter is None
+        states = self._model.states(view.time) if captured else ()
+        if captured and (frame_graph := self._graph_for(view, states)) is not None:
             graph = frame_graph.replay(view, states)
             return self._pending(graph.result, graph.needed, graph.capacities, wanted)
         with capacity.planned(self._needs) as lists:
@@ -100,13 +102,7 @@ class GpuFrameRenderer:
             self._graph = None
         return self._pending(frame, torch.empty(0, dtype=torch.int32), [], wanted)
 
-    def _time_states(self, view: View) -> TimeStates | None:
-        """The parts' time states of a view; None where a frame of it cannot be captured: Python looks up the poses,
-        exposures and rolling shutters of cameras of the rig."""
-        captured = self._captures and view.camera is None and view.shutter is None
-        return self._model.time_states(view.time) if captured else None
-
-    def _graph_for(self, view: View, states: TimeStates) -> "_FrameGraph | None":
+    def _graph_for(self, view: View, states: ModelStates) -> "_FrameGraph | None":
         """The graph for a view, captured now unless there is one; None where the GPU or its driver refuses."""
         if self._graph is None or not self._graph.fits(view):
             self._graph = None  # frees its memory for the next one
@@ -130,18 +126,18 @@ class _FrameGraph:
     """The graph of a frame, and its inputs, into which those of other frames are copied."""
 
     view: View
-    states: TimeStates
+    states: ModelStates
     graph: CudaGraph[RenderedFrame]
 
     @classmethod
-    def capture(cls, model: SplatModel, view: View, states: TimeStates, needs: Sequence[int]) -> "_FrameGraph | None":
+    def capture(cls, model: SplatModel, view: View, states: ModelStates, needs: Sequence[int]) -> "_FrameGraph | None":
         """Captures a frame of a model whose lists needed so many entries; None where the GPU or its driver refuses."""
         device = view.K.device
         own_view = replace(view, K=view.K.clone(), camera_to_world=view.camera_to_world.clone())
-        own_states = [[values.clone() for values in state] for state in states]
+        own_states = copied(states)
 
         def render() -> RenderedFrame:
-            return _render(model, own_view, model.sets_at_time_states(own_states))
+            return _render(model, own_view, model.sample(own_states))
 
         pool = new_pool()
         with capture_stream(device):  # a second thread encodes the film meanwhile
@@ -152,13 +148,12 @@ class _FrameGraph:
         """Whether a view has the same size."""
         return (view.width, view.height) == (self.view.width, self.view.height)
 
-    def replay(self, view: View, states: TimeStates) -> CudaGraph[RenderedFrame]:
+    def replay(self, view: View, states: ModelStates) -> CudaGraph[RenderedFrame]:
         """The graph, replayed with a view and time states."""
         self.view.K.copy_(view.K)
         self.view.camera_to_world.copy_(view.camera_to_world)
-        for own, state in zip(self.states, states, strict=True):
-            for place, values in zip(own, state, strict=True):
-                place.copy_(values)
+        for place, values in zip(tensors_of(self.states), tensors_of(states), strict=True):
+            place.copy_(values)
         self.graph.replay()
         return self.graph
 

@@ -12,6 +12,7 @@ RENAMED = {
     "train.coarse_to_fine.share": "fraction",
     "train.drifting.share": "fraction",
     "train.drifting.seed.share": "fraction",
+    "train.gaussians.lr_echoes": "lr_lidar_logits",
     "train.actors.least": "min_gaussians",
     "train.actors.tracks.size_weight": "l2_weight",
     "train.actors.tracks.bend_weight": "smoothness_weight",

@@ -61,7 +61,7 @@ class GaussianSettings(Settings):
     """Learning rate of the colours' constant term."""
     lr_classes: float = Field(1e-2, gt=0)
     """Learning rate of class logits, where class maps are given (masks.semantic_folder)."""
-    lr_echoes: float = Field(1e-2, gt=0)
+    lr_lidar_logits: float = Field(1e-2, gt=0)
     """Learning rate of LiDAR's logits of intensity and return, where LiDAR is rendered (train.scans)."""
     lr_shN: float = Field(1.25e-4, gt=0)
     """Learning rate of the colours' view-dependent terms."""

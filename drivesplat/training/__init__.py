@@ -1,2 +1,3 @@
-"""The stage `train`: loop, losses, densification, CUDA graphs, logs and resume state. It renders with `model`, and
-reads no dataset."""
+"""The stage `train`, from the outside in: `stage` (files in, files out), `loop`, `step` (sample, render, losses,
+backward, update). `schedule` counts steps, and `graphs` captures them. It renders with `model`, and reads no
+dataset."""

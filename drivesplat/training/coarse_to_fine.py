@@ -1,4 +1,4 @@
-"""Training images by iteration: reduced at first, at full size in the end."""
+"""Training images by step: reduced at first, at full size in the end."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,37 +10,35 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from drivesplat.model.view import View
-from drivesplat.settings.train import TrainSettings
+from drivesplat.training.schedule import Schedule
 from drivesplat.training.views import LidarDepth, TrainingView, view_index
 
 
 class TrainingImages:
-    """The images of a training: `views` in a seeded order, each once per epoch, reduced according to
-    `settings.coarse_to_fine`. Reduced images are cached while their factor is in use."""
+    """The images of a training: `views` in a seeded order, each once per epoch, reduced as the schedule says. Reduced
+    images are cached while their factor is in use."""
 
-    def __init__(self, views: Sequence[TrainingView], settings: TrainSettings, seed: int):
+    def __init__(self, views: Sequence[TrainingView], schedule: Schedule, seed: int):
         self.views = views
-        self._settings = settings
+        self._schedule = schedule
         self._seed = seed
         self._factor, self._reduced = 1, views
 
-    def at(self, step: int, image_step: int | None = None) -> TrainingView:
-        """The image of an iteration, the `image_step`-th that takes one (None: every iteration does)."""
+    def at(self, step: int) -> TrainingView:
+        """The image of a step."""
         factor = self.factor(step)
         if factor != self._factor:
             self._reduced = self.views if factor == 1 else [reduced(view, factor) for view in self.views]
             self._factor = factor
-        return self._reduced[self.number(step if image_step is None else image_step)]
+        return self._reduced[self.number(step)]
 
     def number(self, step: int) -> int:
-        """The index in `views` of the image that the `step`-th iteration with an image takes."""
-        return view_index(len(self.views), step, self._seed)
+        """The index in `views` of the image of a step."""
+        return view_index(len(self.views), self._schedule.images_before(step), self._seed)
 
     def factor(self, step: int) -> int:
-        """The factor by which width and height are reduced at an iteration."""
-        done, coarse = step / self._settings.iterations, self._settings.coarse_to_fine
-        wanted = 4 if done < coarse.quarter_until else 2 if done < coarse.half_until else 1
-        return next((factor for factor in (4, 2) if factor <= wanted and self._rows >= factor * coarse.min_height), 1)
+        """The factor by which width and height are reduced at a step."""
+        return self._schedule.reduction(step, self._rows)
 
     @cached_property
     def _rows(self) -> int:

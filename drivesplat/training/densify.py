@@ -10,22 +10,23 @@ import torch
 from torch.optim import Adam
 
 from drivesplat.model.part import Part
-from drivesplat.settings.train import TrainSettings
+from drivesplat.training.schedule import Schedule
 
 
 class Densifier:
-    """The densification of one part: call `after_step` at every iteration. With strategy: mcmc, `preallocates` is
+    """The densification of one part: call `after_step` at every step. With strategy: mcmc, `preallocates` is
     called before the part's tensors are reallocated; where it returns True, the part gets preallocated rows."""
 
-    def __init__(self, part: Part, settings: TrainSettings, preallocates: Callable[[], bool] = lambda: False):
+    def __init__(self, part: Part, schedule: Schedule, preallocates: Callable[[], bool] = lambda: False):
         from drivesplat.kernels.gsplat_private import cpu_strategies  # gsplat; the stage explains where it is missing
         from drivesplat.training import strategies
 
+        settings = schedule.settings
         self._part = part
         self._by_gradient = settings.strategy == "default"
         self._cap = part.cap_max or settings.cap_max
-        self._coarse_cap, self._coarse_until = coarse_cap(self._cap, settings)
-        self._strategy = strategies.make_strategy(settings, part, self._cap, preallocates)
+        self._coarse_cap, self._coarse_until = coarse_cap(self._cap, schedule)
+        self._strategy = strategies.make_strategy(schedule, part, self._cap, preallocates)
         self._on_cpu = cpu_strategies
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
@@ -64,21 +65,22 @@ class Densifier:
     def end(self, optimizers: dict[str, Adam]) -> None:
         """Drops the preallocated rows that are left."""
         if self._part.preallocated:
-            from drivesplat.training.cuda_graph.preallocation import release_rows
+            from drivesplat.training.graphs.preallocation import release_rows
 
             release_rows(self._part, optimizers)
 
 
-def coarse_cap(cap: int, settings: TrainSettings) -> tuple[int, int]:
-    """The cap while images are reduced, and the iteration at which it ends at the latest: early enough to grow to the
+def coarse_cap(cap: int, schedule: Schedule) -> tuple[int, int]:
+    """The cap while images are reduced, and the step at which it ends at the latest: early enough to grow to the
     full `cap` before densification stops."""
     from drivesplat.training.strategies import GROWTH
 
+    settings = schedule.settings
     fraction, every = settings.coarse_to_fine.fraction, settings.mcmc.refine_every
     if settings.strategy != "mcmc" or fraction == 1.0:
         return cap, 0
     steps = math.ceil(-math.log(fraction) / math.log1p(GROWTH)) + 1
-    return max(1, int(fraction * cap)), int(settings.refine_stop * settings.iterations) - steps * every
+    return max(1, int(fraction * cap)), schedule.step_at(settings.refine_stop) - steps * every
 
 
 def _info_of_rows(info: dict[str, Any], rows: slice) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import SparseGrid, dilated
+from drivesplat.model.parameters import fade
 from drivesplat.model.part import Part
 
 LARGEST_STEP = 15.0
@@ -115,7 +116,7 @@ def fade_floaters(part: Part, empty: EmptySpace) -> None:
 
     Only centres count, whatever the size: the centre of a large flat Gaussian lies in the surface it shows.
     """
-    part.fade(empty.holds(part.params["means"]))
+    fade(part.params, empty.holds(part.params["means"]))
 
 
 def fade_in_empty_space(parts: Iterable[Part], empty: EmptySpace) -> None:

@@ -11,7 +11,7 @@ from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.constants import constant
 from drivesplat.kernels.depth_error import mean_depth_error
-from drivesplat.kernels.regularizers import mean_thickness
+from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness
 from drivesplat.kernels.road_distance import Road, road_distance
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import active_fraction
@@ -58,9 +58,10 @@ def loss_terms(
     if picture.depth is not None and settings.smoothness_weight:
         opaque = picture.alpha if view.ego_mask is None else picture.alpha.masked_fill(view.ego_mask, 0.0)
         terms["smoothness"] = settings.smoothness_weight, depth_roughness(picture.depth, opaque, view.target())
-    logits = model.class_logits(picture, view.view) if view.classes is not None else None
-    if logits is not None:
-        terms["semantic"] = settings.semantic_weight, class_cross_entropy(logits, view.classes)
+    if view.classes is not None and all("classes" in part.params for part in model.parts):
+        logits = torch.cat([part.params["classes"] for part in model.parts])
+        rendered = model.composited(picture.shapes, logits, view.view).image.squeeze(0)
+        terms["semantic"] = settings.semantic_weight, class_cross_entropy(rendered, view.classes)
     penalty = model.exposure.penalty(view.view.camera) if model.exposure is not None else None
     if penalty is not None:
         terms["exposure"] = 1.0, penalty
@@ -81,7 +82,8 @@ def regularization(picture: Picture | ScanPicture, model: SplatModel, settings: 
     weights = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
     if not any(weights.values()):
         return {}
-    means, active = picture.mean_opacity_and_scale(), active_fraction(model.parts)
+    known = picture.sets if picture.sets.are_apart else [picture.sets.shapes]  # copying all of them would take time
+    means, active = mean_opacity_and_scale(*((it.opacities, it.scales) for it in known)), active_fraction(model.parts)
     return {name: (w, mean / active) for (name, w), mean in zip(weights.items(), means, strict=True) if w}
 
 
@@ -100,14 +102,10 @@ def _dynamic_terms(picture: Picture, view: TrainingView, model: SplatModel, sett
 
 
 def surface_terms(
-    sets: Sequence[Gaussians],
-    model: SplatModel,
-    road: Road | None,
-    settings: TrainSettings,
-    from_road: Float[Tensor, ""] | None = None,
+    sets: Sequence[Gaussians], model: SplatModel, road: Road | None, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The weighted loss terms of the surfaces of static parts, from the `sets` of Gaussians of all parts at one time.
-    `from_road` is the distance of these sets from the `road`, None where it is not known yet."""
+    """The weighted loss terms of the surfaces of static parts, from the `sets` of Gaussians of all parts at one
+    time."""
     if not settings.flatness_weight and road is None:
         return {}
     parts = [(part, own) for part, own in zip(model.parts, sets, strict=True) if not part.moves]
@@ -117,14 +115,9 @@ def surface_terms(
         thickness = mean_thickness(static.scales) / active_fraction([part for part, _ in parts])
         terms["flatness"] = settings.flatness_weight, thickness
     if road is not None:
-        distance = road_loss(static, road) if from_road is None else from_road
+        distance = road_distance(static.means, static.quats, static.scales, static.opacities, road)
         terms["road"] = settings.road_weight, distance
     return weighted(terms)
-
-
-def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
-    """The weighted mean distance in metres of the road's Gaussians from its surface: see `road_distance`."""
-    return road_distance(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, road)
 
 
 def class_cross_entropy(logits: Float[Tensor, "h w c"], classes: UInt8[Tensor, "h w"]) -> Float[Tensor, ""]:

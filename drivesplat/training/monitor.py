@@ -101,13 +101,11 @@ class Monitor:
         )
 
     def scalars(self, step: int, values: dict[str, float], advanced: int) -> None:
-        with self._writing():
-            for name, value in values.items():
-                self._writer.add_scalar(name, value, step)
+        self.write(step, values)
         self._bar.update(advanced)
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
 
-    def psnrs(self, step: int, values: dict[str, float]) -> None:
+    def write(self, step: int, values: dict[str, float]) -> None:
         with self._writing():
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)

@@ -1,7 +1,8 @@
-"""Adam for every parameter of a model, one optimizer each, as gsplat's strategies need it."""
+"""Adam for every parameter of a model, one optimizer each, as gsplat's strategies need it; learning rates, and the mean
+of the last parameters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -12,13 +13,17 @@ from drivesplat.kernels import torch_private
 from drivesplat.kernels.adam import adam_step
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.settings.train import TrainSettings
+from drivesplat.training.schedule import Schedule
 
 DECAY = 0.01
 """Final learning rate of what decays (positions, exposures, deformations, ...), and of all that is fine-tuned, as a
 fraction of the initial rate."""
 FINE_TUNED_MEANS, FINE_TUNED_OTHERS = 0.5, 6.0
 """Factors of the learning rates at which the fine-tuning of positions, and of all else, begins."""
+FINE_TUNED = ("lidar_logits", *OFFSETS.values())
+"""The parameters of Gaussians that only the LiDAR sees."""
+AVERAGED_EVERY = 5
+"""Steps from one whose parameters count in the mean to the next."""
 
 
 class Adam(torch.optim.Adam):
@@ -128,10 +133,6 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
-FINE_TUNED = ("echoes", *OFFSETS.values())
-"""The parameters of Gaussians that only the LiDAR sees."""
-
-
 def choose_learned(optimizers: ModelOptimizers, fine_tunes: bool) -> None:
     """Sets `requires_grad` of the parameters of parts for the next iteration: FINE_TUNED where it `fine_tunes`,
     otherwise all but OFFSETS. Parameters without an optimizer are left alone. What is constant costs no time."""
@@ -141,9 +142,14 @@ def choose_learned(optimizers: ModelOptimizers, fine_tunes: bool) -> None:
             optimizer.parameter.requires_grad_(learned)
 
 
-def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float, settings: TrainSettings) -> None:
-    """Sets the learning rates after the fraction `done` of the training. Those of exposures and of what parts name in
-    `decaying` decay exponentially, and that of exposures is 0 until they start; the others are constant."""
+def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, schedule: Schedule, step: int) -> None:
+    """Sets the learning rates of a step. Those of exposures and of what parts name in `decaying` decay exponentially,
+    and that of exposures is 0 until they start; the others are constant. In steps that fine-tune, the rates of what
+    only the LiDAR sees decay anew."""
+    if schedule.fine_tunes(step):
+        _set_fine_tuning_rates(model, optimizers, schedule.fine_tuned(step))
+        return
+    done = schedule.progress(step)
     decay = DECAY**done
     for part, *groups in zip(model.parts, optimizers.parts, optimizers.shared, strict=True):
         rates = part.learning_rates()
@@ -151,16 +157,62 @@ def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, done: flo
             for name in (name for name in part.decaying if name in group):
                 group[name].param_groups[0]["lr"] = rates[name] * decay
     for camera, optimizer in optimizers.beside_parts.get("exposure", {}).items():
-        rate = model.beside_parts["exposure"].learning_rates()[camera] if done >= settings.exposure.start else 0.0
+        starts = schedule.settings.exposure.start
+        rate = model.beside_parts["exposure"].learning_rates()[camera] if done >= starts else 0.0
         optimizer.param_groups[0]["lr"] = rate * decay
 
 
-def set_fine_tuning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float) -> None:
-    """Sets the learning rates of what only the LiDAR sees, after the fraction `done` of its fine-tuning. All of them
-    decay exponentially."""
+def _set_fine_tuning_rates(model: SplatModel, optimizers: ModelOptimizers, done: float) -> None:
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         rates = part.learning_rates()
         for name in FINE_TUNED:
             if name in group:
                 begin = FINE_TUNED_MEANS if name == OFFSETS["means"] else FINE_TUNED_OTHERS
                 group[name].param_groups[0]["lr"] = rates[name] * begin * DECAY**done
+
+
+@dataclass
+class ParameterAverage:
+    """The mean of all parameters over the steps `first` to `last`, of which `count` are in `means` so far: stochastic
+    weight averaging (Izmailov et al. 2018, arXiv 1803.05407). Until `last` the number and order of Gaussians may not
+    change."""
+
+    first: int
+    last: int
+    count: int = 0
+    means: list[Tensor] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, schedule: Schedule) -> "ParameterAverage":
+        """Over the last `train.averaged` of the training, after the last densification."""
+        settings = schedule.settings
+        begin = max(1.0 - settings.averaged, settings.refine_stop) if settings.averaged else 1.0
+        return cls(schedule.step_at(begin) + 1, schedule.fine_tuning_from)
+
+    @torch.no_grad()
+    def update(self, step: int, model: SplatModel) -> bool:
+        """To be called after each step, `step` of which are done. Writes the mean to the model after the last one;
+        returns whether it did."""
+        if not self.first <= step <= self.last or (self.last - step) % AVERAGED_EVERY:
+            return False
+        learned = [parameter.data for parameter in model.parameters() if parameter.is_floating_point()]
+        self.count += 1
+        if self.count == 1:
+            self.means = [values.clone() for values in learned]
+        else:
+            for mean, values in zip(self.means, learned, strict=True):
+                mean.lerp_(values, 1.0 / self.count)
+        if step < self.last:
+            return False
+        for mean, values in zip(self.means, learned, strict=True):
+            values.copy_(mean)
+        self.means = []
+        return True
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed training needs of it."""
+        return {"count": self.count, "means": self.means}
+
+    def restore(self, state: dict[str, Any], device: torch.device) -> None:
+        """The inverse of `state`."""
+        self.count, self.means = state["count"], [values.to(device) for values in state["means"]]

@@ -12,6 +12,7 @@ from drivesplat.errors import ResultError, TrainingError
 from drivesplat.io import checkpoint_file
 from drivesplat.io.file_lock import LockHeldError, locked_file
 from drivesplat.io.storage import unwritable
+from drivesplat.model.part import preallocate
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.densify import Densifier
 from drivesplat.training.optimizers import ModelOptimizers
@@ -76,7 +77,7 @@ def restore(
     """The inverse of `state_of`, in place."""
     restore_model(model, state["model"])
     for part, rows in zip(model.parts, state["preallocated"], strict=True):
-        part.preallocated = rows
+        preallocate(part, rows)
     parameters = [(part.params, group) for part, group in zip(model.parts, optimizers.parts, strict=True)]
     parameters += [(part.shared, group) for part, group in zip(model.parts, optimizers.shared, strict=True)]
     parameters += [(it.params, optimizers.beside_parts[name]) for name, it in model.beside_parts.items()]

@@ -64,7 +64,7 @@ def _loaded(recorded: RecordedScan, spread: tuple[float, float], device: torch.d
     return TrainingScan(view_of_scan(recorded, spread, device), measured, returned & measured, ranges, intensity)
 
 
-def initial_echo(recorded: Sequence[RecordedScan]) -> tuple[float, float]:
+def initial_lidar_logits(recorded: Sequence[RecordedScan]) -> tuple[float, float]:
     """The logits of the mean recorded intensity, and of the fraction of measured rays that returned; what meets a
     surface mostly returns."""
     intensities = [scan.scan.intensities[scan.scan.returned] for scan in recorded if scan.scan.intensities is not None]

@@ -13,8 +13,8 @@ from torch.optim import Adam
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import HookedDefaultStrategy
 from drivesplat.model.part import Part
-from drivesplat.settings.train import TrainSettings
-from drivesplat.training.cuda_graph.preallocation import activate, release_rows, reserve_rows
+from drivesplat.training.graphs.preallocation import activate, release_rows, reserve_rows
+from drivesplat.training.schedule import Schedule
 
 GROWTH = 0.05
 """Fraction by which the number of Gaussians grows at each densification step of MCMC, up to the limit."""
@@ -97,11 +97,12 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
 
 
 def make_strategy(
-    settings: TrainSettings, part: Part, cap_max: int, preallocates: Callable[[], bool]
+    schedule: Schedule, part: Part, cap_max: int, preallocates: Callable[[], bool]
 ) -> CappedDefaultStrategy | PreallocatingMcmcStrategy:
     """The strategy that the settings name, for at most `cap_max` Gaussians of a part. With MCMC new Gaussians go into
     preallocated rows where `preallocates` returns True."""
-    start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
+    settings = schedule.settings
+    start, stop = map(schedule.step_at, (settings.refine_start, settings.refine_stop))
     if settings.strategy == "mcmc":
         return PreallocatingMcmcStrategy(
             cap_max=cap_max,

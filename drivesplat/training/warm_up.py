@@ -24,8 +24,8 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import RayGrid
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.loop import TrainingFolders, train
 from drivesplat.training.scans import TrainingScan
-from drivesplat.training.train import TrainingFolders, train
 from drivesplat.training.views import TrainingView
 
 ITERATIONS = 4
@@ -48,7 +48,7 @@ def warm_up(folder: Path) -> None:
     sky = torch.zeros(height, width, dtype=torch.bool)
     view = TrainingView(View(intrinsics, torch.eye(4), width, height, time=0.0), pixels, sky)
     colors = np.full((GAUSSIANS, 3), 0.5)
-    part = Background.from_points(points, colors, settings.gaussians, extent=5.0, echo=(0.0, 0.0))
+    part = Background.from_points(points, colors, settings.gaussians, extent=5.0, lidar_logits=(0.0, 0.0))
     model = SplatModel([part], CubemapSky(settings.sky_resolution, torch.full((3,), 0.5), settings.lr_sky))
     folders = TrainingFolders(folder / "resume", folder / "tensorboard", "", "warm-up")
     train(model, [view], settings, 0, torch.device("cpu"), folders, _road(), scans=[_scan()])

@@ -30,7 +30,7 @@ from drivesplat.errors import ConfigError, DeviceError, TrainingError
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.settings.config import load, merged
 from drivesplat.training.probes import NO_PROBES
-from drivesplat.training.run import TrainingFiles, read_inputs, run_training
+from drivesplat.training.stage import TrainingFiles, read_inputs, run_training
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -380,7 +380,7 @@ def assert_curve_ends_at_result(run: dict[str, Any]) -> None:
 @pytest.mark.xdist_group("speed")
 def test_our_curve_ends_at_the_result_but_for_colours_that_follow_the_last_iteration(measured, tmp_path, monkeypatch):
     monkeypatch.chdir(measured.folder)
-    monkeypatch.setattr("drivesplat.training.run.fill_unseen", lambda model, views: None)
+    monkeypatch.setattr("drivesplat.training.stage.fill_unseen", lambda model, views: None)
     file, out = read_speed_file("tiny.yaml", {}), Path("results/speed/tiny")
     *_, task = tasks_of(file, plan_run(file, out, Path()), out)
     assert task.recipe == "ours"

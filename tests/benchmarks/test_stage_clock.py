@@ -7,8 +7,8 @@ import torch
 from helpers.trainings import folders_of, recorded_views, settings_of, untrained
 
 from benchmarks.speed.stage_clock import OTHER, StageClock
-from drivesplat.training.clock import ITERATION, UNTIMED, Clock
-from drivesplat.training.train import train
+from drivesplat.training.loop import train
+from drivesplat.training.step import ITERATION, UNTIMED, Clock
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CPU = torch.device("cpu")

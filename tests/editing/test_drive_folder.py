@@ -21,6 +21,7 @@ from helpers.hand_made_street import (
     straight,
     street_model,
 )
+from helpers.samples import sampled_with
 from nuscenes.nuscenes import NuScenes
 from nuscenes.utils.geometry_utils import view_points
 from PIL import Image, ImageDraw
@@ -30,7 +31,7 @@ from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_driv
 from drivesplat.editing.render_plan import image_render_plan
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.storage import unwritable
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.readers.drive.check import check, whole_scene
@@ -88,7 +89,7 @@ def shown_by(model: SplatModel, frame: Frame, scene: Scene, placed: list[ActorPl
         frame.height,
         time=scene.seconds(frame.timestamp),
     )
-    return film_frame(model, view, model.gaussians_with_placements(view.time, placed)).astype(int)
+    return film_frame(model, view, sampled_with(model, view.time, placed)).astype(int)
 
 
 def as_read(folder: Path) -> Scene:

@@ -13,6 +13,7 @@ from helpers.drives import LIDAR_AT
 from helpers.hand_made import looking_at, motion_through, round_gaussians
 from helpers.hand_made_street import AHEAD, DRIVERS, GONE, KEY, TURNING, checkpoint_of, straight, street_actors
 from helpers.hand_made_street import street_model as model_of
+from helpers.samples import sampled_with
 from nuscenes.nuscenes import NuScenes
 from nuscenes.scripts.export_2d_annotations_as_json import post_process_coords
 from nuscenes.utils.geometry_utils import BoxVisibility, view_points
@@ -21,7 +22,7 @@ from drivesplat.editing.actors import other_objects, trained_actors
 from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_drive
 from drivesplat.editing.film import track_labels
 from drivesplat.editing.shown_objects import ShownObjects, parts_that_may_show
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.readers.drive.format import read_drive
@@ -110,13 +111,13 @@ def test_every_box_in_an_image_has_an_object_of_the_model_in_it(devkit, scene, m
         view = view_of(devkit, image, scene)
         left, top, right, bottom = (round(v) for v in row["bbox_corners"])
         if row["shown_by"] == "background":
-            pair = [film_frame(m, view, m.gaussians_with_placements(view.time, [])) for m in (model, bare)]
+            pair = [film_frame(m, view, sampled_with(m, view.time, [])) for m in (model, bare)]
         else:
             pose = straight(view.time)
             name = AHEAD if row["category_name"] == "vehicle.car" else GONE
             pose = None if name == GONE else pose + np.array([[0, 0, 0, 0], [0, 0, 0, 2.0], [0, 0, 0, 0], [0] * 4])
             shown = [ActorPlacement(name, pose)]
-            pair = [film_frame(model, view, model.gaussians_with_placements(view.time, p)) for p in (shown, [])]
+            pair = [film_frame(model, view, sampled_with(model, view.time, p)) for p in (shown, [])]
         changed = np.abs(np.subtract(*pair, dtype=int)).max(axis=2) > 8
         assert changed[top : bottom + 1, left : right + 1].any(), row
 

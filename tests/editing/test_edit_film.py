@@ -23,6 +23,7 @@ from helpers.hand_made_street import (
     views_of,
 )
 from helpers.hand_made_traffic import placed
+from helpers.samples import sampled_with
 from PIL import Image
 
 from drivesplat.editing.actors import actor_placements, collisions, editable_actors
@@ -31,7 +32,7 @@ from drivesplat.editing.film import EditFiles, Still, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import read_footage
-from drivesplat.model.part import ActorPlacement
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
@@ -168,7 +169,7 @@ def test_labels_and_cameras_reproduce_the_frames(scene, model, busy):
             for track in busy.record["tracks"]
             if track["editable"] and track["object_to_world"][number] is not None
         ]
-        again = film_frame(model, view, model.gaussians_with_placements(view.time, shown)).astype(int)
+        again = film_frame(model, view, sampled_with(model, view.time, shown)).astype(int)
         assert np.abs(again - picture).max() <= 1
 
 
@@ -328,7 +329,7 @@ def test_at_60_frames_a_second_actors_move_in_every_frame(scene, model):
     present = actor_placements(edited_actors(editable_actors(model, scene, "here"), edit_of(step), "here"), seconds)
     aside, motion = rigid(np.eye(3), np.array([0.0, 2.0, 0.0])), model.rigid_groups(0.0)[TURNING].motion
     for number in (1, 77, 270):
-        shown = model.gaussians_with_placements(float(seconds[number]), present[number])
+        shown = sampled_with(model, float(seconds[number]), present[number])
         groups = model.rigid_groups(float(seconds[number]))
         poses = {AHEAD: straight(number / 60) @ aside, TURNING: motion.poses(np.array([number / 60]))[0]}
         for name, pose in poses.items():

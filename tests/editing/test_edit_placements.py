@@ -17,6 +17,7 @@ from helpers.hand_made_street import (
     street_model,
 )
 from helpers.hand_made_traffic import placed
+from helpers.samples import sampled_with
 
 from drivesplat.editing.actors import actor_placements, editable_actors
 from drivesplat.editing.ego import edited_camera_path
@@ -52,7 +53,7 @@ def edited_gaussians(
 ) -> list[Gaussians]:
     """The Gaussians at `times` after these steps."""
     placed = actor_placements(edited(model, scene, *steps), times)
-    return [model.gaussians_with_placements(float(time), actors) for time, actors in zip(times, placed, strict=True)]
+    return [sampled_with(model, float(time), actors) for time, actors in zip(times, placed, strict=True)]
 
 
 def rows_of(model: SplatModel, *names: str) -> torch.Tensor:
@@ -96,7 +97,7 @@ def test_parameters_of_unnamed_actors_do_not_change(model, scene, kind):
     others = ~rows_of(model, *STEPS[kind])
     differs = False
     for time, edited in zip(TIMES, edited_gaussians(model, scene, STEP[kind]), strict=True):
-        recorded = model.gaussians_at(float(time))
+        recorded = model.at(float(time))
         for name in recorded.tensors:
             now, then = (gaussians.tensors[name][: len(model)] for gaussians in (edited, recorded))
             assert torch.equal(now[others], then[others]), name
@@ -123,7 +124,7 @@ def test_only_pixels_reached_by_the_edited_actor_change(model, scene, kind):
     """Where its own alpha, alone, is under 1/255 at its old and at its new place."""
     changed = []
     for time, edited in zip(TIMES, edited_gaussians(model, scene, STEP[kind]), strict=True):
-        view, recorded = view_at(scene, time), model.gaussians_at(float(time))
+        view, recorded = view_at(scene, time), model.at(float(time))
         own = rows_of(model, *STEPS[kind])
         own_now = torch.cat([own, torch.ones(len(edited) - len(own), dtype=torch.bool)])
         alone = [model.render(view, gaussians=gaussians) for gaussians in (recorded[own], edited[own_now])]
@@ -231,7 +232,7 @@ def test_a_removed_actor_is_absent(model, scene):
     own = rows_of(model, AHEAD)
     for time, edited in zip(TIMES, edited_gaussians(model, scene, {"remove": {"track": "6e5c"}}), strict=True):
         assert (edited.opacities[own] == 0).all() and len(edited) == len(model)
-        view, without = view_at(scene, time), model.gaussians_at(float(time))[~own]
+        view, without = view_at(scene, time), model.at(float(time))[~own]
         assert torch.equal(model.render(view, gaussians=edited).image, model.render(view, gaussians=without).image)
 
 
@@ -258,7 +259,7 @@ def test_a_duplicate_appears_beside_its_original(model, scene):
     ]
     own = rows_of(model, AHEAD)
     for time, edited in zip(TIMES, edited_gaussians(model, scene, *steps), strict=True):
-        recorded, count = model.gaussians_at(float(time)), int(own.sum())
+        recorded, count = model.at(float(time)), int(own.sum())
         assert len(edited) == len(model) + 2 * count
         assert torch.equal(edited.means[: len(model)], recorded.means)
         assert torch.equal(edited.opacities[: len(model)], recorded.opacities)
@@ -281,7 +282,7 @@ def test_a_recoloured_actor_has_other_colours_from_all_directions_and_nothing_el
     first = color_matrix(Recolour(**changes[0]))
     own, toward = rows_of(directed, AHEAD).nonzero()[:, 0], torch.tensor([0.6, -0.48, 0.64])
     for time, edited in zip(TIMES, edited_gaussians(directed, scene, *steps), strict=True):
-        recorded = directed.gaussians_at(float(time))
+        recorded = directed.at(float(time))
         for rows, matrix in ((own, first), (slice(len(directed), None), color_matrix(Recolour(**changes[1])) @ first)):
             for field in ("means", "scales", "opacities"):
                 np.testing.assert_allclose(getattr(edited, field)[rows], getattr(recorded, field)[own], atol=2e-5)

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import about_z, actors_of, motion_through, round_gaussians, track_of
+from helpers.samples import EVERYTHING, sampled, sampled_with
 from torch import nn
 
 from drivesplat.editing.actors import actor_placements
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanPicture, ScanView
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import SCAN
 from drivesplat.rasterization.scans import RayGrid
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
@@ -19,7 +21,7 @@ from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
 CAR, SPEED, TIME = "car", 8.0, 1.0
 CAR_AT, WALL_AT = 12.0, 30.0
 """Metres ahead of the sensor, at TIME: the rear of the car, and a wall behind it."""
-CAR_ECHO, WALL_ECHO = (2.0, 5.0), (-2.0, 5.0)
+CAR_LOGITS, WALL_LOGITS = (2.0, 5.0), (-2.0, 5.0)
 """Logits of intensity and of a return."""
 SIZE = np.array([4.0, 2.0, 1.6])
 REVOLUTION_S = 0.1
@@ -35,7 +37,7 @@ def plate(x: float, half_width: float, half_height: float, spacing: float = 0.1)
     return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
 
 
-def echoes(count: int, logits: tuple[float, float]) -> nn.Parameter:
+def lidar_logits(count: int, logits: tuple[float, float]) -> nn.Parameter:
     made = torch.zeros(count, 4, 2)
     made[:, 0] = torch.tensor(logits)
     return nn.Parameter(made)
@@ -45,7 +47,7 @@ def street() -> SplatModel:
     """A car, the plate of its rear, that drives along x; a wall behind it."""
     places = plate(WALL_AT, 8.0, 2.0, 0.25)
     wall = round_gaussians(places, 0.25, 0.99)
-    wall.params["echoes"] = echoes(len(places), WALL_ECHO)
+    wall.params["lidar_logits"] = lidar_logits(len(places), WALL_LOGITS)
     rear = plate(-0.5 * SIZE[0], 1.0, 0.8)
     times = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
     motion = motion_through(times, [[CAR_AT + 0.5 * SIZE[0] + SPEED * (t - TIME), 0.0, 0.0] for t in times])
@@ -54,7 +56,7 @@ def street() -> SplatModel:
         car.params["means"].copy_(torch.from_numpy(rear))
         car.params["scales"].fill_(float(np.log(0.11)))
         car.params["opacities"].fill_(5.0)
-    car.params["echoes"] = echoes(len(rear), CAR_ECHO)
+    car.params["lidar_logits"] = lidar_logits(len(rear), CAR_LOGITS)
     return SplatModel([wall, car], None).requires_grad_(False)
 
 
@@ -72,8 +74,8 @@ def edited(model: SplatModel, *steps: dict[str, Any], time: float = TIME) -> Gau
     (group,) = (group for group in model.rigid_groups(0.0).values() if group.motion is not None)
     recorded = [EditedActor.recorded(CAR, "vehicle.car", SIZE, group.motion)]
     actors = edited_actors(recorded, Edit.model_validate({"steps": steps}), "here")
-    (placed,) = actor_placements(actors, np.array([time]))
-    return model.gaussians_with_placements(time, placed, with_velocities=True, with_echoes=True)
+    (there,) = actor_placements(actors, np.array([time]))
+    return sampled_with(model, time, there, EVERYTHING)
 
 
 def scan(*steps: dict[str, Any], **changes: Any) -> ScanPicture:
@@ -92,7 +94,7 @@ def assert_meets(picture: ScanPicture, x: float, echo: tuple[float, float], **of
 
 
 def test_the_recorded_car_returns_its_own_echo():
-    assert_meets(scan(), CAR_AT, CAR_ECHO)
+    assert_meets(scan(), CAR_AT, CAR_LOGITS)
 
 
 def test_an_edit_of_nothing_is_the_recorded_scan():
@@ -105,23 +107,23 @@ def test_an_edit_of_nothing_is_the_recorded_scan():
 
 
 def test_rays_of_a_removed_car_return_what_is_behind_it():
-    assert_meets(scan({"remove": {"track": CAR}}), WALL_AT, WALL_ECHO)
+    assert_meets(scan({"remove": {"track": CAR}}), WALL_AT, WALL_LOGITS)
 
 
 def test_a_shifted_car_returns_where_it_now_is_and_no_longer_where_it_was():
     beside = np.arctan2(3.0, CAR_AT) + np.linspace(-0.05, 0.05, 9)
     step = {"shift": {"track": CAR, "lateral": 3.0}}
-    assert_meets(scan(step, azimuths=beside), CAR_AT, CAR_ECHO, azimuths=beside)
-    assert_meets(scan(step), WALL_AT, WALL_ECHO)
-    assert_meets(scan({"shift": {"track": CAR, "longitudinal": 5.0}}), CAR_AT + 5.0, CAR_ECHO)
+    assert_meets(scan(step, azimuths=beside), CAR_AT, CAR_LOGITS, azimuths=beside)
+    assert_meets(scan(step), WALL_AT, WALL_LOGITS)
+    assert_meets(scan({"shift": {"track": CAR, "longitudinal": 5.0}}), CAR_AT + 5.0, CAR_LOGITS)
 
 
-def test_a_duplicate_has_the_echoes_and_the_speed_of_its_original():
+def test_a_duplicate_has_the_logits_and_the_speed_of_its_original():
     model = street()
     steps = {"duplicate": {"track": CAR, "as": "twin", "longitudinal": -6.0}}
     both = edited(model, steps)
     assert len(both) == len(model) + int(model.of_track(CAR).sum())
-    assert_meets(model.scan(view(), gaussians=both), CAR_AT - 6.0, CAR_ECHO)
+    assert_meets(model.scan(view(), gaussians=both), CAR_AT - 6.0, CAR_LOGITS)
     moving = both.velocities[both.velocities.abs().sum(dim=1) > 0]
     assert len(moving) == 2 * int(model.of_track(CAR).sum())
     torch.testing.assert_close(moving, torch.tensor([SPEED, 0.0, 0.0]).expand_as(moving), atol=1e-2, rtol=0)
@@ -155,16 +157,16 @@ def test_the_side_of_a_car_that_returns_more_turns_with_it():
     model = street()
     (car,) = (part for part in model.parts if part.moves)
     with torch.no_grad():
-        car.params["echoes"][:, 1:, 0] = torch.tensor([3.0, 0.0, 0.0])
-    turned = edited(model, {"shift": {"track": CAR, "yaw": 90.0}}).echoes[model.of_track(CAR)]
+        car.params["lidar_logits"][:, 1:, 0] = torch.tensor([3.0, 0.0, 0.0])
+    turned = edited(model, {"shift": {"track": CAR, "yaw": 90.0}}).lidar_logits[model.of_track(CAR)]
     expected = torch.from_numpy(about_z(np.pi / 2) @ np.array([3.0, 0.0, 0.0])).float()
     torch.testing.assert_close(turned[:, 1:, 0], expected.expand(len(turned), 3), atol=1e-4, rtol=0)
 
 
 def test_a_shifted_sensor_sees_past_the_car():
-    assert_meets(scan(left=3.0), WALL_AT, WALL_ECHO)
+    assert_meets(scan(left=3.0), WALL_AT, WALL_LOGITS)
     toward = np.arctan2(-3.0, CAR_AT) + np.linspace(-0.03, 0.03, 5)
-    assert_meets(scan(left=3.0, azimuths=toward), CAR_AT, CAR_ECHO, azimuths=toward)
+    assert_meets(scan(left=3.0, azimuths=toward), CAR_AT, CAR_LOGITS, azimuths=toward)
 
 
 def test_rows_know_their_placements():
@@ -177,20 +179,21 @@ def test_rows_know_their_placements():
         {"duplicate": {"track": CAR, "as": "two", "lateral": 3.0}},
         {"remove": {"track": CAR}},
     ]
-    (placed,) = actor_placements(
+    (there,) = actor_placements(
         edited_actors(recorded, Edit.model_validate({"steps": steps}), "here"), np.array([TIME])
     )
-    found, rows = model.gaussians_with_placements(TIME, placed), model.placement_of_rows(placed)
+    found = sampled_with(model, TIME, there)
+    rows = found.placement
     walls, own = len(model.parts[0]), len(model.parts[1])
     assert rows.tolist() == [-1] * walls + [0] * own + [1] * own
     places = [found.means[rows == number].mean(dim=0) for number in (0, 1)]
     assert float(places[0][0] - places[1][0]) == pytest.approx(6.0, abs=0.01)
     assert float(places[1][1]) == pytest.approx(3.0, abs=0.01)
-    assert set(model.placement_of_rows([]).tolist()) == {-1}
+    assert set(sampled_with(model, TIME, []).placement.tolist()) == {-1}
 
 
 def test_a_car_about_to_vanish_has_no_speed_rather_than_that_to_nowhere():
     """The motion reaches 0.25 s beyond its last annotation at 2 s."""
     (car,) = (part for part in street().parts if part.moves)
-    assert float(car.velocities(2.24).abs().max()) == 0.0
-    assert float(car.velocities(2.2)[:, 0].mean()) == pytest.approx(SPEED, rel=0.01)
+    assert float(sampled(car, 2.24, SCAN).velocities.abs().max()) == 0.0
+    assert float(sampled(car, 2.2, SCAN).velocities[:, 0].mean()) == pytest.approx(SPEED, rel=0.01)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made_street import AHEAD, DRIVERS, GONE, TURNING, checkpoint_of, straight, street_model
-from helpers.scanned_street import ECHO, SPEED, UNMEASURED, WALL_AT, parked_truck, scan_records, scanned_street
+from helpers.scanned_street import LIDAR_LOGITS, SPEED, UNMEASURED, WALL_AT, parked_truck, scan_records, scanned_street
 from plyfile import PlyData
 
 from drivesplat.editing.scan_folder import write_scan_folder
@@ -116,9 +116,10 @@ def test_labels_are_the_actors_that_contribute_most_and_boxes_of_what_stands_in_
     assert len(box) > 5
     np.testing.assert_allclose(box[:, 0], truck.object_to_world[0][0, 3], atol=0.5)
     intensity = found.rendered.intensities
-    for name, echo in ((AHEAD, "vehicle"), (truck.id, "wall")):
+    for name, kind in ((AHEAD, "vehicle"), (truck.id, "wall")):
         rays = found.objects == names.index(name)
-        assert np.median(intensity[rays]) == pytest.approx(float(torch.tensor(ECHO[echo][0]).sigmoid()), abs=0.03)
+        expected = float(torch.tensor(LIDAR_LOGITS[kind][0]).sigmoid())
+        assert np.median(intensity[rays]) == pytest.approx(expected, abs=0.03)
     assert (found.objects[~found.returned] == NO_OBJECT).all()
 
 

@@ -39,7 +39,7 @@ from drivesplat.settings.images import ParserJob
 from drivesplat.settings.method import merged
 from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.train import TrainJob
-from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
+from drivesplat.training.stage import TrainingFiles, TrainingInputs, run_training
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("without_cameras")]

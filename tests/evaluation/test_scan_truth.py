@@ -10,6 +10,7 @@ from helpers.drives import LIDAR_AT, ORIGIN, seconds_of
 from helpers.hand_made import actors_of, round_gaussians
 from helpers.hand_made_street import AHEAD, DRIVERS, SETTINGS, straight, street_scene
 from helpers.hand_made_street import SPEED as CAR_SPEED
+from helpers.samples import sampled
 from helpers.scanned_street import REVOLUTION_S, scan_records
 from helpers.scanned_street import SPEED as EGO_SPEED
 from torch import nn
@@ -94,10 +95,10 @@ def known(path, scene) -> ScanTruth:
     return ScanTruth.of(read_truth(path), path, scene, scan_records(scene), 2.5)
 
 
-def echoes(part: nn.Module, intensity: float) -> None:
+def set_lidar_logits(part: nn.Module, intensity: float) -> None:
     made = torch.zeros(len(part), 4, 2)
     made[:, 0] = torch.tensor([np.log(intensity / (1.0 - intensity)), 5.0])
-    part.params["echoes"] = nn.Parameter(made)
+    part.params["lidar_logits"] = nn.Parameter(made)
 
 
 def street(wall_at: float = WALL_AT, car_ahead: float = 0.0, intensity: float = 0.5) -> SplatModel:
@@ -113,7 +114,7 @@ def street(wall_at: float = WALL_AT, car_ahead: float = 0.0, intensity: float = 
         car.params["scales"].fill_(float(np.log(0.08)))
         car.params["opacities"].fill_(5.0)
     for part in (wall, car):
-        echoes(part, intensity)
+        set_lidar_logits(part, intensity)
         with torch.no_grad():
             part.params["scales"][:, 0] = np.log(0.01)
     return SplatModel([wall, car], None).requires_grad_(False)
@@ -178,9 +179,9 @@ def test_without_the_car_its_rays_meet_what_is_behind_it(known):
 def test_a_model_without_actors_loses_what_lies_in_the_box(known):
     """A car in its static part is removed by its box, in each scan."""
     moving = street()
-    car = moving.parts[1].at(scan_seconds(known))
+    car = sampled(moving.parts[1], scan_seconds(known))
     static = round_gaussians(car.means.numpy(), 0.08, 0.99)
-    echoes(static, 0.5)
+    set_lidar_logits(static, 0.5)
     model = SplatModel([moving.parts[0], static], None).requires_grad_(False)
     found = removal_scan_metrics(model, known, MARGIN, SPREAD, CPU)
     assert found["not_removed"]["box"]["range_error_mean_m"] > found["box"]["range_error_mean_m"] + 1.0

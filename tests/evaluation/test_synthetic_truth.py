@@ -27,6 +27,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.picture import Picture
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import IMAGE, State, Want
 from drivesplat.model.view import View, view_of
 from drivesplat.readers.truth import TruthFrame, TruthView, read_truth, truth_image
 from drivesplat.scene.regions import LABELS
@@ -503,9 +504,11 @@ class Riding(Own):
             for frame, box in zip(frames, boxes, strict=True)
         }
 
-    def at(self, time: float) -> Gaussians:
-        pose = self._poses[round(time, 3)]
-        still = super().at(time)
+    def state(self, time: float, want: Want = IMAGE) -> State:
+        return State((self._poses[round(time, 3)],))
+
+    def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
+        (pose,), still = state.now, super().sample(state, want)
         return dataclasses.replace(still, means=still.means @ pose[:3, :3].T + pose[:3, 3])
 
 

@@ -6,6 +6,7 @@ import torch
 from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import TURNING, with_turning_track
+from helpers.samples import sampled, sampled_with
 from helpers.viewer_pages import (
     HEIGHT,
     SHOWN_WITHOUT_WORDS,
@@ -30,10 +31,11 @@ from drivesplat.export.trained_parts import SampledGroup, sampled_shapes, traine
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_scene import ViewerContent, modes_array
 from drivesplat.kernels.placement import LocalGaussians
+from drivesplat.model.actor_placements import ActorPlacement, with_walked
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import concatenate
-from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.timeline import TimeState
 from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit
 
 EDITED = {"walked": 0.7, "scale": 1.25, "phase": 0.3}
@@ -61,8 +63,8 @@ def modes(model, group) -> Modes:
 
 def in_box(people: Deformable, second: float, **placement: float) -> LocalGaussians:
     """The Gaussians that the model places in the box, as recorded or with changes of their gait."""
-    state = people._state_with(people.time_state(second), [ActorPlacement(TURNING, **placement)])
-    return people.local(state)
+    state, there = TimeState(*people.state(second).now), [ActorPlacement(TURNING, **placement)]
+    return people.local(with_walked(state, people.ids, there, people.cycle_lengths))
 
 
 def turned_by(quats: torch.Tensor, turns: np.ndarray, others: torch.Tensor) -> np.ndarray:
@@ -102,10 +104,10 @@ def test_weights_are_of_similar_size(modes, group):
 
 
 def test_what_is_rigid_has_no_modes(model, group):
-    assert fitted_modes(model, {"background": SampledGroup(round_gaussians([[0.0, 0.0, 0.0]]).at(0.0))}) == {}
+    assert fitted_modes(model, {"background": SampledGroup(sampled(round_gaussians([[0.0, 0.0, 0.0]]), 0.0))}) == {}
     nothing = group.of_rows(torch.zeros(len(group.gaussians), dtype=torch.bool))
     assert fitted_modes(model, {TURNING: nothing}) == {}
-    assert model.shape_weights([0.0], [ActorPlacement("nobody")]) is None
+    assert all(part.shape_weights([0.0], [ActorPlacement("nobody")]) is None for part in model.parts)
 
 
 def test_bytes_hold_the_modes_of_all_groups_in_order(modes):
@@ -156,7 +158,7 @@ def test_people_walk_as_recorded_and_as_edited(tmp_path):
         pose = motion.poses(np.array([second if place is None else place]))[0]
         placement = ActorPlacement(TURNING, object_to_world=pose, **(shape or {}))
         with torch.no_grad():
-            person = people.with_placements(second, [placement])
+            person = sampled_with(people, second, [placement])
         return rendered(a_model(concatenate([street, person]), sky), frame.camera_to_world)
 
     with chromium(tmp_path / "profile") as tab:

@@ -145,7 +145,7 @@ def test_the_groups_compose_the_drive_at_every_image(folder, parts, scene):
     first, model = min(frame.timestamp for frame in scene.frames), street()
     for frame in scene.frames:
         seconds = (frame.timestamp - first) * 1e-6
-        world = model.gaussians_at(seconds)
+        world = model.at(seconds)
         start = len(STREET)
         for track_id in TRAJECTORIES:
             expected, start = world[slice(start, start + 12)], start + 12

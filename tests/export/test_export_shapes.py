@@ -5,6 +5,7 @@ import pytest
 import torch
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import TURNING, with_turning_track
+from helpers.samples import sampled
 from helpers.walkers import walker
 from pxr import Gf, Usd, UsdVol
 
@@ -17,6 +18,7 @@ from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.io.storage import read_json
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.timeline import TimeState
 from drivesplat.settings.train import GaussianSettings
 
 NO_TIMES = np.array([], dtype=np.int64)
@@ -39,7 +41,7 @@ def scene(tiny_scene):
 
 
 def in_box(people: Deformable, second: float) -> np.ndarray:
-    return people.local(people.time_state(second)).means.detach().numpy()
+    return people.local(TimeState(*people.state(second).now)).means.detach().numpy()
 
 
 def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, scene):
@@ -53,7 +55,7 @@ def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, 
 
 def test_what_is_rigid_has_no_shapes(model, scene):
     assert trained_groups(model, scene, NO_TIMES)["background"].shapes is None
-    assert model.shapes("nobody", [0.0]) is None
+    assert all(part.shapes("nobody", [0.0]) is None for part in model.parts)
 
 
 def test_shapes_are_sampled_while_the_object_is_present():
@@ -109,7 +111,7 @@ def test_a_ply_shows_the_time_that_was_asked_for(model, people, scene):
         own = trained_groups(model, scene, NO_TIMES, second)[TURNING].gaussians
         np.testing.assert_allclose(own.means.numpy(), in_box(people, second), atol=1e-6)
         together = trained_gaussians(model, scene, second)
-        expected = people.at(second).means.detach()
+        expected = sampled(people, second).means.detach()
         np.testing.assert_allclose(together.means[-30:].detach().numpy(), expected.numpy(), atol=1e-5)
 
 

@@ -31,7 +31,7 @@ from drivesplat.scene.scan_record import read_scans
 from drivesplat.scene.scene import read_scene
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.training.resume_state import resumable
-from drivesplat.training.run import read_summary
+from drivesplat.training.stage import read_summary
 from drivesplat.trajectories.actor_record import read_actors
 
 SOURCES = [

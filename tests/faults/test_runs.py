@@ -407,7 +407,7 @@ def test_a_results_folder_on_a_read_only_disk_is_named(trained):
 
 OUT_OF_MEMORY = """\
 import torch
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.loop import Trainer
 
 
 def training_step(self, shown=True):

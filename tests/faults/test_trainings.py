@@ -35,7 +35,7 @@ from drivesplat.io import checkpoint_file
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training.monitor import Monitor
-from drivesplat.training.run import run_training
+from drivesplat.training.stage import run_training
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -82,7 +82,7 @@ def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
         raise EndedError
 
     with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
-        patched.setattr("drivesplat.training.run.write_checkpoint", ended)
+        patched.setattr("drivesplat.training.stage.write_checkpoint", ended)
         run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
     assert checkpoint_file.load(files.resume / "state.npz", "train")["step"] == 10
     provenance = {**PROVENANCE, **({other: "other"} if other else {})}

@@ -58,7 +58,7 @@ def train_step(
     picture.info["means2d"].retain_grad()
     loss = (picture.image - target).abs().mean()
     if learns_size:
-        means = mean_opacity_and_scale(picture.shapes.opacities, picture.shapes.scales)
+        means = mean_opacity_and_scale((picture.shapes.opacities, picture.shapes.scales))
         loss = loss + 0.1 * sum(means) / active_fraction(model.parts)
     loss.backward()
     for optimizer in optimizers.values():

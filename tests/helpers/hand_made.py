@@ -13,6 +13,7 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
+from drivesplat.model.states import IMAGE, State, Want
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.preprocess.parser import training_record
@@ -56,8 +57,8 @@ class Own(Part):
         self._still = still
         self._track_id = track_id
 
-    def at(self, time: float) -> Gaussians:
-        return self._still.at(time)
+    def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
+        return self._still.sample(state, want)
 
     def learning_rates(self) -> dict[str, float]:
         return self._still.learning_rates()
@@ -88,16 +89,17 @@ def track_of(motion: Motion, name: str = "it", size: Any = (4.0, 2.0, 1.6)) -> A
 
 def actors_of(
     *tracks: ActorTrack, count: int = 6, settings: ActorSettings | None = None, seed: int = 0, shaken: bool = True,
-    echo: tuple[float, float] | None = None,
+    lidar_logits: tuple[float, float] | None = None,
 ) -> Actors:  # fmt: skip
-    """Actors of `count` Gaussians each within their boxes, with `echo` for a LiDAR, too. `shaken`: every parameter is
-    random, corrections of the tracks (0.1 m, 0.1 rad) and all coefficients of the colours included, as after a
-    training."""
+    """Actors of `count` Gaussians each within their boxes, with `lidar_logits` for a LiDAR, too. `shaken`: every
+    parameter is random, corrections of the tracks (0.1 m, 0.1 rad) and all coefficients of the colours included, as
+    after a training."""
     rng = np.random.default_rng(seed)
     points = [rng.uniform(-0.5, 0.5, (count, 3)) * track.size for track in tracks]
     colors = [rng.uniform(0.0, 1.0, (count, 3)) for _ in tracks]
     settings = ActorSettings() if settings is None else settings
-    actors = Actors.from_points(tracks, points, colors, settings, GaussianSettings(init_opacity=0.6), echo=echo)
+    gaussians = GaussianSettings(init_opacity=0.6)
+    actors = Actors.from_points(tracks, points, colors, settings, gaussians, lidar_logits=lidar_logits)
     if shaken:
         with torch.no_grad():
             for name, value in (*actors.params.items(), *actors.shared.items()):

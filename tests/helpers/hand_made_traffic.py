@@ -10,6 +10,7 @@ from torch import nn
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.part import Part, RigidGroup
+from drivesplat.model.states import IMAGE, State, Want
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.trajectories.motion import Motion
@@ -99,8 +100,11 @@ class Traffic(Part):
         all_gaussians = concatenate([own_gaussians(track_id, 0.0) for track_id in TRAJECTORIES])
         self.params = nn.ParameterDict({"means": all_gaussians.means})
 
-    def at(self, time: float) -> Gaussians:
-        shown = []
+    def state(self, time: float, want: Want = IMAGE) -> State:
+        return State((torch.tensor(time, dtype=torch.float64),))
+
+    def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
+        shown, time = [], float(state.now[0])
         for track_id, trajectory in TRAJECTORIES.items():
             gaussians = placed(own_gaussians(track_id, time), trajectory.pose(time))
             shown.append(replace(gaussians, opacities=gaussians.opacities * trajectory.is_there(time)))

@@ -19,7 +19,7 @@ SPEED = 4.0
 """Of the tiny drive's ego vehicle, along x."""
 UNMEASURED = slice(0, 10)
 """Firings that say nothing: they look back."""
-ECHO = {"wall": (-2.0, 4.0), "vehicle": (1.0, 5.0)}
+LIDAR_LOGITS = {"wall": (-2.0, 4.0), "vehicle": (1.0, 5.0)}
 """Logits of intensity and of a return."""
 
 
@@ -39,9 +39,9 @@ def scanned_street(scene: Scene) -> SplatModel:
         actors.params["scales"].fill_(float(np.log(0.2)))
         actors.params["opacities"].fill_(4.0)
     for part, name in ((static, "wall"), (actors, "vehicle")):
-        echoes = torch.zeros(len(part), 4, 2)
-        echoes[:, 0] = torch.tensor(ECHO[name])
-        part.params["echoes"] = nn.Parameter(echoes)
+        logits = torch.zeros(len(part), 4, 2)
+        logits[:, 0] = torch.tensor(LIDAR_LOGITS[name])
+        part.params["lidar_logits"] = nn.Parameter(logits)
     return SplatModel([static, actors], None).requires_grad_(False)
 
 

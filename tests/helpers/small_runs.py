@@ -27,7 +27,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.train import TrainJob
-from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
+from drivesplat.training.stage import TrainingFiles, TrainingInputs, run_training
 from drivesplat.visuals.rendered_view import ModelWithRecording, open_model_with_recording
 from drivesplat.workflow.stages import stage_settings
 from helpers.workflow_copy import TINY_TRAINING

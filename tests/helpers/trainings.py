@@ -39,11 +39,11 @@ from drivesplat.settings.train import (
     TrainSettings,
 )
 from drivesplat.settings.train_geometry import FloaterSettings
-from drivesplat.training.run import (
+from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
+from drivesplat.training.stage import (
     TrainingFiles,
     TrainingInputs,
 )
-from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import LidarDepth, TrainingView
 from helpers import REPOSITORY
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
@@ -108,9 +108,9 @@ def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
 
 
 def untrained(
-    settings: TrainSettings, sky: bool = False, echo: tuple[float, float] | None = None, offsets: bool = False
+    settings: TrainSettings, sky: bool = False, lidar_logits: tuple[float, float] | None = None, offsets: bool = False
 ) -> SplatModel:
-    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, echo=echo, offsets=offsets)
+    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, lidar_logits=lidar_logits, offsets=offsets)
     return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
 
 
@@ -125,17 +125,16 @@ def cars() -> list[ActorTrack]:
 
 
 def untrained_street(
-    settings: TrainSettings, echo: tuple[float, float] | None = None, people: bool = False
+    settings: TrainSettings, lidar_logits: tuple[float, float] | None = None, people: bool = False
 ) -> SplatModel:
-    """Background, two cars and a sky; with `echo`, logits of intensity and returns, for a LiDAR, too, with the offsets
+    """Background, two cars and a sky; with `lidar_logits` of intensity and returns, for a LiDAR, too, with the offsets
     that settings want. `people`: what the cars are deforms."""
-    still = untrained(settings, sky=True, echo=echo, offsets=settings.scans.fine_tune > 0)
-    moving: Actors = actors_of(
-        *cars(), count=25, settings=settings.deformable if people else settings.actors, shaken=False, echo=echo
-    )
+    still = untrained(settings, sky=True, lidar_logits=lidar_logits, offsets=settings.scans.fine_tune > 0)
+    own = settings.deformable if people else settings.actors
+    moving: Actors = actors_of(*cars(), count=25, settings=own, shaken=False, lidar_logits=lidar_logits)
     if people:
-        own = {name: value.detach() for name, value in moving.params.items()}
-        moving = Deformable(own, moving.timeline.tracks, settings.deformable, settings.gaussians)
+        params = {name: value.detach() for name, value in moving.params.items()}
+        moving = Deformable(params, moving.timeline.tracks, settings.deformable, settings.gaussians)
     return SplatModel([*still.parts, moving], still.sky)
 
 

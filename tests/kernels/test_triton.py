@@ -29,26 +29,23 @@ from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
 from drivesplat.kernels.depth_error import mean_depth_error
-from drivesplat.kernels.echoes import echo_values
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.finite import NEVER, record_not_finite
 from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.kernels.object_poses import corrected
-from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
+from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, colors_in_world, place
 from drivesplat.kernels.quaternions import rotation_matrix
-from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness
+from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness, sums_of_squares
 from drivesplat.kernels.road_distance import Road, by_torch, road_distance
 from drivesplat.kernels.sparse_grid import SparseGrid
-from drivesplat.kernels.time_varying_colors import colors_in_world
-from drivesplat.kernels.track_penalties import sums_of_squares
-from drivesplat.kernels.view_colors import fused_view_colors
+from drivesplat.kernels.view_colors import fused_view_colors, lidar_response
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics, rotation_of_harmonics_by
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.model.view_colors import all_view_colors, rasterizer_colors
 from drivesplat.settings.train import McmcSettings
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.loop import Trainer
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -266,14 +263,21 @@ def test_colors_of_several_sets_equal_those_of_one():
     torch.testing.assert_close(found[0], found[1])
 
 
-def test_regularized_means_and_their_gradients_agree_with_torch():
+@pytest.mark.parametrize("counts", [(1500,), (1500, 0, 2100), (1, 1)])
+def test_regularized_means_over_sets_and_their_gradients_agree_with_torch(counts):
     torch.manual_seed(0)
-    opacities, scales = torch.rand(1500, device=DEVICE), 5.0 * torch.rand(1500, 3, device=DEVICE)
-    opacities[::3] = 0.0
-    inputs = [opacities.requires_grad_(), scales.requires_grad_()]
-    expected, found = both_ways(mean_opacity_and_scale, *inputs)
+    sets = []
+    for count in counts:
+        opacities, scales = torch.rand(count, device=DEVICE), 5.0 * torch.rand(count, 3, device=DEVICE)
+        opacities[2::3] = 0.0
+        sets.append((opacities.requires_grad_(), scales.requires_grad_()))
+    expected, found = both_ways(mean_opacity_and_scale, *sets)
+    together = [torch.cat(values) for values in zip(*sets, strict=True)]
+    present = together[0][:, None] > 0.0
+    torch.testing.assert_close(expected[0], together[0].mean())
+    torch.testing.assert_close(expected[1], (together[1] * present).mean())
     torch.testing.assert_close(found, expected)
-    assert_same_gradients([expected, found], inputs, atol=1e-9, rtol=1e-5)
+    assert_same_gradients([expected, found], [values for own in sets for values in own], atol=1e-9, rtol=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 1500])
@@ -335,14 +339,14 @@ def test_of_equal_errors_of_depth_those_that_count_share_their_weight():
 
 
 @pytest.mark.parametrize("count", [0, 1, 700])
-def test_values_of_echoes_and_their_gradients_agree_with_torch(count):
+def test_the_response_to_a_lidar_and_its_gradients_agree_with_torch(count):
     torch.manual_seed(count)
     means, sensor = 20.0 * torch.randn(count, 3, device=DEVICE), torch.tensor([1.0, -2.0, 1.8], device=DEVICE)
     means[:1] = sensor
-    echoes = (2.0 * torch.randn(count, 4, 2, device=DEVICE)).requires_grad_()
-    expected, found = both_ways(lambda: [echo_values(echoes, means.requires_grad_(), sensor)])
+    logits = (2.0 * torch.randn(count, 4, 2, device=DEVICE)).requires_grad_()
+    expected, found = both_ways(lambda: [lidar_response(logits, means.requires_grad_(), sensor)])
     torch.testing.assert_close(found, expected)
-    assert_same_gradients([expected, found], [echoes, means], atol=1e-6, rtol=1e-4)
+    assert_same_gradients([expected, found], [logits, means], atol=1e-6, rtol=1e-4)
     assert expected[0].shape == (count, 2)
 
 
@@ -510,12 +514,12 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, echoes, exploration
+from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, exploration
 from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
 from drivesplat.kernels.triton import colored_projection, road_distance
-from drivesplat.kernels.triton import depth_error, finite, joined_chunks, object_poses, track_penalties
+from drivesplat.kernels.triton import depth_error, finite, joined_chunks, lidar_response, object_poses
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
-from drivesplat.kernels.triton import scan_tiles
+from drivesplat.kernels.triton import scan_tiles, track_penalties
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "empty": "*i1", "index": "*i64",
               "owner": "*i64",
@@ -537,8 +541,10 @@ DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "l
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS, "nearest": "*i32"})
 SCAN[scan_chunks._copy] = RAYS
-COLORED = {"values": FLOATS, "first": "i32", "first_block": "i32", "total": "i32"}
+COLORED = {"values": FLOATS, "first": "i32"}
+SUMS = {"first": "i32", "total": "i32"}
 SCAN |= dict.fromkeys((colored_projection._project, colored_projection._project_backward), COLORED)
+SCAN |= dict.fromkeys((regularizers._sums, regularizers._spread), SUMS)
 ROAD = {"offsets": FLOATS, "keys": "*i64", "known": "i32", "edge": "fp32", "reach": "fp32", "roughness": "fp32",
         "cells": "*i32"}
 SCAN |= dict.fromkeys((road_distance._distances, road_distance._distances_backward), ROAD)
@@ -568,11 +574,10 @@ for k, degree, depth in ((1, 0, True), (4, 1, True), (4, 0, False), (9, 1, False
         compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth, BLOCK=colored_projection.BLOCK)
 compiled(road_distance._distances, STEPS=17, BLOCK=road_distance.BLOCK)
 compiled(road_distance._mean, BLOCK=road_distance.SUMS)
-for add in (False, True):
-    compiled(road_distance._distances_backward, ADD=add, BLOCK=road_distance.BLOCK)
+compiled(road_distance._distances_backward, BLOCK=road_distance.BLOCK)
 compiled(adam._step, BLOCK=adam.BLOCK)
-compiled(echoes._values, BLOCK=echoes.BLOCK)
-compiled(echoes._values_backward, BLOCK=echoes.BLOCK)
+compiled(lidar_response._values, BLOCK=lidar_response.BLOCK)
+compiled(lidar_response._values_backward, BLOCK=lidar_response.BLOCK)
 compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
 compiled(regularizers._means, BLOCK=regularizers.BLOCK)
 compiled(regularizers._spread, BLOCK=regularizers.BLOCK)

@@ -15,16 +15,13 @@ from helpers.trainings import settings_of, untrained_street
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels import triton_support
-from drivesplat.kernels.colored_projection import ColoredGaussians, PinholeCamera, SetOnRoad, project_with_colors
+from drivesplat.kernels.colored_projection import ColoredGaussians, PinholeCamera, project_with_colors
 from drivesplat.kernels.projection import project
-from drivesplat.kernels.regularizers import mean_opacity_and_scale
-from drivesplat.kernels.road_distance import Road, road_distance
-from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.kernels.view_colors import view_colors
 from drivesplat.model.view import RollingShutter
 from drivesplat.rasterization import rasterize_projected
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.losses import surface_terms
+from drivesplat.training.losses import regularization
 
 WIDTH, HEIGHT = 64, 48
 
@@ -86,10 +83,8 @@ def test_projected_sets_and_their_gradients_equal_projection_and_colors(degrees,
     outside = ((means2d[missed] < 0) | (means2d[missed] > torch.tensor([WIDTH, HEIGHT], device=DEVICE))).any(dim=-1)
     assert outside.all() and not reach[missed].any()
     expected = [projected.means2d[seen], projected.conics[seen], projected.opacities, values[seen]]
-    expected += mean_opacity_and_scale(opacities, scales)
     gaussians = found.gaussians
     ours = [gaussians.means2d[seen], gaussians.conics[seen], gaussians.opacities, found.values[seen]]
-    ours += [found.mean_opacity, found.mean_scale]
     for theirs, own in zip(expected, ours, strict=True):
         torch.testing.assert_close(own, theirs, atol=2e-5, rtol=2e-5)
     torch.testing.assert_close(gaussians.depths[seen], projected.depths[seen])
@@ -105,44 +100,6 @@ def test_projected_sets_and_their_gradients_equal_projection_and_colors(degrees,
     for theirs, own in zip(by_theirs, by_ours, strict=True):
         torch.testing.assert_close(own, theirs, atol=1e-4, rtol=1e-4)
     assert all(gradient.any() for gradient in by_ours[:5])
-
-
-def a_road(cells: int = 40) -> Road:
-    """A road of cells around the camera, near the middle of the Gaussians of `a_set`."""
-    torch.manual_seed(0)
-    keys = torch.randperm(8 * 6)[:cells].sort().values
-    normals = torch.nn.functional.normalize(torch.tensor([0.1, 0.2, 1.0]) + 0.1 * torch.randn(cells, 3), dim=1)
-    grid = SparseGrid(torch.tensor([-4.0, -3.0]), 1.0, (8, 6), keys)
-    return Road(grid, normals, 6.0 + torch.randn(cells), torch.rand(cells), 5.0).to(DEVICE)
-
-
-@pytest.mark.parametrize("index", [0, 2])
-def test_the_distance_from_a_road_adds_its_gradients_to_those_of_one_set(index):
-    """Of Gaussians in view and out of view; with a coefficient of its own, and where nothing else has a gradient."""
-    generator, camera, road = torch.Generator().manual_seed(0), a_camera(), a_road()
-    sets = [a_set(150, 4, generator), a_set(0, 4, generator), a_set(160, 1, generator)]
-    found = project_with_colors(sets, camera, (1, 0, 0), True, SetOnRoad(index, road))
-    expected = road_distance(*sets[index][:4], road)
-    torch.testing.assert_close(found.road_distance, expected)
-    assert float(expected.detach()) > 0.1
-    seen = (found.gaussians.radii > 0).all(dim=-1)
-    image = found.values[seen].square().sum() + found.gaussians.conics[seen].sum()
-    leaves = [tensor for own in sets for tensor in own[:3]]
-    options = {"retain_graph": True, "allow_unused": True, "materialize_grads": True}
-    for others in (image, 0.0):
-        ours = torch.autograd.grad(others + 3.0 * found.road_distance, leaves, **options)
-        theirs = torch.autograd.grad(others + 3.0 * expected, leaves, **options)
-        for own, their in zip(ours, theirs, strict=True):
-            torch.testing.assert_close(own, their, atol=1e-5, rtol=1e-4)
-    assert all(gradient.any() for gradient in ours[3 * index : 3 * index + 3])
-    assert not any(gradient.any() for gradient in [*ours[: 3 * index], *ours[3 * index + 3 :]])
-
-
-def test_without_a_road_or_gaussians_there_is_no_distance():
-    generator, camera = torch.Generator().manual_seed(0), a_camera()
-    sets = [a_set(20, 4, generator), a_set(0, 4, generator)]
-    for on_road in (None, SetOnRoad(0, a_road(0)), SetOnRoad(1, a_road())):
-        assert project_with_colors(sets, camera, (1, 1), False, on_road).road_distance is None
 
 
 @pytest.fixture
@@ -171,7 +128,7 @@ def test_what_is_out_of_view_reaches_no_image_and_no_gradient(behind):
     found = project_with_colors(sets, camera, (1, 0), True)
     rendering = rasterize_projected(found, WIDTH, HEIGHT, with_depth=True)
     assert behind != bool((rendering.alpha > 0.1).any())
-    loss = rendering.image.sum() + rendering.alpha.sum() + rendering.depth.sum() + found.mean_opacity + found.mean_scale
+    loss = rendering.image.sum() + rendering.alpha.sum() + rendering.depth.sum()
     gradients = torch.autograd.grad(loss, list(sets[0]))
     assert torch.isfinite(loss) and all(torch.isfinite(gradient).all() for gradient in gradients)
     assert gradients[3].any() and gradients[0].any() != behind
@@ -192,17 +149,16 @@ def a_view_on_device():
 
 
 def test_pictures_of_a_model_and_their_gradients_are_those_of_separate_kernels(monkeypatch):
-    """With depth, the means that regularizers penalise, and the distance from a road."""
-    model, road = untrained_street(settings_of()).to(DEVICE), a_road()
-    pictures = both_pictures(model, a_view_on_device(), monkeypatch, with_depth=True, road=road)
-    assert [picture.means_of_sets is None for picture in pictures] == [False, True]
-    assert [picture.road_distance is None for picture in pictures] == [False, True]
-    settings, shown = TrainSettings(road_weight=2.0), []
-    for it in pictures:
-        terms = surface_terms(it.sets, model, road, settings, it.road_distance)
-        shown.append([it.image, it.depth, *it.mean_opacity_and_scale(), terms["road"]])
-    assert float(shown[1][-1].detach()) > 0.01
-    assert shown[1][0].std() > 0.01
+    """With depth, and the means that regularizers penalise."""
+    model, settings = untrained_street(settings_of()).to(DEVICE), TrainSettings(opacity_reg=1.0, scale_reg=1.0)
+    pictures = both_pictures(model, a_view_on_device(), monkeypatch, with_depth=True)
+    assert [picture.sets.are_apart for picture in pictures] == [True, False], "the kernel needs no copy of all sets"
+    shown = []
+    for it, used in zip(pictures, (True, False), strict=True):
+        monkeypatch.setattr(triton_support, "usable_for", lambda tensor, used=used: used)
+        means = [mean for _, mean in regularization(it, model, settings).values()]
+        shown.append([it.image, it.depth, *means])
+    assert shown[1][0].std() > 0.01 and len(shown[1]) == 4
     for ours, theirs in zip(*shown, strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
     weights = [torch.rand(value.shape, generator=torch.Generator().manual_seed(0)).to(DEVICE) for value in shown[0]]
@@ -235,7 +191,7 @@ def test_other_pictures_are_left_to_separate_kernels(case, monkeypatch):
     else:
         view = replace(view, camera_to_world=view.camera_to_world.clone().requires_grad_())
     with_kernel, without = both_pictures(model, view, monkeypatch, **options)
-    assert with_kernel.means_of_sets is None
+    assert not with_kernel.sets.are_apart
     torch.testing.assert_close(with_kernel.image, without.image, atol=1e-4, rtol=1e-4)
 
 

@@ -232,7 +232,7 @@ def test_without_gsplat_the_training_stage_fails_with_one_sentence():
         "import sys; sys.modules['gsplat'] = None\n"
         "import torch; torch.cuda.is_available = lambda: True\n"
         "torch.cuda.mem_get_info = lambda *_: (10**11, 10**11); torch.cuda.get_device_name = lambda *_: 'card'\n"
-        "import drivesplat.training.run\n"
+        "import drivesplat.training.stage\n"
         "from drivesplat.machine.device import choose_device\n"
         "from drivesplat.settings.device import DeviceSettings\n"
         "from drivesplat.errors import DeviceError\n"

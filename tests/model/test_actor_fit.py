@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import about_z, looking_at, motion_through, track_of
+from helpers.samples import sampled
 
 from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import SplatModel
@@ -17,7 +18,7 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.loop import Trainer
 from drivesplat.training.views import TrainingView
 from drivesplat.trajectories.motion import Motion
 
@@ -94,18 +95,18 @@ def fit(actors: Actors, views: list[TrainingView], iterations: int = 200) -> Non
     """Iterations of the trainer, without densification and regularisers."""
     settings = TrainSettings(
         iterations=iterations, opacity_reg=0, scale_reg=0, entropy_weight=0, sh_every=0,
-        gaussians=GaussianSettings(sh_degree=actors.at(0.0).sh_degree),
+        gaussians=GaussianSettings(sh_degree=sampled(actors, 0.0).sh_degree),
     )  # fmt: skip
     trainer = Trainer.begin(SplatModel([actors], None), views, settings, 0, torch.device("cpu"))
     for _ in range(iterations):
         trainer.training_step()
-        trainer.step += 1
+        trainer.state.step += 1
 
 
 def distances(actors: Actors, thing: Thing, pose: np.ndarray, time: float) -> np.ndarray:
     """How far (n,) Gaussians are in the world from where the thing has them."""
     truth = thing.places @ pose[:3, :3].T + pose[:3, 3]
-    return np.linalg.norm(actors.at(time).means.detach().double().numpy() - truth, axis=1)
+    return np.linalg.norm(sampled(actors, time).means.detach().double().numpy() - truth, axis=1)
 
 
 def test_an_object_is_learned_in_its_own_frame_from_images_of_it_passing_by():

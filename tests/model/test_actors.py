@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import about_z, actors_of, looking_at, motion_through, track_of
+from helpers.samples import sampled, sampled_with
 from scipy.spatial.transform import Rotation
+from torch.nn.functional import one_hot
 
-from drivesplat.kernels.placement import ObjectPoses
+from drivesplat.kernels.placement import ObjectPoses, colors_in_object
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix, turned
-from drivesplat.model.actors import Actors
+from drivesplat.model.actor_placements import ActorPlacement
+from drivesplat.model.actors import Actors, track_penalties
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.timeline import ActorTrack
-from drivesplat.model.track_penalties import track_penalties
+from drivesplat.model.states import State
+from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings
 from drivesplat.training.optimizers import make_optimizers
@@ -56,6 +59,16 @@ def doubled(actors: Actors) -> dict[str, np.ndarray]:
     return {name: value.detach().double().numpy() for name, value in (*actors.params.items(), *actors.shared.items())}
 
 
+def poses_at(actors: Actors, time: float) -> ObjectPoses:
+    return actors.posed(actors.state(time).now).poses
+
+
+def harmonics_at(actors: Actors, time: float) -> torch.Tensor:
+    """The coefficients of its colours in the frames of its objects."""
+    owns = one_hot(actors.params["owner"], len(actors.ids)).float()
+    return colors_in_object(actors.params["sh0"], actors.params["shN"], TimeState(*actors.state(time).now).series, owns)
+
+
 # ---- mirror images
 
 
@@ -64,11 +77,11 @@ def test_a_mirrored_vehicle_is_its_mirror_image(degree):
     """In the frame of its box: what is at y is at -y, in its shape and its colours. The other vehicle stays."""
     actors = actors_of(van(), car(), settings=ActorSettings(sh_degree=degree))
     actors.mirrored = torch.full((2,), 0.5)
-    state = actors.time_state(2.7)
+    state = TimeState(*actors.state(2.7).now)
     here, found = (
-        actors.at_time_state(each) for each in (state, state._replace(side=torch.tensor([-1.0, 1.0])))
+        actors.sample(State(each)) for each in (state, state._replace(side=torch.tensor([-1.0, 1.0])))
     )  # fmt: skip
-    pose, rows = actors.poses(state), actors.of_track("van")
+    pose, rows = actors.posed(state).poses, actors.of_track("van")
     turn, place = torch.from_numpy(matrices(pose.quats)[0]).float(), pose.translations[0].detach()
     reflected = turn @ torch.diag(torch.tensor([1.0, -1.0, 1.0])) @ turn.T
     for name, values in here.tensors.items():
@@ -142,7 +155,7 @@ def test_a_turning_actor_is_transformed_by_its_corrected_box(time):
     with torch.no_grad():
         actors.shared["translation"].copy_(torch.from_numpy(TIMES[:, None] * shift - 0.3))
         actors.shared["yaw"].copy_(torch.from_numpy(turn * TIMES - 0.2))
-    p, gaussians = doubled(actors), actors.at(time)
+    p, gaussians = doubled(actors), sampled(actors, time)
     box = about_z(RATE * time + turn * time - 0.2)
     means = p["means"] @ box.T + time * VELOCITY + time * shift - 0.3
     np.testing.assert_allclose(gaussians.means.detach(), means, atol=1e-5)
@@ -155,7 +168,7 @@ def test_a_turning_actor_is_transformed_by_its_corrected_box(time):
 def test_the_correction_of_an_annotation_holds_at_its_time(index):
     """Whatever those of its neighbours are; a box that is tilted, too, is turned about its own vertical."""
     actors = actors_of(tilted(van()))
-    p, gaussians = doubled(actors), actors.at(TIMES[index])
+    p, gaussians = doubled(actors), sampled(actors, TIMES[index])
     box = tilted(van()).motion.object_to_world[index, :3, :3] @ about_z(p["yaw"][index])
     means = p["means"] @ box.T + TIMES[index] * VELOCITY + p["translation"][index]
     np.testing.assert_allclose(gaussians.means.detach(), means, atol=1e-5)
@@ -165,7 +178,7 @@ def test_the_correction_of_an_annotation_holds_at_its_time(index):
 def test_between_annotations_corrections_are_weighted_as_positions_are():
     actors = actors_of(van())
     weights = van().motion.weights(np.array([1.8]))[0]
-    poses, p = actors.poses(actors.time_state(1.8)), doubled(actors)
+    poses, p = poses_at(actors, 1.8), doubled(actors)
     np.testing.assert_allclose(poses.translations[0].detach(), 1.8 * VELOCITY + weights @ p["translation"], atol=1e-5)
     np.testing.assert_allclose(matrices(poses.quats)[0], about_z(RATE * 1.8 + weights @ p["yaw"]), atol=1e-5)
 
@@ -174,10 +187,10 @@ def test_actors_can_be_placed_anywhere_and_enlarged():
     actors = actors_of(van(), car())
     turns = Rotation.random(2, random_state=3)
     places, scales = np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 1.0]]), np.array([1.5, 0.5])
-    poses = ObjectPoses(
-        *(torch.from_numpy(x).float() for x in (turns.as_quat(scalar_first=True), places, scales)), torch.ones(2)
-    )
-    gaussians, p = actors.placed(actors.time_state(9.0), poses), doubled(actors)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = turns.as_matrix(), places
+    there = zip(("van", "car"), poses, scales, strict=True)
+    gaussians, p = sampled_with(actors, 9.0, [ActorPlacement(*each) for each in there]), doubled(actors)
     for i, rotation in enumerate(turns.as_matrix()):
         own = p["owner"] == i
         means = scales[i] * p["means"][own] @ rotation.T + places[i]
@@ -194,7 +207,7 @@ def test_actors_can_be_placed_anywhere_and_enlarged():
 )
 def test_absent_actors_keep_their_rows_and_have_no_opacity(time, there):
     actors = actors_of(van(), car(), count=7)
-    gaussians = actors.at(time)
+    gaussians = sampled(actors, time)
     assert len(gaussians) == len(actors) == 14
     assert actors.params["owner"].tolist() == [0] * 7 + [1] * 7
     for i, present in enumerate(there):
@@ -222,9 +235,9 @@ def test_several_actors_at_once_are_each_as_alone(time):
     shuffled = torch.randperm(15, generator=torch.Generator().manual_seed(0))
     for value in actors.params.values():
         value.data = value.data[shuffled]
-    together = actors.at(time)
+    together = sampled(actors, time)
     for i in range(3):
-        one, own = alone(actors, i, settings).at(time), together[actors.params["owner"] == i]
+        one, own = sampled(alone(actors, i, settings), time), together[actors.params["owner"] == i]
         for name in own.tensors:
             torch.testing.assert_close(own.tensors[name], one.tensors[name], rtol=1e-5, atol=1e-6)
 
@@ -238,7 +251,7 @@ def test_new_actors_have_their_points_colours_at_all_times():
     actors = Actors.from_points([van()], [points], [colors], ActorSettings(), GaussianSettings())
     np.testing.assert_allclose(actors.params["means"].detach(), points, atol=1e-6)
     for time in (1.0, 1.7, 3.0):
-        sh = actors.at(time).sh.detach()
+        sh = sampled(actors, time).sh.detach()
         assert sh.shape == (9, 4, 3)
         np.testing.assert_allclose(0.5 + 0.28209479 * sh[:, 0], colors, atol=1e-5)
         np.testing.assert_allclose(sh[:, 1:], 0.0, atol=1e-6)
@@ -252,17 +265,17 @@ def test_colours_are_a_series_of_cosines_over_the_annotations(time, progress):
     f = np.concatenate([p["sh0"], p["shN"]], axis=2)
     assert f.shape == (6, 4, 4, 3)
     expected = sum(f[:, i] * np.cos(np.pi * i * progress) for i in range(4))
-    np.testing.assert_allclose(actors.harmonics(actors.time_state(time)).detach(), expected, atol=1e-5)
+    np.testing.assert_allclose(harmonics_at(actors, time).detach(), expected, atol=1e-5)
 
 
 def test_with_the_constant_term_alone_colours_do_not_change():
     actors = actors_of(van(), settings=ActorSettings(fourier=5))
     with torch.no_grad():
         actors.params["sh0"][:, 1:], actors.params["shN"][:, 1:] = 0.0, 0.0
-    first = actors.harmonics(actors.time_state(1.0))
+    first = harmonics_at(actors, 1.0)
     assert first.std() > 0.1
     for time in (1.4, 2.2, 3.0):
-        torch.testing.assert_close(actors.harmonics(actors.time_state(time)), first)
+        torch.testing.assert_close(harmonics_at(actors, time), first)
 
 
 def test_each_actors_series_runs_over_its_own_annotations():
@@ -270,7 +283,7 @@ def test_each_actors_series_runs_over_its_own_annotations():
     coefficients = actors.params["sh0"][:, :, 0].detach()
     progress = torch.tensor([0.5, 2.0 / 3.5])[actors.params["owner"]]  # at 2 s, from 1 to 3 and from 0 to 3.5
     expected = coefficients[:, 0] + coefficients[:, 1] * torch.cos(torch.pi * progress)[:, None]
-    torch.testing.assert_close(actors.harmonics(actors.time_state(2.0))[:, 0].detach(), expected)
+    torch.testing.assert_close(harmonics_at(actors, 2.0)[:, 0].detach(), expected)
 
 
 def first_degree(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -288,9 +301,9 @@ def test_an_actor_that_turns_keeps_its_colours_on_its_sides():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     seen = []
     for time in (1.0, 2.1, 2.9):
-        box = matrices(actors.poses(actors.time_state(time)).quats)[0]
-        expected = first_degree(actors.harmonics(actors.time_state(time)).detach().double().numpy(), directions @ box)
-        seen.append(first_degree(actors.at(time).sh.detach().double().numpy(), directions))
+        box = matrices(poses_at(actors, time).quats)[0]
+        expected = first_degree(harmonics_at(actors, time).detach().double().numpy(), directions @ box)
+        seen.append(first_degree(sampled(actors, time).sh.detach().double().numpy(), directions))
         np.testing.assert_allclose(seen[-1], expected, atol=1e-5)
     assert np.abs(seen[0] - seen[1]).max() > 0.1, "turned far enough to tell"
 
@@ -490,7 +503,7 @@ def test_rigid_groups_place_actors_as_the_model_does(time, corrected, tolerance)
                 times = torch.from_numpy(track.motion.times).float()
                 actors.shared["translation"][own] = times[:, None] * torch.tensor([0.1, -0.1, 0.0])
                 actors.shared["yaw"][own] = 0.15
-    together, groups = actors.at(time), actors.rigid_groups(time)
+    together, groups = sampled(actors, time), actors.rigid_groups(time)
     assert list(groups) == ["van", "car"]
     for i, piece in enumerate(groups.values()):
         (pose,) = piece.motion.poses(np.array([time]))

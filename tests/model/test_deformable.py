@@ -8,15 +8,17 @@ import pytest
 import torch
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
 from helpers.records import training_record_of
+from helpers.samples import sampled, sampled_with
 
 from drivesplat.kernels.quaternions import rotation_matrix
+from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.build import ModelInit, build_model, definitions, rebuild_model
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.lattice import Lattice, Undeformed, roughness
-from drivesplat.model.part import ActorPlacement
-from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.states import SCAN, State
+from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.deformable import GaitSettings, LatticeSettings
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.settings.train_objects import DeformableSettings
@@ -46,8 +48,12 @@ def people_of(*tracks: ActorTrack, seed: int = 0, **changes) -> Deformable:
     return part
 
 
+def time_state(part: Deformable, time: float) -> TimeState:
+    return TimeState(*part.state(time).now)
+
+
 def in_box(part: Deformable, time: float) -> torch.Tensor:
-    return part.local(part.time_state(time)).means.detach()
+    return part.local(time_state(part, time)).means.detach()
 
 
 # ---- the lattice
@@ -132,9 +138,9 @@ def test_without_displacements_it_is_a_rigid_actor():
         part.shared["lattice"].zero_()
         for name, values in rigid.params.items():
             values.copy_(part.params[name])
-    for found, expected in zip(part.at(1.3).tensors.values(), rigid.at(1.3).tensors.values(), strict=True):
+    for found, expected in zip(sampled(part, 1.3).tensors.values(), sampled(rigid, 1.3).tensors.values(), strict=True):
         torch.testing.assert_close(found, expected)
-    torch.testing.assert_close(part.velocities(1.3), rigid.velocities(1.3))
+    torch.testing.assert_close(sampled(part, 1.3, SCAN).velocities, sampled(rigid, 1.3, SCAN).velocities)
 
 
 def test_the_limbs_return_after_a_stride():
@@ -142,7 +148,7 @@ def test_the_limbs_return_after_a_stride():
     cycle = STRIDE / SPEED
     torch.testing.assert_close(in_box(part, 0.4 + cycle), in_box(part, 0.4), atol=1e-4, rtol=0.0)
     assert (in_box(part, 0.4 + 0.5 * cycle) - in_box(part, 0.4)).norm(dim=1).median() > 0.05
-    first, last = (part.cycles(part.time_state(at)).detach() for at in (0.4, 0.4 + cycle))
+    first, last = (part.cycles(time_state(part, at)).detach() for at in (0.4, 0.4 + cycle))
     assert float(last - first) == pytest.approx(1.0)
 
 
@@ -167,11 +173,11 @@ def test_a_longer_stride_and_a_correction_change_the_phase():
     with torch.no_grad():
         part.shared["stride"].fill_(math.log(1.25))
         part.shared["phase"].copy_(0.1 * torch.arange(9))
-    assert float(part.cycles(part.time_state(2.25)).detach()) == pytest.approx(
+    assert float(part.cycles(time_state(part, 2.25)).detach()) == pytest.approx(
         walked / (1.25 * STRIDE) + 0.45, abs=1e-4
     )
     far = ActorPlacement("walker", np.eye(4), walked=1000.0)
-    state = part.time_state(2.0)._replace(walked=torch.tensor([far.walked]))
+    state = time_state(part, 2.0)._replace(walked=torch.tensor([far.walked]))
     assert float(part.cycles(state).detach()) == pytest.approx(1000.0 / (1.25 * STRIDE) + 0.8, abs=1e-3), (
         "the last holds"
     )
@@ -182,7 +188,7 @@ def test_gaussians_turn_with_their_limb():
     with torch.no_grad():
         part.shared["lattice"].zero_()
         part.shared["lattice"][:, 0, ..., 4] = math.tan(0.15)  # 0.3 rad about the y axis at phase 0
-    state = part.time_state(0.0)
+    state = time_state(part, 0.0)
     turned = rotation_matrix(torch.nn.functional.normalize(part.local(state).quats, dim=1)).detach()
     assert turned[:, 0, 2].mean() == pytest.approx(math.sin(0.3), abs=1e-5)
 
@@ -191,12 +197,12 @@ def test_a_mirrored_person_is_the_mirror_image_of_half_a_cycle_later():
     """Of two people, who walk along x, the first is mirrored."""
     part = people_of(walker("first"), walker("second", 1.1))
     part.mirrored = torch.full((2,), 0.5)
-    state, half = part.time_state(1.3), torch.tensor([0.5 * STRIDE, 0.0])
+    state, half = time_state(part, 1.3), torch.tensor([0.5 * STRIDE, 0.0])
     later, sides = state._replace(walked=state.walked + half), state._replace(side=torch.tensor([-1.0, 1.0]))
-    places = part.poses(state).translations[part.params["owner"]]
-    placed = [part.at_time_state(each) for each in (state, later, sides)]
-    here, expected, found = (gaussians.means.detach() - places for gaussians in placed)
-    _, covariances, mirrored = map(covariances_of, placed)
+    places = part.posed(state).poses.translations[part.params["owner"]]
+    seen = [part.sample(State(each)) for each in (state, later, sides)]
+    here, expected, found = (gaussians.means.detach() - places for gaussians in seen)
+    _, covariances, mirrored = map(covariances_of, seen)
     mirror, first = torch.diag(torch.tensor([1.0, -1.0, 1.0])), part.of_track("first")
     torch.testing.assert_close(found[first], expected[first] @ mirror, atol=1e-5, rtol=0.0)
     torch.testing.assert_close(mirrored[first], mirror @ covariances[first] @ mirror, atol=1e-6, rtol=1e-4)
@@ -215,9 +221,9 @@ def test_colours_are_mirrored_too(degree):
     part.mirrored = torch.full((1,), 0.5)
     with torch.no_grad():
         part.params["shN"].normal_(generator=torch.Generator().manual_seed(6))
-    state, mirror = part.time_state(time), np.diag([1.0, -1.0, 1.0])
+    state, mirror = time_state(part, time), np.diag([1.0, -1.0, 1.0])
     half_later = state._replace(walked=state.walked + 0.5 * STRIDE)
-    here, shown = (part.at_time_state(s).sh.detach() for s in (half_later, state._replace(side=-state.side)))
+    here, shown = (part.sample(State(s)).sh.detach() for s in (half_later, state._replace(side=-state.side)))
     expected = rotated(here, torch.from_numpy(mirror))
     torch.testing.assert_close(shown, expected, atol=1e-5, rtol=0.0)
 
@@ -232,29 +238,29 @@ def test_colours_are_mirrored_too(degree):
 )
 def test_odd_tracks_have_finite_gaussians_and_gradients(times, places):
     part = people_of(track_of(motion_through(times, places, np.zeros(len(times))), "odd", SIZE), walker())
-    part.at(times[-1]).means.square().sum().backward()
+    sampled(part, times[-1]).means.square().sum().backward()
     learned = [value for value in (*part.params.values(), *part.shared.values()) if value.grad is not None]
     assert learned and all(value.grad.isfinite().all() for value in learned)
-    assert part.velocities(times[-1]).isfinite().all()
+    assert sampled(part, times[-1], SCAN).velocities.isfinite().all()
 
 
 def test_velocities_include_those_of_limbs():
     part, step = people_of(walker()), HALF_STEP
-    expected = (part.at(1.3 + step).means - part.at(1.3 - step).means) / (2.0 * step)
-    torch.testing.assert_close(part.velocities(1.3), expected.detach(), atol=1e-3, rtol=1e-3)
-    assert (part.velocities(1.3)[:, 0] - SPEED).abs().max() > 0.1
+    expected = (sampled(part, 1.3 + step).means - sampled(part, 1.3 - step).means) / (2.0 * step)
+    torch.testing.assert_close(sampled(part, 1.3, SCAN).velocities, expected.detach(), atol=1e-3, rtol=1e-3)
+    assert (sampled(part, 1.3, SCAN).velocities[:, 0] - SPEED).abs().max() > 0.1
 
 
 def test_edited_actors_move_their_limbs_by_the_distance_that_they_walk():
     part, pose = people_of(walker(), fourier=1), walker().motion.poses(np.array([1.0]))[0]
-    recorded = part.at(1.0).means.detach()
-    as_recorded = part.with_placements(1.0, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
+    recorded = sampled(part, 1.0).means.detach()
+    as_recorded = sampled_with(part, 1.0, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
     torch.testing.assert_close(as_recorded, recorded, atol=1e-4, rtol=0.0)
-    later = part.with_placements(2.7, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
+    later = sampled_with(part, 2.7, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
     torch.testing.assert_close(later, recorded, atol=1e-4, rtol=0.0)
-    stride_on = part.with_placements(2.7, [ActorPlacement("walker", pose, walked=SPEED + STRIDE)]).means.detach()
+    stride_on = sampled_with(part, 2.7, [ActorPlacement("walker", pose, walked=SPEED + STRIDE)]).means.detach()
     torch.testing.assert_close(stride_on, recorded, atol=1e-3, rtol=0.0)
-    half_on = part.with_placements(1.0, [ActorPlacement("walker", pose, walked=SPEED + 0.5 * STRIDE)]).means.detach()
+    half_on = sampled_with(part, 1.0, [ActorPlacement("walker", pose, walked=SPEED + 0.5 * STRIDE)]).means.detach()
     assert (half_on - recorded).norm(dim=1).median() > 0.05
 
 
@@ -262,12 +268,12 @@ def test_copies_have_their_own_phase_and_scaled_people_take_scaled_steps():
     part, pose = people_of(walker(), fourier=1), np.eye(4)
 
     def at(**placement) -> torch.Tensor:
-        return part.with_placements(1.0, [ActorPlacement("walker", pose, **placement)]).means.detach()
+        return sampled_with(part, 1.0, [ActorPlacement("walker", pose, **placement)]).means.detach()
 
     torch.testing.assert_close(at(walked=1.0, phase=0.25), at(walked=1.0 + 0.25 * STRIDE), atol=1e-5, rtol=0.0)
     torch.testing.assert_close(at(walked=2.0, scale=2.0), 2.0 * at(walked=1.0), atol=1e-5, rtol=0.0)
     copies = [ActorPlacement("walker", pose, walked=1.0), ActorPlacement("walker", pose, walked=1.0, phase=0.5)]
-    first, second = part.with_placements(1.0, copies).means.detach().split(40)
+    first, second = sampled_with(part, 1.0, copies).means.detach().split(40)
     torch.testing.assert_close(first, at(walked=1.0))
     torch.testing.assert_close(second, at(walked=1.0, phase=0.5))
 
@@ -275,10 +281,10 @@ def test_copies_have_their_own_phase_and_scaled_people_take_scaled_steps():
 def test_a_placement_that_stands_has_no_velocity_and_one_that_walks_on_the_spot_only_that_of_its_limbs():
     part, pose = people_of(walker(), fourier=1), np.eye(4)
     standing = ActorPlacement("walker", pose, around=(pose, pose), walked=2.0, walked_around=(2.0, 2.0))
-    assert part.velocities_with_placements(1.0, [standing]).abs().max() < 1e-4
+    assert sampled_with(part, 1.0, [standing], SCAN).velocities.abs().max() < 1e-4
     beside = (2.0 - HALF_STEP * SPEED, 2.0 + HALF_STEP * SPEED)
     walking = ActorPlacement("walker", pose, around=(pose, pose), walked=2.0, walked_around=beside)
-    assert part.velocities_with_placements(1.0, [walking]).abs().max() > 0.1
+    assert sampled_with(part, 1.0, [walking], SCAN).velocities.abs().max() > 0.1
 
 
 def test_penalties_grow_with_displacements_and_their_order():
@@ -312,9 +318,7 @@ def test_a_part_is_built_of_its_own_objects_and_survives_a_checkpoint():
     with torch.no_grad():
         model.parts[2].shared["lattice"].normal_(0.0, 0.1, generator=torch.Generator().manual_seed(4))
     again = rebuild_model(model.state_dict(), definitions(model), "none", settings)
-    for found, expected in zip(
-        again.gaussians_at(1.1).tensors.values(), model.gaussians_at(1.1).tensors.values(), strict=True
-    ):
+    for found, expected in zip(again.at(1.1).tensors.values(), model.at(1.1).tensors.values(), strict=True):
         assert torch.equal(found, expected)
 
 
@@ -368,7 +372,7 @@ def test_a_swinging_leg_is_learned():
     for step in range(400):
         optimizer.zero_grad()
         time = times[step % len(times)]
-        (part.local(part.time_state(time)).means - truth(time)).square().sum().backward()
+        (part.local(time_state(part, time)).means - truth(time)).square().sum().backward()
         optimizer.step()
     for time in (0.33, 1.71, 3.2):
         off = (in_box(part, time) - truth(time)).norm(dim=1)

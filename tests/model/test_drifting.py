@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers.hand_made import looking_at
 from helpers.records import training_record_of
+from helpers.samples import EVERYTHING, sampled
 
 from drivesplat.io.storage import no_provenance
 from drivesplat.model.background import Background
@@ -16,6 +17,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, read_checkpoint, trai
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import DriftingSeed, drifting_seed, ego_velocities
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import SCAN
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.training_record import TrainingRecord
@@ -23,8 +25,9 @@ from drivesplat.settings.drifting import DriftingSeedSettings, DriftingSettings
 from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainJob, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier
+from drivesplat.training.loop import Trainer
 from drivesplat.training.optimizers import make_optimizers
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.schedule import Schedule
 from drivesplat.training.views import TrainingView
 
 COUNT = 7
@@ -73,17 +76,15 @@ def expected_at(part: Drifting, time: float, min_span: float) -> tuple[np.ndarra
 @pytest.mark.parametrize("time", [-1.0, 0.5, 2.3, 4.0, 6.5, 8.0])
 def test_a_gaussian_moves_at_its_velocity_and_is_most_opaque_at_its_life_peak(time):
     part = drifting(DriftingSettings(min_span=0.4))
-    found = part.at(time)
+    found = sampled(part, time)
     centres, opacities = expected_at(part, time, 0.4)
     np.testing.assert_allclose(found.means.detach(), centres, atol=1e-5)
     np.testing.assert_allclose(found.opacities.detach(), opacities, atol=1e-6)
-    again = part.at_time_state(part.time_state(time))
-    assert all(torch.equal(values, again.tensors[name]) for name, values in found.tensors.items())
 
 
 def test_beyond_the_training_images_gaussians_go_on_but_neither_appear_nor_fade():
     part = drifting()
-    last, later = part.at(SECONDS[1]), part.at(SECONDS[1] + 2.0)
+    last, later = sampled(part, SECONDS[1]), sampled(part, SECONDS[1] + 2.0)
     assert torch.equal(last.opacities, later.opacities) and (last.opacities > 0.0).any()
     torch.testing.assert_close(later.means - last.means, 2.0 * part.params["velocities"])
 
@@ -92,7 +93,7 @@ def test_a_gaussian_is_absent_long_before_and_after_its_life_peak():
     part = drifting(DriftingSettings(min_span=0.1), count=1)
     part.params["spans"].data.fill_(np.log(0.2))
     part.params["peaks"].data.fill_(3.0)
-    shown = [float(part.at(3.0 + age).opacities[0].detach()) for age in (-0.95, -0.85, 0.0, 0.85, 0.95)]
+    shown = [float(sampled(part, 3.0 + age).opacities[0].detach()) for age in (-0.95, -0.85, 0.0, 0.85, 0.95)]
     assert shown[0] == shown[-1] == 0.0 and 0.0 < shown[1] < 0.02 * shown[2] and shown[3] > 0.0
 
 
@@ -105,8 +106,8 @@ def test_no_life_span_is_below_the_minimum():
 def test_velocities_are_differences_of_positions():
     part = drifting().double()
     step = 1e-3
-    difference = (part.at(2.0 + step).means - part.at(2.0 - step).means) / (2.0 * step)
-    velocities = part.velocities(2.0)
+    difference = (sampled(part, 2.0 + step).means - sampled(part, 2.0 - step).means) / (2.0 * step)
+    velocities = sampled(part, 2.0, SCAN).velocities
     torch.testing.assert_close(velocities, difference.detach(), atol=1e-6, rtol=1e-6)
     assert not velocities.requires_grad
 
@@ -117,7 +118,7 @@ def test_gradients_are_those_of_differences(name):
     weights = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
     def shown() -> torch.Tensor:
-        found = part.at(3.0)
+        found = sampled(part, 3.0)
         return (found.means * weights).sum() + found.opacities.square().sum()
 
     shown().backward()
@@ -134,8 +135,8 @@ def test_gradients_are_those_of_differences(name):
 
 
 def test_what_scans_may_not_change_freely_is_all_that_places_and_opacities_follow_from():
-    part = drifting(echo=(0.3, 0.9))
-    found = part.at(3.0)
+    part = drifting(lidar_logits=(0.3, 0.9))
+    found = sampled(part, 3.0)
     (found.means.sum() + found.quats.sum() + found.scales.sum() + found.opacities.sum()).backward()
     assert {name for name, value in part.params.items() if value.grad is not None} == set(part.geometry)
 
@@ -220,10 +221,10 @@ def test_without_images_nothing_drifts():
     assert [part.name for part in model.parts] == ["background"]
 
 
-@pytest.mark.parametrize("echo", [None, (0.3, 0.9)])
-def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(echo, tmp_path):
+@pytest.mark.parametrize("logits", [None, (0.3, 0.9)])
+def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(logits, tmp_path):
     settings = TrainSettings(cap_max=100, drifting=DriftingSettings(min_span=0.7))
-    model = an_untrained_model(settings, echo=echo)
+    model = an_untrained_model(settings, lidar_logits=logits)
     with torch.no_grad():
         for value in (value for value in model.parameters() if value.requires_grad):
             value += 0.2 * torch.randn_like(value)
@@ -231,8 +232,8 @@ def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(echo, tmp_path):
     write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, no_provenance()))
     rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
     for time in (-0.2, 0.5, 1.3, 3.5, 9.0):
-        ours, again = (it.gaussians_at(time, True, echo is not None) for it in (model, rebuilt))
-        assert ours.tensors.keys() == again.tensors.keys() and ("echoes" in ours.tensors) == (echo is not None)
+        ours, again = (it.at(time, EVERYTHING) for it in (model, rebuilt))
+        assert ours.tensors.keys() == again.tensors.keys() and ("lidar_logits" in ours.tensors) == (logits is not None)
         assert all(torch.equal(values, again.tensors[name]) for name, values in ours.tensors.items())
     part, again = model.parts[1], rebuilt.parts[1]
     assert again.definition() == part.definition() and again.learning_rates() == part.learning_rates()
@@ -256,7 +257,7 @@ def test_densification_copies_motion_and_life_with_each_gaussian(monkeypatch):
     before = rows()
     (optimizers,) = make_optimizers(SplatModel([part], None)).parts
     assert {"velocities", "peaks", "spans"} <= optimizers.keys()
-    Densifier(part, settings).after_step(1, optimizers, {}, slice(0, 40))
+    Densifier(part, Schedule.of(settings, 1)).after_step(1, optimizers, {}, slice(0, 40))
     assert len(part) == 50 and {len(value) for value in part.params.values()} == {50}
     assert rows() <= before and len(rows()) <= 30
 
@@ -268,7 +269,7 @@ def test_exports_show_the_gaussians_that_are_present_as_one_group():
     part.params["peaks"].data[2] = torch.nan
     (name, group), *others = part.rigid_groups(3.0).items()
     assert (name, group.motion, len(group.gaussians), others) == ("drifting", None, COUNT - 2, [])
-    torch.testing.assert_close(group.gaussians.means[1:], part.at(3.0).means[3:])
+    torch.testing.assert_close(group.gaussians.means[1:], sampled(part, 3.0).means[3:])
     assert not group.gaussians.means[0].isfinite().any()
 
 
@@ -313,14 +314,14 @@ def test_what_moves_is_learned_with_its_velocity_and_shown_between_the_images():
         trainer = Trainer.begin(model, recorded(looking_on(train)), settings, 0, torch.device("cpu"))
         for _ in range(200):
             trainer.training_step()
-            trainer.step += 1
+            trainer.state.step += 1
         with torch.no_grad():
             shown = [
                 (model.render(it.view).image - it.pixels / 255.0).square().mean()
                 for it in recorded(looking_on(between))
             ]
         errors[name] = float(torch.stack(shown).mean())
-    seen = parts["drifting"].at(1.5).opacities.detach()
-    velocity = (seen[:, None] * parts["drifting"].velocities(1.5)).sum(dim=0) / seen.sum()
+    seen = sampled(parts["drifting"], 1.5).opacities.detach()
+    velocity = (seen[:, None] * sampled(parts["drifting"], 1.5, SCAN).velocities).sum(dim=0) / seen.sum()
     assert errors["drifting"] < 0.2 * errors["static"]
     assert float(velocity[0]) == pytest.approx(1.2, abs=0.3)

@@ -42,7 +42,8 @@ from drivesplat.settings.train_cameras import ExposureSettings
 from drivesplat.training.exposure_init import DISTANCE_STEP, Sightings, initial_gains, log_colors, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
-from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
+from drivesplat.training.schedule import Schedule
+from drivesplat.training.stage import TrainingFiles, TrainingInputs, run_training
 from drivesplat.training.views import Supervision, TrainingView, load_views
 from drivesplat.workflow.stages import stage_settings
 
@@ -199,7 +200,7 @@ def test_exposures_start_late_and_their_learning_rate_decays():
     optimizers = make_optimizers(model)
     rates = []
     for step in (0, 9, 10, 50, 100):
-        set_learning_rates(model, optimizers, step / 100, settings)
+        set_learning_rates(model, optimizers, Schedule.of(settings, 1), step)
         rates.append(optimizers.beside_parts["exposure"]["BACK"].param_groups[0]["lr"])
     assert rates == pytest.approx([0.0, 0.0, 0.1 * 0.01**0.1, 0.01, 0.001])
 

@@ -8,6 +8,7 @@ import torch
 from helpers.hand_made import actor_record, actors_of, looking_at, motion_through, round_gaussians, track_of
 from helpers.records import training_record_of
 from helpers.reference_rays import pixel_rays
+from helpers.samples import sampled
 from scipy.spatial.transform import Rotation
 from torch import nn
 
@@ -22,6 +23,7 @@ from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import IMAGE, State, Want, copied, tensors_of
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
@@ -102,7 +104,7 @@ def test_viewmat_undoes_camera_to_world():
 
 def test_seed_gaussians_have_the_positions_and_colours_of_the_points():
     positions, colors = seed_points(50)
-    gaussians = Background.from_points(positions, colors, GaussianSettings(sh_degree=2), 1.0).at(0.0)
+    gaussians = sampled(Background.from_points(positions, colors, GaussianSettings(sh_degree=2), 1.0), 0.0)
     np.testing.assert_allclose(gaussians.means.detach(), positions, atol=1e-6)
     np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0].detach(), colors, atol=1e-6)
     assert gaussians.sh.shape == (50, 9, 3) and (gaussians.sh[:, 1:] == 0).all()
@@ -111,14 +113,14 @@ def test_seed_gaussians_have_the_positions_and_colours_of_the_points():
 @pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9])
 def test_seed_gaussians_have_the_opacity_set(opacity):
     settings = GaussianSettings(init_opacity=opacity)
-    opacities = Background.from_points(*seed_points(10), settings, 1.0).at(0.0).opacities
+    opacities = sampled(Background.from_points(*seed_points(10), settings, 1.0), 0.0).opacities
     torch.testing.assert_close(opacities.detach(), torch.full((10,), opacity))
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.3])
 def test_seed_gaussians_are_isotropic_with_the_distance_of_neighbours_as_scale(factor):
     positions, colors = seed_points(60)
-    gaussians = Background.from_points(positions, colors, GaussianSettings(init_scale=factor), 1.0).at(0.0)
+    gaussians = sampled(Background.from_points(positions, colors, GaussianSettings(init_scale=factor), 1.0), 0.0)
     distances = np.sort(np.linalg.norm(positions[:, None] - positions[None], axis=-1), axis=1)[:, 1:4]
     expected = factor * np.sqrt((distances**2).mean(axis=1))
     np.testing.assert_allclose(gaussians.scales.detach(), expected[:, None].repeat(3, axis=1), rtol=1e-5)
@@ -128,13 +130,13 @@ def test_seed_gaussians_are_isotropic_with_the_distance_of_neighbours_as_scale(f
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_few_points_give_gaussians(count):
     positions = np.arange(3.0 * count).reshape(count, 3)
-    gaussians = Background.from_points(positions, np.full((count, 3), 0.5), GaussianSettings(), 1.0).at(0.0)
+    gaussians = sampled(Background.from_points(positions, np.full((count, 3), 0.5), GaussianSettings(), 1.0), 0.0)
     assert len(gaussians) == count
     assert torch.isfinite(gaussians.scales).all() and (gaussians.scales > 0).all()
 
 
 def test_coincident_points_have_a_positive_scale():
-    gaussians = Background.from_points(np.ones((5, 3)), np.full((5, 3), 0.5), GaussianSettings(), 1.0).at(0.0)
+    gaussians = sampled(Background.from_points(np.ones((5, 3)), np.full((5, 3), 0.5), GaussianSettings(), 1.0), 0.0)
     assert torch.isfinite(torch.log(gaussians.scales)).all()
 
 
@@ -174,9 +176,11 @@ class Riding(Part):
         self.params = still.params
         self._still = still
 
-    def at(self, time: float) -> Gaussians:
-        still = self._still.at(time)
-        shift = torch.tensor([time, 0.0, 0.0])
+    def state(self, time: float, want: Want = IMAGE) -> State:
+        return State((torch.tensor([time, 0.0, 0.0]),))
+
+    def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
+        (shift,), still = state.now, sampled(self._still, 0.0)
         return Gaussians.of(still.means + shift, still.quats, still.scales, still.opacities, still.sh)
 
     def learning_rates(self) -> dict[str, float]:
@@ -196,7 +200,8 @@ def test_a_model_renders_all_parts_at_the_time_of_the_view():
 
 
 def test_concatenate_keeps_order_and_every_field():
-    a, b = (Background.from_points(*seed_points(n, seed=n), GaussianSettings(sh_degree=1), 1.0).at(0.0) for n in (3, 4))
+    parts = (Background.from_points(*seed_points(n, seed=n), GaussianSettings(sh_degree=1), 1.0) for n in (3, 4))
+    a, b = (sampled(part, 0.0) for part in parts)
     joined = concatenate([a, b])
     assert len(joined) == 7
     assert joined.velocities is None
@@ -214,22 +219,22 @@ def test_concatenation_keeps_the_colours_of_lower_degrees(degrees):
         shaken(Background.from_points(*seed_points(n, seed=n), GaussianSettings(sh_degree=degree), 1.0))
         for n, degree in zip((3, 4), degrees, strict=True)
     ]
-    joined = concatenate([part.at(0.0) for part in parts])
+    joined = concatenate([sampled(part, 0.0) for part in parts])
     assert joined.sh_degree == max(degrees)
     directions = Rotation.random(20, random_state=0).as_matrix()[:, 0]
     for part, rows in zip(parts, (slice(0, 3), slice(3, 7)), strict=True):
-        alone = part.at(0.0).sh
+        alone = sampled(part, 0.0).sh
         assert torch.equal(joined.sh[rows, : alone.shape[1]], alone) and not joined.sh[rows, alone.shape[1] :].any()
     cameras = [looking_at([0.0, 0.0, 4.0], [0.0, 0.0, 4.0] + 9.0 * d) for d in directions[:3]]
     for view in cameras:
         alone = SplatModel([parts[1]], None).render(view).image
         model = SplatModel(parts, None)
-        seen = model.render(view, gaussians=model.gaussians_at(0.0)[3:]).image
+        seen = model.render(view, gaussians=model.at(0.0)[3:]).image
         torch.testing.assert_close(seen, alone)
 
 
 def test_concatenating_one_set_copies_nothing():
-    one = Background.from_points(*seed_points(3), GaussianSettings(), 1.0).at(0.0)
+    one = sampled(Background.from_points(*seed_points(3), GaussianSettings(), 1.0), 0.0)
     assert concatenate([one]) is one
 
 
@@ -263,31 +268,24 @@ def street(antialiased: bool = False) -> SplatModel:
 
 def test_rows_are_the_slices_of_each_part():
     model = street()
-    together = model.gaussians_at(0.7)
+    together = model.at(0.7)
     assert model.rows == [slice(0, 12), slice(12, 20), slice(20, 25)]
     for part, rows in zip(model.parts, model.rows, strict=True):
-        assert torch.equal(together[rows].means, part.at(0.7).means)
+        assert torch.equal(together[rows].means, sampled(part, 0.7).means)
     assert model.moving().tolist() == [False] * 12 + [True] * 8 + [False] * 5
     assert model.of_track("later").tolist() == [False] * 16 + [True] * 4 + [False] * 5
 
 
-def test_gaussians_follow_the_time_state_copied_into_the_tensors():
+def test_gaussians_follow_the_states_copied_into_the_tensors():
     model = street()
-    early, late = (model.time_states(time) for time in (0.3, 1.6))
-    lying = [[values.clone() for values in state] for state in early]
+    early, late = (model.states(time) for time in (0.3, 1.6))
+    lying = copied(early)
     for time, states in ((0.3, early), (1.6, late)):
-        for places, state in zip(lying, states, strict=True):
-            for place, values in zip(places, state, strict=True):
-                place.copy_(values)
-        found, expected = concatenate(model.sets_at_time_states(lying)), model.gaussians_at(time)
+        for place, values in zip(tensors_of(lying), tensors_of(states), strict=True):
+            place.copy_(values)
+        found, expected = concatenate(model.sample(lying)), model.at(time)
         assert all(torch.equal(values, expected.tensors[name]) for name, values in found.tensors.items())
-    assert not torch.equal(model.gaussians_at(0.3).means, model.gaussians_at(1.6).means)
-
-
-def test_a_model_with_a_part_without_time_states_has_none():
-    still = Background.from_points(*seed_points(3), GaussianSettings(), 1.0)
-    assert SplatModel([still], None).time_states(0.5) == [()]
-    assert SplatModel([still, Riding(still)], None).time_states(0.5) is None
+    assert not torch.equal(model.at(0.3).means, model.at(1.6).means)
 
 
 def test_two_rigid_groups_of_one_name_are_refused():
@@ -358,7 +356,7 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
     rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
     assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
     for time in (-0.2, 0.0, 0.61, 1.0, 1.8, 2.7, 5.0):
-        ours, again = model.gaussians_at(time), rebuilt.gaussians_at(time)
+        ours, again = model.at(time), rebuilt.at(time)
         assert all(torch.equal(values, again.tensors[name]) for name, values in ours.tensors.items())
     for part, again in zip(model.parts, rebuilt.parts, strict=True):
         assert again.learning_rates() == part.learning_rates() and again.extent == part.extent
@@ -374,7 +372,7 @@ def test_actors_are_initialised_from_their_records():
     assert actors.params["owner"].tolist() == [0] * 10 + [1] * 7
     np.testing.assert_array_equal(actors.params["means"].detach(), np.concatenate([r.points for r in records]))
     colors = np.concatenate([r.points_rgb for r in records]) / 255.0
-    np.testing.assert_allclose(0.5 + SH_C0 * actors.harmonics(actors.time_state(0.3))[:, 0].detach(), colors, atol=1e-5)
+    np.testing.assert_allclose(0.5 + SH_C0 * sampled(actors, 0.3).sh0[:, 0].detach(), colors, atol=1e-5)
     at = np.linspace(-0.5, 3.0, 15)
     for track, expected in zip(actors.timeline.tracks, (a_track(), a_track("later", 1.0)), strict=True):
         assert track.id == expected.id
@@ -407,7 +405,7 @@ def test_each_actor_is_initialised_with_at_most_its_cap():
     kept = {tuple(row) for row in actors.params["means"].detach()[:20].numpy()}
     assert len(kept & {tuple(row) for row in records[0].points}) == 20
     colors = dict(zip(map(tuple, records[0].points), records[0].points_rgb, strict=True))
-    own = 255.0 * (0.5 + SH_C0 * actors.harmonics(actors.time_state(0.0))[:20, 0].detach().numpy())
+    own = 255.0 * (0.5 + SH_C0 * sampled(actors, 0.0).sh0[:20, 0].detach().numpy())
     np.testing.assert_allclose(
         own, [colors[tuple(row)] for row in actors.params["means"].detach()[:20].numpy()], atol=0.01
     )

@@ -1,4 +1,4 @@
-"""LiDAR scans of a model: what its echoes give, seen along the rays of a sensor."""
+"""LiDAR scans of a model: what its Gaussians return, seen along the rays of a sensor."""
 
 import dataclasses
 from dataclasses import replace
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import actors_of, motion_through, round_gaussians, track_of
+from helpers.samples import EVERYTHING, sampled
 from torch import nn
 
 from drivesplat.errors import ResultError
@@ -15,6 +16,7 @@ from drivesplat.model.gaussians import GaussianSets, concatenate
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanView, group_met, scan_picture, view_of_scan
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import SCAN, copied, tensors_of
 from drivesplat.rasterization.scans import RayGrid
 from drivesplat.scene.scan import Scan, ScanRays
 from drivesplat.scene.scan_record import RecordedScan
@@ -59,16 +61,16 @@ def view(**changes) -> ScanView:
 
 
 def walls(logits: tuple[float, float] = (-1.0, 2.0), slope: np.ndarray | None = None) -> SplatModel:
-    """A ring of Gaussians 10 m around the sensor, with echoes of these logits that grow along a direction."""
+    """A ring of Gaussians 10 m around the sensor, with LiDAR logits that grow along a direction."""
     angles = np.linspace(0.0, 2.0 * np.pi, 300, endpoint=False)
     heights = np.linspace(-2.0, 2.0, 9)
     ring = np.array([[10 * np.cos(a), 10 * np.sin(a), z] for a in angles for z in heights]) + PLACE
     part = round_gaussians(ring, sizes=0.25, opacities=0.95)
-    echoes = torch.zeros(len(ring), 4, 2)
-    echoes[:, 0] = torch.tensor(logits)
+    coefficients = torch.zeros(len(ring), 4, 2)
+    coefficients[:, 0] = torch.tensor(logits)
     if slope is not None:
-        echoes[:, 1:] = torch.from_numpy(slope).float()
-    part.params["echoes"] = nn.Parameter(echoes)
+        coefficients[:, 1:] = torch.from_numpy(slope).float()
+    part.params["lidar_logits"] = nn.Parameter(coefficients)
     return SplatModel([part], None)
 
 
@@ -79,7 +81,7 @@ def test_a_view_of_a_scan_has_its_pose_rays_and_motion():
     assert found.time == 1.0 and found.beam_spread == SPREAD and not found.linear.any()
 
 
-def test_a_wall_around_the_sensor_returns_its_range_and_its_echo():
+def test_a_wall_around_the_sensor_returns_its_range_and_its_intensity():
     picture = walls().scan(view())
     assert (picture.alpha > 0.99).all()
     flat = 10.0 / torch.cos(view().rays.elevations)
@@ -89,7 +91,7 @@ def test_a_wall_around_the_sensor_returns_its_range_and_its_echo():
     torch.testing.assert_close(picture.returned, picture.alpha * torch.tensor(2.0).sigmoid(), atol=1e-4, rtol=0)
 
 
-def test_an_echo_depends_on_the_direction_in_the_world():
+def test_the_intensity_depends_on_the_direction_in_the_world():
     slope = np.array([[2.0, 0.0], [0.0, 0.0], [0.0, 0.0]])  # the intensity's logit grows along the world's x axis
     picture = walls((0.0, 0.0), slope).scan(view(angle=0.4))
     along_x = torch.cos(view().rays.elevations) * torch.cos(view().rays.azimuths + 0.4)
@@ -104,39 +106,39 @@ def test_a_ray_that_meets_nothing_does_not_return():
         assert torch.equal(values, torch.zeros(5, 40))
 
 
-def test_the_echoes_of_an_actor_turn_with_it():
+def test_the_lidar_logits_of_an_actor_turn_with_it():
     """Its side that returns more is another side of the world after it has turned by 90 degrees."""
     motion = motion_through([0.0, 2.0], [[10.0, 0.0, 1.0]] * 2, [0.0, np.pi / 2])
     actors = actors_of(track_of(motion), count=4, shaken=False)
-    echoes = torch.zeros(4, 4, 2)
-    echoes[:, 0], echoes[:, 1, 1] = 0.5, 3.0
-    actors.params["echoes"] = nn.Parameter(echoes)
-    before, after = actors.echoes(0.0), actors.echoes(2.0)
-    torch.testing.assert_close(before, echoes)
-    torch.testing.assert_close(after[:, 0], echoes[:, 0])
+    logits = torch.zeros(4, 4, 2)
+    logits[:, 0], logits[:, 1, 1] = 0.5, 3.0
+    actors.params["lidar_logits"] = nn.Parameter(logits)
+    before, after = (sampled(actors, time, SCAN).lidar_logits for time in (0.0, 2.0))
+    torch.testing.assert_close(before, logits)
+    torch.testing.assert_close(after[:, 0], logits[:, 0])
     torch.testing.assert_close(after[:, 1:, 1], torch.tensor([0.0, 3.0, 0.0]).expand(4, 3), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("with_offsets", [False, True])
-def test_gaussians_follow_the_time_states_copied_into_the_tensors(with_offsets):
-    """With what they echo, how fast they move then and where only the LiDAR sees them, without colours."""
+def test_gaussians_follow_the_states_copied_into_the_tensors(with_offsets):
+    """With what they return, how fast they move then and where only the LiDAR sees them, without colours."""
     motion = motion_through([0.0, 2.0, 4.0], [[10.0, 0.0, 1.0], [14.0, 0.0, 1.0], [26.0, 3.0, 1.0]], [0.0, 0.5, 1.0])
     actors = actors_of(track_of(motion), count=4)
-    actors.params["echoes"] = nn.Parameter(torch.randn(4, 4, 2, generator=torch.Generator().manual_seed(0)))
+    actors.params["lidar_logits"] = nn.Parameter(torch.randn(4, 4, 2, generator=torch.Generator().manual_seed(0)))
     (still,) = walls().parts
     if with_offsets:
         for name, offset in OFFSETS.items():
             shaken = torch.linspace(-0.2, 0.3, still.params[name].numel()).view_as(still.params[name])
             still.params[offset] = nn.Parameter(shaken)
     model = SplatModel([still, actors], None)
-    assert torch.equal(model.gaussians_at(0.5, with_echoes=True).means, model.gaussians_at(0.5).means) != with_offsets
-    early, late = model.scan_states(0.5), model.scan_states(3.2)
-    inputs = early.copied()
+    assert torch.equal(model.at(0.5, SCAN).means, model.at(0.5).means) != with_offsets
+    early, late = model.states(0.5, SCAN), model.states(3.2, SCAN)
+    inputs = copied(early)
     for time, states in ((0.5, early), (3.2, late)):
-        torch_private.copy_all(inputs.tensors, states.tensors)
-        found = concatenate(model.sets_at_scan_states(inputs)).tensors
-        expected = model.gaussians_at(time, with_velocities=True, with_echoes=True).tensors
-        assert found.keys() == expected.keys() >= {"velocities", "echoes"}
+        torch_private.copy_all(tensors_of(inputs), tensors_of(states))
+        found = concatenate(model.sample(inputs, SCAN)).tensors
+        expected = model.at(time, EVERYTHING).tensors
+        assert found.keys() == expected.keys() >= {"velocities", "lidar_logits"}
         assert not found.pop("sh0").any() and found.pop("shN").numel() == 0
         assert all(torch.equal(values, expected[name]) for name, values in found.items())
 
@@ -152,7 +154,7 @@ def test_alpha_before_a_range_is_that_of_what_is_nearer():
 def test_each_ray_knows_the_group_that_contributes_most():
     """Eleven groups around the sensor, numbered from -1; behind them, unseen, the Gaussians of another."""
     model = walls()
-    near = model.gaussians_at(0.0, with_echoes=True)
+    near = model.at(0.0, EVERYTHING)
     around = torch.atan2(near.means[:, 1] - PLACE[1], near.means[:, 0] - PLACE[0])
     own = ((around + np.pi) * 11 / (2 * np.pi)).long().clamp(max=10) - 1
     far = replace(near, means=near.means + 5.0 * (near.means - torch.from_numpy(PLACE).float()))
@@ -168,8 +170,8 @@ def test_a_model_trained_without_lidar_is_refused():
     model = SplatModel([round_gaussians([[5.0, 0.0, 0.0]])], None)
     with pytest.raises(ResultError, match=r"trained without LiDAR: train it with train\.scans\.per_image above 0"):
         model.scan(view())
-    gaussians = walls().gaussians_at(0.0)
-    assert gaussians.echoes is None, "images need no echoes"
+    gaussians = walls().at(0.0)
+    assert gaussians.lidar_logits is None, "images need none"
     with pytest.raises(ResultError):
         scan_picture(GaussianSets([gaussians]), view())
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import motion_through, round_gaussians, track_of
+from helpers.samples import sampled
 from scipy.spatial.transform import Rotation
 
 from drivesplat.model.actors import Actors
@@ -154,7 +155,7 @@ def test_overlapping_gaussians_keep_their_order():
 
 def test_gradients_pass_the_displacement_unchanged():
     part = round_gaussians(torch.rand(20, 3) * 5.0 + torch.tensor([4.0, -2.5, 0.0]))
-    gaussians = part.at(0.0)
+    gaussians = sampled(part, 0.0)
     shown = where_seen(gaussians, view(DOWN))
     assert (shown.means - gaussians.means).abs().max() > 0.05
     shown.means.backward(weight := torch.randn(20, 3))

@@ -146,14 +146,9 @@ def test_a_graph_has_one_image_size(film):
 
 def test_frames_with_own_gaussians_or_of_a_rig_camera_are_not_captured(film):
     """Python looks up the poses and exposures of cameras of the rig."""
-    of_rig, edited = replace(needing(100), camera="CAM_BACK"), (needing(100), film.model.gaussians_at(0.0))
+    of_rig, edited = replace(needing(100), camera="CAM_BACK"), (needing(100), film.model.at(0.0))
     assert film.made(needing(100), of_rig, edited, of_rig) == [RENDERED] * 4 and not film.captured
     assert film.made(needing(100), edited, needing(100)) == [REPLAYED, RENDERED, REPLAYED]
-
-
-def test_a_model_without_time_states_is_not_captured(film, monkeypatch):
-    monkeypatch.setattr(film.model, "time_states", lambda time: None)
-    assert film.made(*[needing(100)] * 3) == [RENDERED] * 3 and not film.captured
 
 
 def test_a_refused_capture_is_not_tried_again(film, monkeypatch):

@@ -15,8 +15,9 @@ from helpers.trainings import (
 )
 
 from drivesplat.settings.train_geometry import FloaterSettings
-from drivesplat.training.averaging import EVERY, ParameterAverage
-from drivesplat.training.train import TrainingRun
+from drivesplat.training.loop import TrainingRun
+from drivesplat.training.optimizers import AVERAGED_EVERY, ParameterAverage
+from drivesplat.training.schedule import Schedule
 
 
 def averages(monkeypatch) -> list[dict[str, torch.Tensor]]:
@@ -37,7 +38,7 @@ def test_a_training_ends_with_the_mean_of_its_last_parameters(strategy, monkeypa
     recorded, settings = averages(monkeypatch), settings_of(strategy, refine_stop=0.4, averaged=0.5)
     model, _ = trained(tmp_path, settings, guided_views(), model=untrained_street(settings))
     assert len(recorded) == 60
-    last = recorded[30 + EVERY - 1 :: EVERY]
+    last = recorded[30 + AVERAGED_EVERY - 1 :: AVERAGED_EVERY]
     for name, value in model.named_parameters():
         if value.is_floating_point():
             expected = torch.stack([each[name] for each in last]).mean(dim=0)
@@ -60,7 +61,7 @@ def test_there_is_no_mean_where_none_is_wanted_or_densification_never_ends(share
 
 @pytest.mark.parametrize(("share", "first"), [(0.1, 6_301), (0.3, 5_832), (1.0, 5_832)])
 def test_the_mean_begins_after_the_last_densification(share, first):
-    average = ParameterAverage.of(settings_of(iterations=7_000, refine_stop=0.833, averaged=share))
+    average = ParameterAverage.of(Schedule.of(settings_of(iterations=7_000, refine_stop=0.833, averaged=share), 1))
     assert (average.first, average.last) == (first, 7_000)
 
 
@@ -95,7 +96,7 @@ def test_curves_of_psnr_end_with_the_mean(monkeypatch, tmp_path):
     psnrs = TrainingRun.psnrs
 
     def watching(run):
-        seen.append({name: value.detach().clone() for name, value in run.trainer.model.named_parameters()})
+        seen.append({name: value.detach().clone() for name, value in run.trainer.state.model.named_parameters()})
         return psnrs(run)
 
     monkeypatch.setattr(TrainingRun, "psnrs", watching)

@@ -11,6 +11,7 @@ from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import CoarseToFineSettings, TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
+from drivesplat.training.schedule import Schedule
 from drivesplat.training.views import LidarDepth, TrainingView, view_index
 
 WIDTH, HEIGHT = 14, 9
@@ -88,7 +89,7 @@ NEVER = {"quarter_until": 0.0, "half_until": 0.0}
 
 def images_of(height: int, count: int = 3, **changes: float) -> TrainingImages:
     settings = TrainSettings(iterations=100, coarse_to_fine=CoarseToFineSettings(**{**NEVER, **changes}))
-    return TrainingImages([a_view(16, height) for _ in range(count)], settings, seed=7)
+    return TrainingImages([a_view(16, height) for _ in range(count)], Schedule.of(settings, count), seed=7)
 
 
 def test_images_are_not_reduced_by_default():

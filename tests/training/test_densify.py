@@ -10,6 +10,7 @@ from gsplat import MCMCStrategy
 from gsplat.strategy import ops
 from helpers.densification import ALL, a_model, a_view, settings_of, train_step
 from helpers.hand_made import actors_of, motion_through, round_gaussians, track_of
+from helpers.samples import sampled
 
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import cpu_strategies
@@ -22,8 +23,9 @@ from drivesplat.settings.train import CoarseToFineSettings, DefaultSettings, Mcm
 from drivesplat.settings.train_objects import ActorSettings
 from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier, coarse_cap
+from drivesplat.training.loop import Trainer
 from drivesplat.training.optimizers import make_optimizers
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.schedule import Schedule
 
 BINOMS = MCMCStrategy().initialize_state()["binoms"]
 N_MAX = len(BINOMS)
@@ -114,7 +116,7 @@ def densified(strategy: str, steps: int, count: int = 100, size: float = 0.05, *
     """The number of Gaussians after every iteration."""
     torch.manual_seed(0)
     model, settings = a_model(count, size), settings_of(strategy, **changes)
-    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(model.parts[0], Schedule.of(settings, 1)), make_optimizers(model).parts
     counts = []
     for step in range(steps):
         train_step(model, densifier, step, optimizers)
@@ -135,16 +137,16 @@ def test_there_are_coarse_cap_in_time_to_become_all():
     """A third more needs six times a twentieth, and another for what is rounded away."""
     coarse = CoarseToFineSettings(fraction=0.75)
     overrides = {"coarse_to_fine": coarse, "refine_stop": 0.8, "mcmc": McmcSettings(refine_every=20)}
-    assert coarse_cap(1000, settings_of("mcmc", **overrides)) == (750, 800 - 7 * 20)
+    assert coarse_cap(1000, Schedule.of(settings_of("mcmc", **overrides), 1)) == (750, 800 - 7 * 20)
     alike = {**overrides, "coarse_to_fine": CoarseToFineSettings(fraction=1.0)}
-    assert coarse_cap(1000, settings_of("mcmc", **alike)) == (1000, 0)
-    assert coarse_cap(1000, settings_of("default", **overrides)) == (1000, 0)
+    assert coarse_cap(1000, Schedule.of(settings_of("mcmc", **alike), 1)) == (1000, 0)
+    assert coarse_cap(1000, Schedule.of(settings_of("default", **overrides), 1)) == (1000, 0)
 
 
 def test_while_images_are_reduced_the_cap_is_lower(monkeypatch):
     monkeypatch.setattr(strategies, "GROWTH", 0.5)
     model, settings = a_model(100), settings_of("mcmc", cap_max=200, mcmc=McmcSettings(refine_every=1))
-    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(model.parts[0], Schedule.of(settings, 1)), make_optimizers(model).parts
     counts = []
     for step, coarse in enumerate([True, True, True, False, False], start=2):
         train_step(model, densifier, step, optimizers, coarse)
@@ -155,7 +157,7 @@ def test_while_images_are_reduced_the_cap_is_lower(monkeypatch):
 def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
     model, settings = a_model(), settings_of("mcmc", cap_max=100)
     part = model.parts[0]
-    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(part, Schedule.of(settings, 1)), make_optimizers(model).parts
     with torch.no_grad():
         part.params["opacities"][:30] = -9.0
     living = part.params["means"].detach()[30:].clone()
@@ -164,13 +166,13 @@ def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
     assert len(model) == 100
     moved = part.params["means"].detach()[:30]
     assert ((moved[:, None] - living).abs().amax(dim=2).amin(dim=1) == 0).all()
-    assert (part.at(0.0).opacities > 0.005).all()
+    assert (sampled(part, 0.0).opacities > 0.005).all()
 
 
 def test_relocation_hardly_changes_what_is_seen():
     """Copies of a Gaussian look like the one that was there, which the formula is made for."""
     model, settings = a_model(size=0.12), settings_of("mcmc", cap_max=105)
-    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(model.parts[0], Schedule.of(settings, 1)), make_optimizers(model).parts
     with torch.no_grad():
         before = model.render(a_view(), 0).image
         torch.manual_seed(0)
@@ -187,7 +189,7 @@ def test_mcmc_noise_moves_faint_gaussians_more_than_opaque_ones():
     with torch.no_grad():
         part.params["opacities"][:50], part.params["opacities"][50:] = -5.2, 6.0
     before = part.params["means"].detach().clone()
-    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(part, Schedule.of(settings, 1)), make_optimizers(model).parts
     torch.manual_seed(0)
     densifier.after_step(1, optimizers, {}, ALL)
     moved = (part.params["means"].detach() - before).norm(dim=1)
@@ -217,7 +219,7 @@ def test_the_default_strategy_never_exceeds_the_cap(cap_max, size):
 def test_at_the_cap_the_default_strategy_prefers_the_largest_gradients():
     model = a_model(size=0.005)
     part, settings = model.parts[0], settings_of("default", cap_max=110)
-    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(part, Schedule.of(settings, 1)), make_optimizers(model).parts
     strength = torch.from_numpy(np.random.default_rng(2).permutation(100)).float() + 1.0
     centers = torch.zeros(1, 100, 2, requires_grad=True)
     centers.grad = torch.stack([strength, torch.zeros(100)], dim=1)[None]
@@ -237,7 +239,7 @@ def test_the_default_strategy_removes_what_is_too_faint():
     with torch.no_grad():
         model.parts[0].params["opacities"][:25] = math.log(0.004 / 0.996)
     settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=0.005))
-    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(model.parts[0], Schedule.of(settings, 1)), make_optimizers(model).parts
     for optimizer in optimizers.values():
         optimizer.param_groups[0]["lr"] = 0.0
     for step in (1, 2):
@@ -248,12 +250,12 @@ def test_the_default_strategy_removes_what_is_too_faint():
 def test_the_default_strategy_resets_opacities_every_so_many_iterations():
     model = a_model()
     default = DefaultSettings(refine_every=1000, reset_every=3, prune_opacity=0.005)
-    densifier = Densifier(model.parts[0], settings_of("default", default=default))
+    densifier = Densifier(model.parts[0], Schedule.of(settings_of("default", default=default), 1))
     (optimizers,) = make_optimizers(model).parts
     brightest = []
     for step in range(1, 4):
         train_step(model, densifier, step, optimizers)
-        brightest.append(float(model.parts[0].at(0.0).opacities.detach().max()))
+        brightest.append(float(sampled(model.parts[0], 0.0).opacities.detach().max()))
     assert min(brightest[:2]) > 0.05
     assert brightest[2] == pytest.approx(0.01, rel=1e-3), "twice prune_opacity, as in 3DGS"
 
@@ -291,7 +293,8 @@ def owners_fit(actors: Actors) -> bool:
 
 def test_mcmc_gives_what_it_adds_and_moves_the_owner_of_where_it_goes():
     actors, settings = two_cars(), settings_of("mcmc")
-    densifier, (optimizers,) = Densifier(actors, settings), make_optimizers(SplatModel([actors], None)).parts
+    densifier = Densifier(actors, Schedule.of(settings, 1))
+    (optimizers,) = make_optimizers(SplatModel([actors], None)).parts
     with torch.no_grad():
         actors.params["opacities"][:36] = -9.0  # all but four of the first car's
     torch.manual_seed(0)
@@ -314,7 +317,7 @@ def screen_gradients(strengths: torch.Tensor) -> dict[str, Any]:
 def test_the_default_strategy_gives_what_it_grows_its_parents_owner(size):
     actors = two_cars(size=size)
     growing = DefaultSettings(refine_every=2, grow_grad2d=1.0, prune_opacity=1e-3)
-    densifier = Densifier(actors, settings_of("default", default=growing))
+    densifier = Densifier(actors, Schedule.of(settings_of("default", default=growing), 1))
     (optimizers,) = make_optimizers(SplatModel([actors], None)).parts
     strengths = torch.zeros(80)
     strengths[30:50] = 1.0
@@ -332,14 +335,14 @@ def test_each_part_grows_by_the_gradients_of_its_own_rows(wanting):
     model = SplatModel([round_gaussians(np.arange(90.0).reshape(30, 3), 0.001), two_cars(20, 0.001)], None)
     settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1.0, prune_opacity=1e-3))
     trainer = Trainer.begin(model, [], settings, 0, torch.device("cpu"))
-    trainer.step = 2
+    trainer.state.step = 2
     strengths, nothing = torch.zeros(70), torch.zeros(24, 32, 3)
     strengths[wanting] = 1.0
-    before, together = [len(part) for part in model.parts], model.gaussians_at(0.0)
+    before, together = [len(part) for part in model.parts], model.at(0.0)
     trainer.densify(
         Picture(GaussianSets([together]), nothing, nothing, nothing[..., 0], None, screen_gradients(strengths))
     )
-    grown = [part.at(0.0)[count:] for part, count in zip(model.parts, before, strict=True)]
+    grown = [sampled(part, 0.0)[count:] for part, count in zip(model.parts, before, strict=True)]
     assert torch.equal(torch.cat([new.means for new in grown]), together.means[wanting])
     assert len(grown[0]) == sum(row < 30 for row in wanting)
 
@@ -351,7 +354,8 @@ def test_each_part_has_a_cap_of_its_own(strategy):
     actors = two_cars()
     actors.cap_max = 82
     model = SplatModel([a_model().parts[0], actors], None)
-    densifiers, optimizers = [Densifier(part, settings) for part in model.parts], make_optimizers(model).parts
+    densifiers = [Densifier(part, Schedule.of(settings, 1)) for part in model.parts]
+    optimizers = make_optimizers(model).parts
     torch.manual_seed(0)
     for densifier, own, of_part in zip(densifiers, optimizers, model.rows, strict=True):
         densifier.after_step(2, own, screen_gradients(torch.ones(180)), of_part)
@@ -361,6 +365,7 @@ def test_each_part_has_a_cap_of_its_own(strategy):
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
 def test_a_part_without_gaussians_is_left_alone(strategy):
     model = SplatModel([round_gaussians([]), two_cars()], None)
-    densifier, optimizers = Densifier(model.parts[0], settings_of(strategy)), make_optimizers(model).parts
+    schedule, optimizers = Schedule.of(settings_of(strategy), 1), make_optimizers(model).parts
+    densifier = Densifier(model.parts[0], schedule)
     densifier.after_step(2, optimizers[0], screen_gradients(torch.ones(80)), model.rows[0])
     assert len(model.parts[0]) == 0 and not densifier.any_alive()

@@ -7,15 +7,15 @@ from helpers.records import training_record_of
 from helpers.trainings import inputs_in, job_of, settings_of, untrained_street
 
 from drivesplat.model.gaussians import concatenate
-from drivesplat.training.dropout import dropout_share, with_dropout
-from drivesplat.training.run import prepare
+from drivesplat.training.augmentation import dropout_share, with_dropout
+from drivesplat.training.stage import prepare
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
 def test_a_random_share_of_the_static_gaussians_is_left_out(share):
     torch.manual_seed(0)
     model = untrained_street(settings_of())
-    sets, moving = model.sets_at(0.5), model.moving()
+    sets, moving = model.sample(model.states(0.5)), model.moving()
     gaussians = concatenate(sets)
     shown = [concatenate(with_dropout(sets, model, share)) for _ in range(400)]
     left_out = torch.stack([some.opacities != gaussians.opacities for some in shown])
@@ -29,7 +29,7 @@ def test_a_random_share_of_the_static_gaussians_is_left_out(share):
 def test_gaussians_left_out_get_no_gradient():
     torch.manual_seed(1)
     model = untrained_street(settings_of())
-    shown = concatenate(with_dropout(model.sets_at(0.5), model, 0.5))
+    shown = concatenate(with_dropout(model.sample(model.states(0.5)), model, 0.5))
     shown.opacities.sum().backward()
     static = model.parts[0].params["opacities"]
     left_out = shown.opacities[model.rows[0]] == 0.0

@@ -40,7 +40,7 @@ from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, MaskSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.training import run
-from drivesplat.training.run import TrainingInputs, read_inputs, run_training
+from drivesplat.training.stage import TrainingInputs, read_inputs, run_training
 from drivesplat.training.views import Supervision, TrainingView, load_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers.samples import sampled
 
 from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import SparseGrid
@@ -78,7 +79,7 @@ def test_only_floaters_near_the_path_fade_and_the_rest_stays():
     part = Background.from_points(positions, np.full((4, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     before = {name: value.detach().clone() for name, value in part.params.items()}
     fade_floaters(part, EmptySpace(SensorPath.of(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), 1.0)))
-    opacities = part.at(0.0).opacities.detach()
+    opacities = sampled(part, 0.0).opacities.detach()
     assert (opacities[:2] < 1e-3).all()
     torch.testing.assert_close(opacities[2:], torch.tensor([0.6, 0.6]))
     for name in before.keys() - {"opacities"}:
@@ -88,7 +89,7 @@ def test_only_floaters_near_the_path_fade_and_the_rest_stays():
 def test_a_faded_gaussian_is_under_what_the_strategies_take_for_dead():
     part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
     fade_floaters(part, EmptySpace(SensorPath.of(torch.zeros(1, 3), 1.0)))
-    opacity = float(part.at(0.0).opacities.detach())
+    opacity = float(sampled(part, 0.0).opacities.detach())
     assert opacity < min(McmcSettings().min_opacity, DefaultSettings().prune_opacity)
 
 
@@ -113,7 +114,7 @@ def test_centres_alone_decide_however_large_gaussians_are():
     with torch.no_grad():
         part.params["scales"][1:] += 5.0
     fade_floaters(part, EmptySpace(SensorPath.of(torch.zeros(1, 3), 1.0)))
-    assert (part.at(0.0).opacities.detach() < 1e-3).tolist() == [True, False, False]
+    assert (sampled(part, 0.0).opacities.detach() < 1e-3).tolist() == [True, False, False]
 
 
 def test_gaussians_fade_that_the_road_hides():
@@ -126,7 +127,7 @@ def test_gaussians_fade_that_the_road_hides():
     )
     part = Background.from_points(positions, np.full((6, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     fade_floaters(part, EmptySpace(road=road))
-    assert (part.at(0.0).opacities.detach() < 1e-3).nonzero()[:, 0].tolist() == [0, 2]
+    assert (sampled(part, 0.0).opacities.detach() < 1e-3).nonzero()[:, 0].tolist() == [0, 2]
 
 
 def test_nothing_is_known_to_be_empty_without_a_radius_and_a_road():

@@ -20,10 +20,11 @@ from drivesplat.model.exposure import Exposures
 from drivesplat.model.view import RollingShutter
 from drivesplat.settings.train import McmcSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
-from drivesplat.training.cuda_graph.image_inputs import SharedImageInputs, can_share
-from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs, Recording
+from drivesplat.training.graphs.inputs import SharedImageInputs, can_share
+from drivesplat.training.graphs.iteration_graphs import IterationGraphs, Recording
+from drivesplat.training.loop import Trainer
 from drivesplat.training.losses import depth_loss, loss_terms
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.schedule import Schedule
 from drivesplat.training.views import LidarDepth, TrainingView
 
 
@@ -36,7 +37,7 @@ def with_depths(view: TrainingView, count: int) -> TrainingView:
 
 
 def inputs_for(views: list[TrainingView], by_camera: bool = False) -> SharedImageInputs:
-    return SharedImageInputs(TrainingImages(views, settings_of(), 0), by_camera)
+    return SharedImageInputs(TrainingImages(views, Schedule.of(settings_of(), len(views)), 0), by_camera)
 
 
 @pytest.mark.parametrize(("drifting", "night"), [(False, False), (True, False), (False, True)])
@@ -49,10 +50,10 @@ def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_i
     shared, addresses = inputs_for(views), set()
     for view in views:
         assert can_share(view)
-        inputs = shared.load(view, model.time_states(view.view.time))
+        inputs = shared.load(view, model.states(view.view.time))
         addresses.add((inputs.number, inputs.image.pixels.data_ptr(), inputs.image.lidar.depth.data_ptr()))
         alone = model.render(view.view, with_depth=True)
-        sets = model.sets_at_time_states(inputs.states)
+        sets = model.sample(inputs.states)
         together = model.render(inputs.view.view, gaussians=sets, with_depth=True)
         expected, found = loss_terms(alone, view, model, settings), loss_terms(together, inputs.view, model, settings)
         assert found.keys() == expected.keys() and {"depth", "horizon" if night else "sky_bce"} <= found.keys()
@@ -69,7 +70,7 @@ def test_an_iteration_with_shared_inputs_has_the_loss_and_the_gradients_of_its_i
 def test_images_of_other_shapes_have_inputs_of_their_own_and_those_of_other_cameras_with_exposures(by_camera):
     views = guided_views()
     model = untrained_street(settings_of())
-    states = model.time_states(0.5)
+    states = model.states(0.5)
     others = [
         views[0],
         reduced(views[0], 2),
@@ -85,7 +86,7 @@ def test_images_of_other_shapes_have_inputs_of_their_own_and_those_of_other_came
 def test_inputs_do_not_change_the_image_that_they_were_made_of():
     first, second = guided_views()[:2]
     before = first.pixels.clone()
-    shared, states = inputs_for([first, second]), untrained_street(settings_of()).time_states(0.5)
+    shared, states = inputs_for([first, second]), untrained_street(settings_of()).states(0.5)
     inputs = shared.load(first, states)
     shared.load(second, states)
     assert torch.equal(first.pixels, before) and torch.equal(inputs.image.pixels, second.pixels)
@@ -132,7 +133,7 @@ def replayed(monkeypatch: pytest.MonkeyPatch, trainer: Trainer) -> list[Recordin
 
     monkeypatch.setattr(IterationGraphs, "_capture", capture)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
-    trainer.graphs.enabled = True
+    trainer.steps.graphs.enabled = True
     return captured
 
 
@@ -153,7 +154,7 @@ def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
         for _ in range(settings.iterations):
             terms = trainer.training_step(with_picture=False)[0]
             losses[-1].append({name: float(value) for name, value in terms.items()})
-            trainer.step += 1
+            trainer.state.step += 1
     sizes, cameras = 2, 1 + exposed
     assert 0 < len(captured) <= sizes * cameras
     for eager, mine in zip(*losses, strict=True):

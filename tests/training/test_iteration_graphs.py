@@ -12,8 +12,10 @@ from drivesplat.kernels.capacity import capacity_for
 from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.cuda_graph import iteration_graphs
-from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, Recording, can_capture
+from drivesplat.training.graphs import iteration_graphs
+from drivesplat.training.graphs.iteration_graphs import GaussianCount, IterationGraphs, Recording, can_capture
+from drivesplat.training.schedule import Schedule
+from drivesplat.training.views import TrainingView
 
 CPU = torch.device("cpu")
 HUNDRED = GaussianCount(100, 1.0)
@@ -142,6 +144,10 @@ def test_disabled_graphs_run_every_iteration(monkeypatch):
     assert [fake.run(0) for _ in range(3)] == [["run"]] * 3
 
 
+def images_of(views: list[TrainingView]) -> TrainingImages:
+    return TrainingImages(views, Schedule.of(TrainSettings(), len(views)), 0)
+
+
 @pytest.mark.parametrize(
     ("settings", "device", "compiles", "expected"),
     [
@@ -155,15 +161,15 @@ def test_disabled_graphs_run_every_iteration(monkeypatch):
 def test_which_trainings_capture_graphs(settings, device, compiles, expected, monkeypatch):
     monkeypatch.setattr(triton_support, "compiles", lambda: compiles)
     chosen = TrainSettings(**settings)
-    assert can_capture(chosen, TrainingImages(guided_views(), chosen, 0), torch.device(device)) == expected
+    assert can_capture(chosen, images_of(guided_views()), torch.device(device)) == expected
 
 
 def test_classes_and_too_many_recordings_disable_graphs(monkeypatch):
     monkeypatch.setattr(triton_support, "compiles", lambda: True)
     views, gpu = guided_views(), torch.device("cuda")
     labelled = [dataclasses.replace(view, classes=torch.zeros_like(view.sky, dtype=torch.uint8)) for view in views]
-    assert not can_capture(TrainSettings(), TrainingImages(labelled, TrainSettings(), 0), gpu)
-    images = TrainingImages(views, TrainSettings(), 0)
+    assert not can_capture(TrainSettings(), images_of(labelled), gpu)
+    images = images_of(views)
     monkeypatch.setattr(iteration_graphs, "MAX_RECORDINGS", len(views) + 1)
     assert can_capture(TrainSettings(), images, gpu, scans=1)
     assert not can_capture(TrainSettings(), images, gpu, scans=2)

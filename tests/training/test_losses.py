@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, track_of
+from helpers.samples import sampled
 from skimage.metrics import structural_similarity
 
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
@@ -61,7 +62,7 @@ def a_case(model: SplatModel, sky_known: bool = True) -> tuple[Picture, Training
 def picture_of(
     model: SplatModel, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None = None
 ) -> Picture:
-    return Picture(GaussianSets(model.sets_at(0.0)), image, image, alpha, depth, {})
+    return Picture(GaussianSets(model.sample(model.states(0.0))), image, image, alpha, depth, {})
 
 
 def zero_padded_ssim(image: np.ndarray, target: np.ndarray) -> float:
@@ -128,7 +129,7 @@ def test_colour_terms_are_weighted_l1_and_ssim():
 def test_regularizers_are_weighted_means_over_all_gaussians():
     picture, view = a_case(model := a_model())
     terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=0.03, scale_reg=0.07))
-    gaussians = model.parts[0].at(0.0)
+    gaussians = sampled(model.parts[0], 0.0)
     torch.testing.assert_close(terms["opacity_reg"], 0.03 * gaussians.opacities.mean())
     torch.testing.assert_close(terms["scale_reg"], 0.07 * gaussians.scales.mean())
 
@@ -137,7 +138,7 @@ def test_regularizers_of_several_parts_weigh_every_gaussian_alike():
     parts = [a_model(gaussians=n).parts[0] for n in (3, 9)]
     picture, view = a_case(model := SplatModel(parts, None))
     terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=1.0))
-    opacities = torch.cat([part.at(0.0).opacities for part in parts])
+    opacities = torch.cat([sampled(part, 0.0).opacities for part in parts])
     torch.testing.assert_close(terms["opacity_reg"], opacities.mean())
 
 
@@ -476,7 +477,8 @@ def test_penalties_of_several_parts_add_up():
     standing = motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 2.0]] * 3)
     other = actors_of(track_of(standing, "other", (1.0, 1.0, 1.0)), seed=1)
     both = SplatModel([*model.parts, other], model.sky)
-    terms = loss_terms(dataclasses.replace(picture, sets=GaussianSets(both.sets_at(0.0))), view, both, TrainSettings())
+    shown = dataclasses.replace(picture, sets=GaussianSets(both.sample(both.states(0.0))))
+    terms = loss_terms(shown, view, both, TrainSettings())
     for name, penalty in model.parts[1].penalties().items():
         torch.testing.assert_close(terms[name], penalty + other.penalties()[name])
         assert float(penalty.detach()) > 0.0 and float(other.penalties()[name].detach()) > 0.0

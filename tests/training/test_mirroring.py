@@ -11,12 +11,13 @@ from helpers.trainings import recorded_views, settings_of, untrained_street
 
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import want_of
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train_objects import DeformableSettings
-from drivesplat.training.mirroring import choose_mirrored, mirrored_shares, sets_with_mirrored_objects
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.augmentation import choose_mirrored, mirrored_at_random, mirrored_shares
+from drivesplat.training.loop import Trainer
 
 
 def street(mirrored: float) -> SplatModel:
@@ -32,19 +33,23 @@ def one_view(rolling: bool = False) -> View:
     return dataclasses.replace(view, shutter=shutter) if rolling else view
 
 
+def shown_in(model: SplatModel, view: View) -> list[Gaussians]:
+    """The set of each part that a step renders in a view."""
+    want = want_of(model.seen_from(view))
+    return model.sample(mirrored_at_random(model, model.states(view.time, want)), want)
+
+
 def are_equal(found: Gaussians, expected: Gaussians) -> bool:
     return all(torch.equal(found.tensors[name], values) for name, values in expected.tensors.items())
 
 
 @pytest.mark.parametrize("share", [0.2, 0.7])
-@pytest.mark.parametrize("looked_up", [True, False])
-def test_objects_are_mirrored_at_random(share, looked_up):
+def test_objects_are_mirrored_at_random(share):
     """Each for itself, in its share of the iterations; nothing else changes."""
     torch.manual_seed(0)
     model, view = street(share), one_view()
-    states = None if looked_up else model.time_states(view.time)
-    recorded = model.sets_in(view)
-    shown = [sets_with_mirrored_objects(model, view, states) for _ in range(300)]
+    recorded = model.sample(model.states(view.time))
+    shown = [shown_in(model, view) for _ in range(300)]
     assert all(are_equal(static, recorded[0]) for static, _ in shown)
     moved = torch.stack([(objects.means - recorded[1].means).norm(dim=1) > 1e-4 for _, objects in shown])
     tracks = [model.parts[1].of_track(track.id) for track in model.parts[1].timeline.tracks]
@@ -58,19 +63,17 @@ def test_without_mirroring_the_gaussians_are_those_of_the_time_and_no_random_num
     torch.manual_seed(3)
     first = torch.rand(())
     torch.manual_seed(3)
-    for states in (None, model.time_states(view.time)):
-        for found, expected in zip(sets_with_mirrored_objects(model, view, states), model.sets_in(view), strict=True):
-            assert are_equal(found, expected)
+    for found, expected in zip(shown_in(model, view), model.sample(model.states(view.time)), strict=True):
+        assert are_equal(found, expected)
     assert torch.rand(()) == first
 
 
 @pytest.mark.parametrize("mirrored", [0.0, 1.0])
 def test_a_rolling_shutter_has_the_velocities_of_what_is_shown(mirrored):
     model, view, step = street(mirrored), one_view(rolling=True), 1e-2
-    static, objects = sets_with_mirrored_objects(model, view, None)
+    static, objects = shown_in(model, view)
     earlier, later = (
-        sets_with_mirrored_objects(model, dataclasses.replace(view, time=view.time + after), None)[1].means.detach()
-        for after in (-step, step)
+        shown_in(model, dataclasses.replace(view, time=view.time + after))[1].means.detach() for after in (-step, step)
     )
     assert static.velocities is None or not static.velocities.any()
     torch.testing.assert_close(objects.velocities, (later - earlier) / (2.0 * step), atol=0.05, rtol=0.02)
@@ -81,7 +84,8 @@ def test_an_iteration_leaves_out_static_gaussians_and_mirrors_objects():
     model, views = street(1.0), recorded_views()
     trainer = Trainer.begin(model, views, settings_of(dropout=0.5), 0, torch.device("cpu"))
     _, picture, view = trainer.training_step()
-    recorded = street(0.0).sets_in(view.view)[1]
+    still = street(0.0)
+    recorded = still.sample(still.states(view.view.time))[1]
     static, objects = picture.sets
     assert 0.2 < float((static.opacities == 0.0).float().mean()) < 0.8
     assert not (objects.opacities == 0.0).all()

@@ -12,6 +12,7 @@ from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.training.optimizers import DeviceSchedule, make_optimizers, set_learning_rates
+from drivesplat.training.schedule import Schedule
 
 DEVICES = [
     "cpu",
@@ -53,7 +54,7 @@ def test_a_step_together_is_every_optimizers_own(device):
         optimizers = make_optimizers(model)
         for step in range(7):
             give_gradients(model, step)
-            set_learning_rates(model, optimizers, step / settings.iterations, settings)
+            set_learning_rates(model, optimizers, Schedule.of(settings, 1), step)
             if together:
                 optimizers.step()
                 assert all(parameter.grad is None for parameter in model.parameters())
@@ -88,7 +89,7 @@ def test_steps_at_device_rates_equal_those_of_adam(kernels, monkeypatch):
         optimizers, schedule = make_optimizers(model), DeviceSchedule(torch.device(device))
         for step in range(7):
             give_gradients(model, step)
-            set_learning_rates(model, optimizers, step / settings.iterations, settings)
+            set_learning_rates(model, optimizers, Schedule.of(settings, 1), step)
             counted, rates = schedule.update(step, optimizers)
             optimizers.step(rates)
             assert int(counted) == step
@@ -108,7 +109,7 @@ def test_rates_decay_that_parts_name_among_their_own_and_their_shared_parameters
     people = Deformable.from_points([track], [points], [colors + 0.5], settings.deformable, settings.gaussians)
     optimizers = make_optimizers(model := SplatModel([people], None))
     first = people.learning_rates()
-    set_learning_rates(model, optimizers, 0.5, settings)
+    set_learning_rates(model, optimizers, Schedule.of(settings, 1), settings.iterations // 2)
     (own,), (shared,) = optimizers.parts, optimizers.shared
     for name, optimizer in {**own, **shared}.items():
         decays = name in ("means", "lattice", "stride", "phase")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.densification import ALL, a_model, a_view, settings_of, train_step
+from helpers.samples import sampled
 from helpers.trainings import ALL_TERMS, EndedError, EndingViews, guided_views, trained, untrained_street
 from helpers.trainings import settings_of as settings_of_training
 
@@ -15,11 +16,12 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training import strategies
-from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier
-from drivesplat.training.losses import loss_terms, road_loss, surface_terms
+from drivesplat.training.graphs.iteration_graphs import IterationGraphs
+from drivesplat.training.losses import loss_terms, surface_terms
 from drivesplat.training.optimizers import Optimizers, make_optimizers
 from drivesplat.training.road import driven_road
+from drivesplat.training.schedule import Schedule
 
 
 @pytest.fixture(autouse=True)
@@ -33,13 +35,13 @@ def grown(preallocates: bool, steps: int, **changes: Any) -> tuple[SplatModel, D
     torch.manual_seed(0)
     growing = {"mcmc": McmcSettings(refine_every=2, noise_lr=0.0), "cap_max": 400}
     model, settings = a_model(), settings_of("mcmc", **{**growing, **changes})
-    densifier = Densifier(model.parts[0], settings, lambda: preallocates)
+    densifier = Densifier(model.parts[0], Schedule.of(settings, 1), lambda: preallocates)
     (optimizers,) = make_optimizers(model).parts
     means = []
     for step in range(steps):
         train_step(model, densifier, step, optimizers, learns_size=True)
-        shown = model.gaussians_at(0.0)
-        opacity, scale = mean_opacity_and_scale(shown.opacities, shown.scales)
+        shown = model.at(0.0)
+        opacity, scale = mean_opacity_and_scale((shown.opacities, shown.scales))
         means += [float(mean.detach() / active_fraction(model.parts)) for mean in (opacity, scale)]
     return model, densifier, optimizers, means
 
@@ -62,11 +64,13 @@ def test_preallocated_rows_learn_nothing():
     part = model.parts[0]
     rows, moved = slice(len(part), None), part.params["means"].detach().clone()
     before = {name: values[rows].detach().clone() for name, values in part.params.items()}
-    assert part.preallocated == 50 and not part.at(0.0).opacities[rows].any() and not part.at(0.0).scales[rows].any()
+    shown = sampled(part, 0.0)
+    assert part.preallocated == 50 and not shown.opacities[rows].any() and not shown.scales[rows].any()
     train_step(model, densifier, 5, optimizers, learns_size=True)
     assert part.preallocated == 50 and not torch.equal(part.params["means"], moved)
     with torch.no_grad():
-        alone = model.render(a_view(), gaussians=part.at(0.0)[torch.arange(part.row_count) >= len(part)])
+        preallocated = sampled(part, 0.0)[torch.arange(part.row_count) >= len(part)]
+        alone = model.render(a_view(), gaussians=preallocated)
     assert not alone.image.any() and not alone.alpha.any()
     for name, values in part.params.items():
         torch.testing.assert_close(values[rows], before[name], rtol=0, atol=0)
@@ -124,9 +128,10 @@ def test_preallocated_rows_have_no_weight_in_the_road_loss():
     with torch.no_grad():
         part.params["means"][len(part) :] = torch.tensor([0.0, 0.0, 0.2])
     road = driven_road(np.tile(np.eye(4), (1, 1, 1)), RoadSettings())
-    with_them = road_loss(part.at(0.0), road)
-    there = part.at(0.0)[torch.arange(part.row_count) < len(part)]
-    assert float(with_them.detach()) == pytest.approx(float(road_loss(there, road).detach()))
+    shown, settings = sampled(part, 0.0), TrainSettings(road_weight=1.0)
+    there = shown[torch.arange(part.row_count) < len(part)]
+    with_them, alone = (float(surface_terms([own], model, road, settings)["road"].detach()) for own in (shown, there))
+    assert with_them == pytest.approx(alone)
 
 
 def test_preallocated_rows_do_not_change_the_loss():
@@ -146,7 +151,7 @@ def test_preallocated_rows_do_not_change_flatness():
     model, _, _, _ = grown(True, 4)
     part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
     found = surface_terms(model.render(a_view()).sets, model, None, settings)
-    expected = part.at(0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
+    expected = sampled(part, 0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
     assert part.preallocated and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
 
 

@@ -24,9 +24,9 @@ from helpers.trainings import (
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.training.psnr_curves import MAX_IMAGES, curve_psnrs, evenly_spaced
-from drivesplat.training.run import prepare, run_training
-from drivesplat.training.train import train
+from drivesplat.training.loop import train
+from drivesplat.training.probes import MAX_IMAGES, curve_psnrs, evenly_spaced
+from drivesplat.training.stage import prepare, run_training
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -7,10 +7,11 @@ import pytest
 import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, round_gaussians, track_of
 from helpers.records import training_record_of
+from helpers.samples import sampled
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.regularizers import mean_thickness
-from drivesplat.kernels.road_distance import ROUGHNESS, Road
+from drivesplat.kernels.road_distance import ROUGHNESS, Road, road_distance
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
@@ -19,7 +20,7 @@ from drivesplat.scene.training_record import SeedInfo, TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP
-from drivesplat.training.losses import road_loss, surface_terms
+from drivesplat.training.losses import surface_terms
 from drivesplat.training.road import CELL, LIDAR_CELL, driven_road, lidar_road, road_of
 
 WIDE = RoadSettings(half_width=1.2, reach=0.3)
@@ -34,6 +35,10 @@ def straight(length: float = 20.0, step: float = 2.0, pitch: float = 0.0, roll: 
 def on_road(poses: np.ndarray, along: np.ndarray, aside: np.ndarray, above: np.ndarray) -> torch.Tensor:
     """World points (n, 3) by their place in the frame of the first of some poses of a straight road."""
     return torch.from_numpy(np.stack([along, aside, above], axis=1) @ poses[0, :3, :3].T + poses[0, :3, 3]).float()
+
+
+def road_loss(gaussians: Gaussians, road: Road) -> torch.Tensor:
+    return road_distance(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, road)
 
 
 def gaussians_at(means: torch.Tensor, scales: torch.Tensor, quats: torch.Tensor) -> Gaussians:
@@ -307,7 +312,7 @@ def test_terms_are_weighted_and_apply_to_static_parts_only():
     model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
     terms = surface_terms(picture.sets, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
-    still = model.parts[0].at(0.0)
+    still = sampled(model.parts[0], 0.0)
     torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
     torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known()))
     assert float(terms["road"].detach()) > 0.0
@@ -329,7 +334,7 @@ def test_flatness_makes_the_shortest_axis_shorter_and_no_other():
     part = round_gaussians(np.zeros((2, 3)), sizes=0.2)
     with torch.no_grad():
         part.params["scales"] += torch.log(torch.tensor([[1.0, 0.5, 2.0], [3.0, 2.0, 0.25]]))
-    flat = mean_thickness(part.at(0.0).scales)
+    flat = mean_thickness(sampled(part, 0.0).scales)
     assert float(flat.detach()) == pytest.approx(0.2 * (0.5 + 0.25) / 2)
     flat.backward()
     assert (part.params["scales"].grad > 0).tolist() == [[False, True, False], [False, False, True]]

@@ -7,9 +7,10 @@ import torch
 from helpers.trainings import CPU, scan_of_a_wall, settings_of, untrained_street
 
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import SCAN
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.settings.train_scans import ScanTrainingSettings
-from drivesplat.training.cuda_graph.scan_inputs import ScanInputs, SharedScanInputs
+from drivesplat.training.graphs.inputs import ScanInputs, SharedScanInputs
 from drivesplat.training.scans import TrainingScan, load_scans, scan_terms
 
 SETTINGS = settings_of(scans=ScanTrainingSettings(per_image=1.0))
@@ -32,19 +33,19 @@ def revolution(x: float, seconds: float) -> RecordedScan:
 
 def terms_of(model: SplatModel, scan: TrainingScan, inputs: ScanInputs | None = None) -> dict[str, float]:
     """The loss terms of a scan; with `inputs` by their tensors alone."""
-    sets = None if inputs is None else model.sets_at_scan_states(inputs.states)
+    sets = None if inputs is None else model.sample(inputs.states, SCAN)
     picture = model.scan(scan.view, gaussians=sets, before=scan.range - 0.5)
     return {name: float(value.detach()) for name, value in scan_terms(picture, scan, model, SETTINGS).items()}
 
 
 def test_scans_of_one_shape_share_their_inputs():
-    model, shared = untrained_street(SETTINGS, echo=(0.0, 2.0)), SharedScanInputs()
+    model, shared = untrained_street(SETTINGS, lidar_logits=(0.0, 2.0)), SharedScanInputs()
     scans = load_scans([revolution(0.0, 0.4), revolution(0.6, 1.2)], SETTINGS.scans, CPU)
     expected = [terms_of(model, scan) for scan in scans]
     assert all(abs(expected[0][name] - expected[1][name]) > 1e-4 for name in ("scan_range", "scan_intensity"))
     places = set()
     for i in (0, 1, 0):
-        inputs = shared.load(scans[i], model.scan_states(scans[i].view.time))
+        inputs = shared.load(scans[i], model.states(scans[i].view.time, SCAN))
         assert terms_of(model, inputs.scan, inputs) == expected[i] and inputs.number == 0
         places.add(tuple(values.data_ptr() for values in inputs.tensors))
     assert len(places) == 1, "a graph keeps the addresses"
@@ -53,10 +54,10 @@ def test_scans_of_one_shape_share_their_inputs():
 
 def test_scans_of_other_shapes_have_inputs_of_their_own():
     """Without intensity, or without rays that the vehicle blocks."""
-    model, shared, full = untrained_street(SETTINGS, echo=(0.0, 2.0)), SharedScanInputs(), revolution(0.0, 0.4)
+    model, shared, full = untrained_street(SETTINGS, lidar_logits=(0.0, 2.0)), SharedScanInputs(), revolution(0.0, 0.4)
     silent = replace(full, scan=replace(full.scan, intensities=None))
     scans = load_scans([full, silent, replace(full, blocked=np.zeros_like(full.blocked)), full], SETTINGS.scans, CPU)
-    numbers = [shared.load(scan, model.scan_states(scan.view.time)).number for scan in scans]
+    numbers = [shared.load(scan, model.states(scan.view.time, SCAN)).number for scan in scans]
     assert numbers == [0, 1, 2, 0]
 
 
@@ -75,7 +76,7 @@ def held_by(value: object, path: str = "scan") -> dict[str, torch.Tensor]:
 def test_the_tensors_of_a_scan_are_all_that_it_holds():
     """Also what a rendering has cached. One that `tensors` forgot would keep the values of the first scan."""
     (scan,) = load_scans([revolution(0.0, 0.4)], SETTINGS.scans, CPU)
-    terms_of(untrained_street(SETTINGS, echo=(0.0, 2.0)), scan)
+    terms_of(untrained_street(SETTINGS, lidar_logits=(0.0, 2.0)), scan)
     known, held = {values.data_ptr() for values in scan.tensors}, held_by(scan)
     assert len(held) > 30 and any("borders" in name for name in held)
     assert [name for name, values in held.items() if values.data_ptr() not in known] == []

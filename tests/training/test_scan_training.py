@@ -32,26 +32,26 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
-from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
+from drivesplat.training.graphs.iteration_graphs import IterationGraphs
+from drivesplat.training.loop import Trainer, train
 from drivesplat.training.optimizers import make_optimizers
-from drivesplat.training.run import TrainingInputs, prepare
-from drivesplat.training.scan_schedule import ScanSchedule
 from drivesplat.training.scans import (
-    initial_echo,
+    initial_lidar_logits,
     load_scans,
     scan_index,
     scan_terms,
     with_scan_points,
 )
-from drivesplat.training.train import train
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.schedule import Schedule
+from drivesplat.training.stage import TrainingInputs, prepare
+from drivesplat.training.step import limit_geometry
 
 SCANS = ScanTrainingSettings(per_image=1.0)
 
 
 def picture_of(scan, **changes) -> ScanPicture:
     """The rendering that equals a recorded scan, but for `changes`."""
-    gaussians = round_gaussians([[0.0, 0.0, 5.0]]).at(0.0)
+    gaussians = SplatModel([round_gaussians([[0.0, 0.0, 5.0]])], None).at(0.0)
     ones = torch.ones_like(scan.range)
     exact = {"range": scan.range, "returned": scan.returned.float(), "intensity": scan.intensity, "alpha": ones}
     return ScanPicture(**{"sets": GaussianSets([gaussians]), **exact, "alpha_before": 0.0 * ones, **changes})
@@ -63,10 +63,10 @@ def terms_of(picture: ScanPicture, scan, **weights) -> dict[str, float]:
     return {name: float(value) for name, value in scan_terms(picture, scan, model, settings).items()}
 
 
-def scheduled(per_image: float, fine_tune: float = 0.0, images: int = 4, scans: int = 5) -> ScanSchedule:
+def scheduled(per_image: float, fine_tune: float = 0.0, images: int = 4, scans: int = 5) -> Schedule:
     """The schedule of a training with 300 iterations."""
     settings = settings_of(iterations=300, scans=ScanTrainingSettings(per_image=per_image, fine_tune=fine_tune))
-    return ScanSchedule.of(settings, images, scans)
+    return Schedule.of(settings, images, scans)
 
 
 @pytest.mark.parametrize("per_image", [0.0, 0.1, 0.25, 1 / 3, 1.0, 2.5])
@@ -75,7 +75,7 @@ def test_scans_are_spread_evenly_among_all_iterations_with_images(per_image):
     steps = 300 + round(300 * per_image)
     fitted = [schedule.fits_scan(step) for step in range(steps)]
     assert schedule.steps == steps and sum(fitted) == schedule.scans_before(steps) == round(300 * per_image)
-    assert schedule.images_before(steps) == schedule.counted_before(steps) == 300
+    assert schedule.images_before(steps) == schedule.iterations_before(steps) == 300
     assert not any(schedule.fine_tunes(step) for step in range(steps))
     share = per_image / (1.0 + per_image)
     for start in range(0, steps - 30, 30):
@@ -88,8 +88,19 @@ def test_the_last_iterations_fine_tune_the_lidar():
     assert [schedule.fine_tunes(step) for step in (0, 374, 375, 434, 435)] == [False, False, True, True, False]
     assert sum(schedule.fits_scan(step) for step in range(375)) == 75 and schedule.images_before(375) == 300
     assert all(schedule.fits_scan(step) for step in range(375, 435))
-    assert (schedule.scans_before(435), schedule.images_before(435), schedule.counted_before(435)) == (135, 300, 300)
+    assert (schedule.scans_before(435), schedule.images_before(435), schedule.iterations_before(435)) == (135, 300, 300)
     assert not schedule.fits_scan(435), "beyond the end only images are fitted"
+
+
+def test_fractions_of_a_training_count_its_scans_and_not_its_fine_tuning():
+    """Of 435 steps: learning rates, degrees, densification and averages end with the last image, step 375."""
+    schedule = scheduled(0.25, fine_tune=0.2)
+    assert schedule.settings.iterations == 300, "settings keep their meaning"
+    assert [schedule.progress(step) for step in (0, 75, 375)] == [0.0, 0.2, 1.0]
+    assert [schedule.step_at(fraction) for fraction in (0.0, 0.5, 1.0)] == [0, 187, 375]
+    assert [schedule.fine_tuned(step) for step in (375, 405)] == [0.0, 0.5]
+    every = schedule.step_at(schedule.settings.sh_every)
+    assert [schedule.sh_degree(step, 2) for step in (every - 1, every, 2 * every, 400)] == [0, 1, 2, 2]
 
 
 def test_nothing_is_fine_tuned_without_scans():
@@ -103,7 +114,7 @@ def test_without_images_every_iteration_fits_a_scan_and_counts():
     schedule = scheduled(0.25, fine_tune=0.2, images=0)
     assert schedule.steps == 300 and all(schedule.fits_scan(step) for step in range(300))
     assert not any(schedule.fine_tunes(step) for step in range(300))
-    assert (schedule.images_before(300), schedule.counted_before(300)) == (0, 300) and schedule.fits_scan(300)
+    assert (schedule.images_before(300), schedule.iterations_before(300)) == (0, 300) and schedule.fits_scan(300)
 
 
 def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
@@ -117,12 +128,12 @@ def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
 def test_every_image_is_taken_once_an_epoch_whatever_the_share():
     settings = settings_of(scans=SCANS)
     trainer = Trainer.begin(
-        with_echoes(settings), recorded_views(4), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
+        with_logits(settings), recorded_views(4), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
     )
     numbers = []
-    for trainer.step in range(16):
-        if not trainer.fits_scan:
-            numbers.append(trainer.images.number(trainer._images_done))
+    for step in range(16):
+        if not trainer.schedule.fits_scan(step):
+            numbers.append(trainer.images.number(step))
     assert len(numbers) == 8 and sorted(numbers[:4]) == sorted(numbers[4:]) == [0, 1, 2, 3]
 
 
@@ -177,16 +188,16 @@ def nothing_met(scan) -> torch.Tensor:
     return torch.zeros_like(scan.range)
 
 
-def with_echoes(settings: TrainSettings, offsets: bool = False) -> SplatModel:
-    """The untrained model of `untrained`, with echoes."""
-    return untrained(settings, echo=initial_echo([scan_of_a_wall()]), offsets=offsets)
+def with_logits(settings: TrainSettings, offsets: bool = False) -> SplatModel:
+    """The untrained model of `untrained`, with a LiDAR's logits."""
+    return untrained(settings, lidar_logits=initial_lidar_logits([scan_of_a_wall()]), offsets=offsets)
 
 
-def test_initial_echoes_are_the_recorded_intensity_and_a_likely_return():
-    intensity, returned = (torch.tensor(logit).sigmoid().item() for logit in initial_echo([scan_of_a_wall()]))
+def test_initial_lidar_logits_are_the_recorded_intensity_and_a_likely_return():
+    intensity, returned = (torch.tensor(logit).sigmoid().item() for logit in initial_lidar_logits([scan_of_a_wall()]))
     assert intensity == pytest.approx(0.3, abs=1e-4) and returned == pytest.approx(0.9)
     without = dataclasses.replace(scan_of_a_wall().scan, intensities=None)
-    unknown = initial_echo([dataclasses.replace(scan_of_a_wall(), scan=without)])
+    unknown = initial_lidar_logits([dataclasses.replace(scan_of_a_wall(), scan=without)])
     assert torch.tensor(unknown[0]).sigmoid().item() == pytest.approx(0.5)
 
 
@@ -196,7 +207,7 @@ def test_the_beam_spread_is_in_radians():
 
 def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
     settings = settings_of(iterations=120, scans=ScanTrainingSettings(per_image=1.0), opacity_reg=0.0, scale_reg=0.0)
-    model, recorded = with_echoes(settings), [scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)]
+    model, recorded = with_logits(settings), [scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)]
     scans = load_scans(recorded, settings.scans, CPU)
 
     summary = train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "a"), scans=scans)
@@ -218,14 +229,14 @@ def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[
     """A trainer after one of 8 iterations, or with `fine_tune` one of those that follow, which fitted a scan; and the
     names of the parameters that it changed, by part."""
     settings = settings_of(iterations=4, scans=ScanTrainingSettings(per_image=1.0, **scans))
-    still = with_echoes(settings, offsets=settings.scans.fine_tune > 0)
-    model = untrained_street(settings, echo=(0.0, 2.0)) if street else still
+    still = with_logits(settings, offsets=settings.scans.fine_tune > 0)
+    model = untrained_street(settings, lidar_logits=(0.0, 2.0)) if street else still
     recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
     trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=recorded)
     before = {part.name: {k: v.detach().clone() for k, v in learnable(part).items()} for part in model.parts}
-    trainer.step = step
-    assert trainer.fits_scan
-    terms, picture, view = trainer.training_step(with_picture=trainer.fine_tunes)
+    trainer.state.step = step
+    assert trainer.schedule.fits_scan(step)
+    terms, picture, view = trainer.training_step(with_picture=trainer.schedule.fine_tunes(step))
     assert picture is None and view is None and "scan_range" in terms
     trainer.densify(picture)
     changed = {
@@ -239,13 +250,13 @@ def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[
 def test_scans_leave_the_geometry_alone_where_they_are_told_to(fine_tune):
     """The noise of MCMC moves Gaussians in any case."""
     _, changed = changed_by_a_scan(1, geometry=0.0, fine_tune=fine_tune)
-    assert changed["background"] - {"means"} == {"echoes"}
+    assert changed["background"] - {"means"} == {"lidar_logits"}
 
 
 def test_fine_tuning_changes_what_the_lidar_alone_sees():
     trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.5)
-    assert changed == {"background": {"echoes", *OFFSETS.values()}, "actors": {"echoes"}}
-    assert trainer.step == 9 and trainer.fine_tunes
+    assert changed == {"background": {"lidar_logits", *OFFSETS.values()}, "actors": {"lidar_logits"}}
+    assert trainer.state.step == 9 and trainer.schedule.fine_tunes(9)
     _, before = changed_by_a_scan(7, street=True, fine_tune=0.5)
     assert {"translation", "yaw"} & before["actors"], "tracks are corrected by scans until then"
     assert not before["background"] & {*OFFSETS.values()} and "scales" in before["background"]
@@ -261,7 +272,7 @@ def test_checks_go_on_during_fine_tuning_and_densification_does_not(tmp_path, mo
     monkeypatch.setattr(IterationGraphs, "check", lambda _: checked.append(None))
     monkeypatch.setattr(Background, "confine", lambda _: confined.append(None))
     train(
-        with_echoes(settings, offsets=True), recorded_views(2), settings, 0, CPU, folders_of(tmp_path, "a"),
+        with_logits(settings, offsets=True), recorded_views(2), settings, 0, CPU, folders_of(tmp_path, "a"),
         scans=recorded,
     )  # fmt: skip
     assert (len(checked), len(confined)) == (4, 2)
@@ -270,17 +281,17 @@ def test_checks_go_on_during_fine_tuning_and_densification_does_not(tmp_path, mo
 def test_the_rates_of_fine_tuning_decay():
     settings = settings_of(iterations=40, scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.5))
     recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
-    trainer = Trainer.begin(with_echoes(settings, offsets=True), recorded_views(4), settings, 0, CPU, scans=recorded)
-    (group,) = trainer.optimizers.parts
-    rates = trainer.model.parts[0].learning_rates()
+    trainer = Trainer.begin(with_logits(settings, offsets=True), recorded_views(4), settings, 0, CPU, scans=recorded)
+    (group,) = trainer.state.optimizers.parts
+    rates = trainer.state.model.parts[0].learning_rates()
 
     def share_of_rate(step: int, name: str) -> float:
-        trainer.step = step
-        trainer._set_learning_rates()
+        trainer.state.step = step
+        trainer.state.begin_step()
         return group[name].param_groups[0]["lr"] / rates[name]
 
     assert [share_of_rate(step, "means") for step in (0, 40)] == pytest.approx([1.0, 0.1]), "ends with the images"
-    assert [share_of_rate(step, "echoes") for step in (79, 80, 90)] == pytest.approx([1.0, 6.0, 0.6])
+    assert [share_of_rate(step, "lidar_logits") for step in (79, 80, 90)] == pytest.approx([1.0, 6.0, 0.6])
     assert [share_of_rate(step, "lidar_scales") for step in (80, 90)] == pytest.approx([6.0, 0.6])
     assert [share_of_rate(step, "lidar_means") for step in (80, 90)] == pytest.approx([0.5, 0.05])
 
@@ -290,7 +301,7 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
     scans = ScanTrainingSettings(per_image=1 / 3, geometry=0.0, fine_tune=4 / 3, range_weight=1.0)
     settings = settings_of(iterations=60, scans=scans)
     recorded = load_scans([scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)], scans, CPU)
-    model, views = with_echoes(settings, offsets=True), recorded_views(4)
+    model, views = with_logits(settings, offsets=True), recorded_views(4)
     trainer = Trainer.begin(model, views, settings, 0, CPU, scans=recorded)
 
     @torch.no_grad()
@@ -298,11 +309,11 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
         picture, scan = model.scan(recorded[1].view), recorded[1]
         return model.render(views[0].view).image, float((picture.range - scan.range)[scan.returned].abs().median())
 
-    while not trainer.fine_tunes:
+    while not trainer.schedule.fine_tunes(trainer.state.step):
         _, picture, _ = trainer.training_step(with_picture=False)
         trainer.densify(picture)
     image, error = image_and_error()
-    while trainer.step < trainer.iterations:
+    while trainer.state.step < trainer.schedule.steps:
         _, picture, _ = trainer.training_step(with_picture=True)
         trainer.densify(picture)
     again, better = image_and_error()
@@ -314,38 +325,38 @@ def scan_trainer(factor: float = 0.25) -> Trainer:
     of_scans = ScanTrainingSettings(per_image=1.0, fine_tune=0.2, geometry=factor)
     settings = settings_of(iterations=300, scans=of_scans)
     scans, views = load_scans([scan_of_a_wall()], settings.scans, CPU), recorded_views(2)
-    return Trainer.begin(with_echoes(settings, offsets=True), views, settings, 0, CPU, scans=scans)
+    return Trainer.begin(with_logits(settings, offsets=True), views, settings, 0, CPU, scans=scans)
 
 
 @pytest.mark.parametrize("factor", [0.25, 0.0])
 def test_a_factor_scales_the_gradients_of_what_images_show(factor):
     trainer = scan_trainer(factor)
-    params = trainer.model.parts[0].params
+    params = trainer.state.model.parts[0].params
     for parameter in params.values():
         parameter.grad = torch.ones_like(parameter)
-    trainer._limit_gradients()
+    limit_geometry(trainer.state.model, factor)
     for name in ("means", "quats", "scales", "opacities"):
         if factor:
             assert (params[name].grad == factor).all(), name
         else:
             assert params[name].grad is None, "a step of Adam would move it on"
-    assert (params["echoes"].grad == 1.0).all()
+    assert (params["lidar_logits"].grad == 1.0).all()
 
 
 @pytest.mark.parametrize(
     ("step", "learned"),
     [
         pytest.param(0, {"means", "quats", "scales", "opacities", "sh0"}, id="an image"),
-        pytest.param(1, {"means", "quats", "scales", "opacities", "echoes"}, id="a scan"),
-        pytest.param(600, {"echoes", *OFFSETS.values()}, id="fine-tuning"),
+        pytest.param(1, {"means", "quats", "scales", "opacities", "lidar_logits"}, id="a scan"),
+        pytest.param(600, {"lidar_logits", *OFFSETS.values()}, id="fine-tuning"),
     ],
 )
 def test_each_kind_of_iteration_learns_its_own_parameters(step, learned):
     trainer = scan_trainer()
-    params = trainer.model.parts[0].params
+    params = trainer.state.model.parts[0].params
     before = {name: parameter.detach().clone() for name, parameter in params.items()}
-    trainer.step = step
-    assert trainer.fits_scan == (step > 0) and trainer.fine_tunes == (step == 600)
+    trainer.state.step = step
+    assert trainer.schedule.fits_scan(step) == (step > 0) and trainer.schedule.fine_tunes(step) == (step == 600)
     trainer.training_step(with_picture=False)
     assert {name for name, parameter in params.items() if not torch.equal(parameter, before[name])} == learned
 
@@ -353,16 +364,16 @@ def test_each_kind_of_iteration_learns_its_own_parameters(step, learned):
 def test_another_training_of_the_same_model_learns_everything_again(tmp_path):
     """Whatever the last iteration of the first one had left constant."""
     settings = settings_of(iterations=4, scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.5))
-    model, scans = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
+    model, scans = with_logits(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
     learned = make_optimizers(model).parts[0].keys()
     train(model, recorded_views(2), settings, 0, CPU, folders_of(tmp_path, "a"), scans=scans)
-    assert make_optimizers(model).parts[0].keys() == learned >= {"means", "echoes", *OFFSETS.values()}
+    assert make_optimizers(model).parts[0].keys() == learned >= {"means", "lidar_logits", *OFFSETS.values()}
 
 
 def test_cameras_do_not_see_what_lidar_sees_elsewhere():
     """Offsets of all background Gaussians by 0.5 m along the rays: the wall is farther for the LiDAR alone."""
     settings = settings_of(scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.2), antialiased=False)
-    model, (scan,) = with_echoes(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
+    model, (scan,) = with_logits(settings, offsets=True), load_scans([scan_of_a_wall()], settings.scans, CPU)
     (view, *_) = recorded_views(1)
     image, range_before = model.render(view.view).image, model.scan(scan.view).range
     with torch.no_grad():
@@ -380,9 +391,9 @@ def test_cameras_do_not_see_what_lidar_sees_elsewhere():
 def test_an_iteration_whose_picture_is_wanted_fits_an_image():
     settings = settings_of(scans=SCANS)
     trainer = Trainer.begin(
-        with_echoes(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
+        with_logits(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
     )
-    trainer.step = 1
+    trainer.state.step = 1
     terms, picture, view = trainer.training_step(with_picture=True)
     assert picture is not None and view is not None and "l1" in terms
 
@@ -390,7 +401,7 @@ def test_an_iteration_whose_picture_is_wanted_fits_an_image():
 def test_scans_need_densification_by_mcmc():
     with pytest.raises(ValidationError, match=r"scans\.per_image needs strategy: mcmc"):
         TrainSettings(strategy="default", scans=SCANS)
-    assert untrained(settings_of()).parts[0].echoes(0.0) is None
+    assert "lidar_logits" not in untrained(settings_of()).parts[0].params
 
 
 def test_seed_points_are_added_where_scans_alone_met_static_surfaces():

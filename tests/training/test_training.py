@@ -68,13 +68,13 @@ from drivesplat.settings.train import (
 )
 from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.training import resume_state
+from drivesplat.training.loop import Trainer, TrainingSummary, train
 from drivesplat.training.monitor import NEVER, FiniteGuard, Monitor
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.probes import Probes
 from drivesplat.training.road import driven_road
-from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
-from drivesplat.training.train import TrainingSummary, train
-from drivesplat.training.trainer import Trainer
+from drivesplat.training.schedule import Schedule
+from drivesplat.training.stage import TrainingFiles, mean_sky_color, run_training
 from drivesplat.training.views import Supervision, TrainingView, load_views, view_index
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -183,7 +183,7 @@ def test_actors_learn_with_the_background_but_for_those_that_are_absent():
     before = {name: value.detach().clone() for name, value in model.named_parameters()}
     for _ in range(15):
         trainer.training_step()
-        trainer.step += 1
+        trainer.state.step += 1
     moved = {name: (value.detach() - before[name]).abs() for name, value in model.named_parameters()}
     first, second = (model.parts[1].params["owner"] == i for i in (0, 1))
     for name in ("means", "scales", "opacities", "sh0", "shN"):
@@ -202,7 +202,7 @@ def test_a_degree_that_is_not_shown_as_yet_does_not_learn():
     trainer = Trainer.begin(model, recorded_views(), settings, 0, CPU)
     for _ in range(5):
         trainer.training_step()
-        trainer.step += 1
+        trainer.state.step += 1
     assert all(part.params["shN"].numel() and not part.params["shN"].any() for part in model.parts)
 
 
@@ -244,13 +244,13 @@ def test_gaussians_below_the_road_fade_where_wanted(tmp_path, fades):
 def test_an_iteration_with_dropout_leaves_out_static_gaussians_and_others_next_time():
     settings = settings_of(dropout=0.3)
     trainer = Trainer.begin(untrained_street(settings), recorded_views(), settings, 0, CPU)
-    still, _ = trainer.model.rows
+    still, _ = trainer.state.model.rows
     left_out = []
     for _ in range(2):
         _, picture, _ = trainer.training_step()
         left_out.append(picture.shapes.opacities[still] == 0.0)
     assert all(0.1 < float(mask.float().mean()) < 0.5 for mask in left_out) and not torch.equal(*left_out)
-    assert (trainer.model.gaussians_at(0.0).opacities[still] > 0.0).all()
+    assert (trainer.state.model.at(0.0).opacities[still] > 0.0).all()
 
 
 @pytest.mark.parametrize(("limit", "farthest"), [(50.0, 50.0), (None, 7e5)])
@@ -275,7 +275,7 @@ def test_a_training_applies_the_flatness_and_road_losses():
     poses[:, 2, 3], poses[:, 0, 3] = 4.5, [-1.0, 1.0]
     road = driven_road(poses, settings.road)
     trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, road)
-    before = trainer.model.gaussians_at(0.0)
+    before = trainer.state.model.at(0.0)
     terms, *_ = trainer.training_step()
     torch.testing.assert_close(terms["flatness"], 0.2 * before.scales.amin(dim=1).mean())
     assert float(terms["road"].detach()) > 0.0
@@ -311,7 +311,7 @@ def test_positions_learn_ever_more_slowly(step, factor):
     model = untrained(settings_of())
     optimizers = make_optimizers(model)
     before = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
-    set_learning_rates(model, optimizers, step / 100, settings_of(iterations=100))
+    set_learning_rates(model, optimizers, Schedule.of(settings_of(iterations=100), 1), step)
     after = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
     assert after.pop("0.means") == pytest.approx(2e-3 * factor)
     assert after == {name: rate for name, rate in before.items() if name != "0.means"}
@@ -321,17 +321,17 @@ def test_positions_learn_ever_more_slowly(step, factor):
 def test_spherical_harmonics_gain_a_degree_at_a_time(step, degree):
     settings = settings_of(iterations=100, sh_every=0.1, gaussians=GaussianSettings(sh_degree=3))
     trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU)
-    trainer.step = step
-    assert trainer.sh_degree() == degree
+    trainer.state.step = step
+    assert trainer.state.sh_degree == degree
 
 
 @pytest.mark.parametrize(("still", "moving"), [(0, 2), (2, 1)])
 def test_the_degree_of_spherical_harmonics_grows_to_the_highest_of_any_part(still, moving):
     settings = settings_of(gaussians=GaussianSettings(sh_degree=still), actors=ActorSettings(sh_degree=moving))
     trainer = Trainer.begin(untrained_street(settings), recorded_views(), settings, 0, CPU)
-    assert [part.sh_degree for part in trainer.model.parts] == [still, moving]
-    trainer.step = settings.iterations
-    assert trainer.sh_degree() == max(still, moving)
+    assert [part.sh_degree for part in trainer.state.model.parts] == [still, moving]
+    trainer.state.step = settings.iterations
+    assert trainer.state.sh_degree == max(still, moving)
 
 
 # ---- the images
@@ -466,7 +466,7 @@ class TickingViews(EndingViews):
 @pytest.mark.parametrize(("apart", "kept"), [(0.0, 40), (20.5, 30), (39.5, 40), (100.0, None)])
 def test_resume_states_come_no_sooner_than_their_time(apart, kept, tmp_path, monkeypatch):
     views = TickingViews(recorded_views(), 45)
-    monkeypatch.setattr("drivesplat.training.train.time", SimpleNamespace(monotonic=lambda: views.seconds))
+    monkeypatch.setattr("drivesplat.training.loop.time", SimpleNamespace(monotonic=lambda: views.seconds))
     with pytest.raises(EndedError):
         trained(tmp_path, settings_of(checkpoint_every=10, min_checkpoint_interval_s=apart), views)
     state = tmp_path / "resume/state.npz"
@@ -477,7 +477,7 @@ def test_slow_iterations_are_saved_by_time_and_resume_to_the_same_result(uninter
     views = TickingViews(recorded_views(), 45)
     views.look_s = 3.3
     with monkeypatch.context() as patched, pytest.raises(EndedError):
-        patched.setattr("drivesplat.training.train.time", SimpleNamespace(monotonic=lambda: views.seconds))
+        patched.setattr("drivesplat.training.loop.time", SimpleNamespace(monotonic=lambda: views.seconds))
         trained(tmp_path, settings_of(checkpoint_every=1000), views)
     assert checkpoint_file.load(tmp_path / "resume/state.npz", "train")["step"] == 38, "each 19th look is past 60 s"
     again, summary = trained(tmp_path, settings_of(checkpoint_every=1000))

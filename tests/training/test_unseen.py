@@ -17,7 +17,7 @@ from drivesplat.model.view import View
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import ActorSettings
-from drivesplat.training.run import run_training
+from drivesplat.training.stage import run_training
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import TrainingView
 

@@ -59,7 +59,7 @@ def test_gaussians_with_their_centre_in_the_box_are_removed_at_any_size(place, g
     world = np.array(place) @ box.object_to_world[:3, :3].T + box.object_to_world[:3, 3]
     model = model_of(round_gaussians([world, [0.0, 0.0, 0.0]], size))
     for margin, goes in ((0.0, goes_without), (0.1, goes_with)):
-        removal = removal_of(model, model.gaussians_at(0.0), box, margin)
+        removal = removal_of(model, model.at(0.0), box, margin)
         assert removal.by == "box" and removal.removed.tolist() == [goes, False]
 
 
@@ -68,14 +68,14 @@ def test_of_an_actor_only_its_own_gaussians_are_removed():
     middle = box.object_to_world[:3, 3]
     parts = round_gaussians([middle, middle + 50.0]), Own(round_gaussians([middle, middle + 9.0]), "it")
     model = model_of(*parts, Own(round_gaussians([middle]), "another"))
-    removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
+    removal = removal_of(model, model.at(0.0), box, 0.1)
     assert removal.by == "actor" and removal.removed.tolist() == [False, False, True, True, False]
 
 
 def test_of_an_object_without_an_actor_the_box_is_emptied():
     box = turned_box()
     model = model_of(round_gaussians([box.object_to_world[:3, 3]]), Own(round_gaussians([[0.0, 0.0, 0.0]]), "another"))
-    removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
+    removal = removal_of(model, model.at(0.0), box, 0.1)
     assert removal.by == "box" and removal.removed.tolist() == [True, False]
 
 
@@ -85,7 +85,7 @@ class Discovered(Own):
     has_objects = True
 
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
-        return {self._track_id: RigidGroup(self.at(time), None)}
+        return {self._track_id: RigidGroup(self.sample(self.state(time)), None)}
 
 
 @pytest.mark.parametrize(("outside", "by"), [(1, "actor"), (3, "box")])
@@ -95,7 +95,7 @@ def test_a_discovered_object_is_removed_as_a_whole_if_most_of_it_lies_in_the_box
     middle = box.object_to_world[:3, 3]
     found = Discovered(round_gaussians([middle, middle, *[middle + 9.0] * outside]), "found_0001")
     model = model_of(round_gaussians([middle]), found, Discovered(round_gaussians([middle + 30.0]), "found_0002"))
-    removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
+    removal = removal_of(model, model.at(0.0), box, 0.1)
     own = [True] * (2 + outside) if by == "actor" else [True, True, *[False] * outside]
     assert removal.by == by and removal.removed.tolist() == [by == "box", *own, False]
 
@@ -104,13 +104,13 @@ def test_an_actor_without_gaussians_is_not_removed_by_its_box():
     """All of its Gaussians died in training: what lies in its box is not its own."""
     box = turned_box()
     model = model_of(round_gaussians([box.object_to_world[:3, 3]]), Own(round_gaussians([]), "it"))
-    removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
+    removal = removal_of(model, model.at(0.0), box, 0.1)
     assert removal.by == "actor" and removal.removed.tolist() == [False]
 
 
 def test_nothing_is_removed_of_an_empty_model():
     model = model_of(round_gaussians([]))
-    assert removal_of(model, model.gaussians_at(0.0), turned_box(), 0.1).removed.shape == (0,)
+    assert removal_of(model, model.at(0.0), turned_box(), 0.1).removed.shape == (0,)
 
 
 def one_car(tiny_scene: Scene, speed: float = 4.0) -> Scene:

@@ -13,8 +13,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.triton.pinhole import EPS2D, axes_in_camera, covariance, in_camera, in_image, rotation
-from drivesplat.kernels.triton.regularizers import write_means
-from drivesplat.kernels.triton.road_distance import distance_from_road, write_gradients
 from drivesplat.kernels.triton.rows import store_quaternion, store_three, store_two, three, two, unit
 from drivesplat.kernels.triton.tiles import MIN_ALPHA
 from drivesplat.kernels.triton.vectors import (
@@ -38,90 +36,71 @@ EXTENT = tl.constexpr(3.33)
 
 class ColoredProjection(torch.autograd.Function):
     """`drivesplat.kernels.colored_projection.project_with_colors`: means2d (1, n, 2), depths (1, n), conics (1, n, 3),
-    radii (1, n, 2), opacities (1, n), values (1, n, 3 or 4), the mean opacity, the mean scale, and the mean distance
-    from a road, None without `road`. `sets` holds TENSORS tensors of each set, `degrees` the degree up to which
-    harmonics of each are evaluated; `road` is the index of the set that lies on a road, that road, and its roughness.
-    Gradients reach all of `sets`."""
+    radii (1, n, 2), opacities (1, n) and values (1, n, 3 or 4). `sets` holds TENSORS tensors of each set, `degrees` the
+    degree up to which harmonics of each are evaluated. Gradients reach all of `sets`."""
 
     @staticmethod
     def forward(
         ctx: Any, viewmat: Tensor, K: Tensor, camera_to_world: Tensor, size: tuple[int, int], degrees: tuple[int, ...],
-        with_depth: bool, road: tuple[int, Any, float] | None, *sets: Tensor,
-    ) -> tuple[Tensor | None, ...]:  # fmt: skip
+        with_depth: bool, *sets: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
         camera = tuple(values.contiguous() for values in (viewmat, K, camera_to_world))
         given = tuple(values.contiguous() for values in sets)
         count, new = sum(len(means) for means in given[::TENSORS]), viewmat.new_empty
         means2d, depths, conics, opacities = (new(1, count, *tail) for tail in ((2,), (), (3,), ()))
         radii = torch.empty(1, count, 2, dtype=torch.int32, device=viewmat.device)
-        values, mean_opacity, mean_scale = new(1, count, 3 + with_depth), new(()), new(())
-        blocks = sum(triton.cdiv(len(means), BLOCK) for means in given[::TENSORS])
-        partial = new(2, blocks)
-        first, first_block = 0, 0
+        values, first = new(1, count, 3 + with_depth), 0
         for own, degree in zip(_by_set(given), degrees, strict=True):
             programs = triton.cdiv(len(own[0]), BLOCK)
             if programs:
                 _project[(programs,)](
-                    *own, *camera, means2d, depths, conics, radii, opacities, values, partial, len(own[0]), first,
-                    first_block, blocks, *size, own[5].shape[1], degree, with_depth, BLOCK,
+                    *own, *camera, means2d, depths, conics, radii, opacities, values, len(own[0]), first, *size,
+                    own[5].shape[1], degree, with_depth, BLOCK,
                 )  # fmt: skip
-            first, first_block = first + len(own[0]), first_block + programs
-        write_means(partial, mean_opacity, mean_scale, count)
-        distance, on_road = None, ()
-        if road is not None:
-            distance, on_road = distance_from_road(*_by_set(given)[road[0]][:4], *road[1:])
-        ctx.save_for_backward(*camera, radii, values, *on_road, *given)
+            first += len(own[0])
+        ctx.save_for_backward(*camera, radii, values, *given)
         ctx.options = (size, degrees, with_depth)
-        ctx.road = (None, 0.0, 0) if road is None else (road[0], road[2], len(on_road))
         ctx.mark_non_differentiable(depths, radii)
-        return means2d, depths, conics, radii, opacities, values, mean_opacity, mean_scale, distance
+        return means2d, depths, conics, radii, opacities, values
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        on_road_at, roughness, count = ctx.road
-        (*camera, radii, values), saved = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
-        on_road, sets = saved[:count], saved[count:]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (*camera, radii, values), sets = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
         size, degrees, with_depth = ctx.options
-        *given, v_distance = gradients
-        v_means2d, _, v_conics, _, *others = (gradient.contiguous() for gradient in given)
+        v_means2d, _, v_conics, _, *others = (gradient.contiguous() for gradient in gradients)
         found: list[Tensor] = []
         first = 0
-        for index, (own, degree) in enumerate(zip(_by_set(sets), degrees, strict=True)):
+        for own, degree in zip(_by_set(sets), degrees, strict=True):
             programs, above = triton.cdiv(len(own[0]), BLOCK), own[5].shape[1]
             v_own = [torch.empty_like(tensor) for tensor in own[:5]]
             v_own.append(torch.empty_like(own[5]) if above == 3 * degree else torch.zeros_like(own[5]))
             if programs:
                 _project_backward[(programs,)](
                     *own, *camera, radii, values, v_means2d, v_conics, *others, *v_own, len(own[0]), first,
-                    radii.shape[1], *size, above, degree, with_depth, BLOCK,
+                    *size, above, degree, with_depth, BLOCK,
                 )  # fmt: skip
-            if index == on_road_at:
-                write_gradients(own[:3], on_road, v_distance, v_own[:3], roughness, add=True)
             found, first = found + v_own, first + len(own[0])
-        return None, None, None, None, None, None, None, *found
+        return None, None, None, None, None, None, *found
 
 
 def _by_set(tensors: tuple[Tensor, ...]) -> list[tuple[Tensor, ...]]:
     return [tensors[at : at + TENSORS] for at in range(0, len(tensors), TENSORS)]
 
 
-@triton.jit(do_not_specialize=["count", "first", "first_block", "blocks", "width", "height"])
+@triton.jit(do_not_specialize=["count", "first", "width", "height"])
 @no_type_check
 def _project(
     means, quats, scales, opacities, sh0, shN, viewmat, K, camera_to_world, means2d, depths, conics, radii, opacities2d,
-    values, partial, count, first, first_block, blocks, width, height,
+    values, count, first, width, height,
     OTHERS: tl.constexpr, DEGREE: tl.constexpr, DEPTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the rows of one set, from row `first` on. A block writes its sum of opacities to the first row of
-    `partial`, from `first_block` on, and its sum of scales, without those of Gaussians of opacity 0, to the second. For
-    Gaussians out of view it writes only the opacity and a radius of 0."""
+    """Writes the rows of one set, from row `first` on; for Gaussians out of view only the opacity and a radius of
+    0."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid, row = i < count, first + i
     opacity, size = tl.load(opacities + i, mask=valid, other=0.0), three(scales, i, valid)
     tl.store(opacities2d + row, opacity, mask=valid)
-    length = tl.where(opacity > 0.0, size[0] + size[1] + size[2], 0.0)
-    tl.store(partial + first_block + tl.program_id(0), tl.sum(opacity))
-    tl.store(partial + blocks + first_block + tl.program_id(0), tl.sum(length))
 
     at = in_camera(three(means, i, valid), viewmat)
     z = at[2]
@@ -154,20 +133,17 @@ def _project(
     tl.store(values + place, shown, mask=seen[:, None] & (channel < 3 + DEPTH)[None, :])
 
 
-@triton.jit(do_not_specialize=["count", "first", "total", "width", "height"])
+@triton.jit(do_not_specialize=["count", "first", "width", "height"])
 @no_type_check
 def _project_backward(
     means, quats, scales, opacities, sh0, shN, viewmat, K, camera_to_world, radii, values, v_means2d, v_conics,
-    v_opacities2d, v_values, v_mean_opacity, v_mean_scale, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN,
-    count, first, total, width, height,
+    v_opacities2d, v_values, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN, count, first, width, height,
     OTHERS: tl.constexpr, DEGREE: tl.constexpr, DEPTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the gradients of one set, whose first row is `first` of `total` rows."""
+    """Writes the gradients of one set, whose first row is `first`."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     valid, row = i < count, first + i
-    present = tl.load(opacities + i, mask=valid, other=0.0) > 0.0
-    by_opacity = tl.load(v_opacities2d + row, mask=valid, other=0.0) + tl.load(v_mean_opacity) / total
-    tl.store(v_opacities + i, by_opacity, mask=valid)
+    tl.store(v_opacities + i, tl.load(v_opacities2d + row, mask=valid, other=0.0), mask=valid)
     wide, high = two(radii, row, valid)
     seen = (wide > 0) & (high > 0)
 
@@ -226,10 +202,9 @@ def _project_backward(
         turned_back(by_axes, (to_camera[0][2], to_camera[1][2], to_camera[2][2])),
     )
     by_size, by_quat = axes_gradient(by_rows, size, w, x, y, z, length)
-    mean = tl.where(present, tl.load(v_mean_scale) / (3.0 * total), 0.0)
     store_three(
-        v_scales, i, tl.where(seen, by_size[0], 0.0) + mean, tl.where(seen, by_size[1], 0.0) + mean,
-        tl.where(seen, by_size[2], 0.0) + mean, valid,
+        v_scales, i, tl.where(seen, by_size[0], 0.0), tl.where(seen, by_size[1], 0.0), tl.where(seen, by_size[2], 0.0),
+        valid,
     )  # fmt: skip
     store_quaternion(
         v_quats, i, tl.where(seen, by_quat[0], 0.0), tl.where(seen, by_quat[1], 0.0), tl.where(seen, by_quat[2], 0.0),

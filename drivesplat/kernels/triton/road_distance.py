@@ -1,6 +1,5 @@
 """The distance of Gaussians from a road in one pass, and its gradients in another."""
 
-from collections.abc import Sequence
 from typing import Any, no_type_check
 
 import torch
@@ -9,16 +8,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.triton.rows import quaternion, store_quaternion, store_three, three, unit
-from drivesplat.kernels.triton.vectors import (
-    added,
-    dot,
-    rotation_gradient,
-    rotation_rows,
-    scaled,
-    times,
-    turned_back,
-)
+from drivesplat.kernels.triton.rows import store_quaternion, store_three, three, unit
+from drivesplat.kernels.triton.vectors import dot, rotation_gradient, rotation_rows, scaled, times, turned_back
 
 BLOCK, SUMS = 256, 1024
 """Gaussians per program, and sums of such blocks that are read at a time."""
@@ -34,52 +25,27 @@ class TritonRoadDistance(torch.autograd.Function):
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, road: Any, roughness: float
     ) -> Tensor:
         given = tuple(values.contiguous() for values in (means, quats, scales))
-        distance, on_road = distance_from_road(*given, opacities.contiguous(), road, roughness)
-        ctx.save_for_backward(*given, *on_road)
+        planes = road.normals.contiguous(), road.offsets.contiguous(), road.weights.contiguous()
+        count, blocks = len(means), triton.cdiv(len(means), BLOCK)
+        cells = torch.empty(count, dtype=torch.int32, device=means.device)
+        partial, distance, weight = means.new_empty(2, blocks), means.new_empty(()), means.new_empty(())
+        grid, (rows, columns) = road.cells, road.cells.shape
+        _distances[(blocks,)](
+            *given, opacities.contiguous(), *planes, grid.keys, grid.lower, cells, partial, count, len(grid.keys),
+            rows, columns, grid.edge, road.reach, roughness, len(grid.keys).bit_length(), BLOCK,
+        )  # fmt: skip
+        _mean[(1,)](partial, distance, weight, blocks, SUMS)
+        ctx.save_for_backward(*given, *planes, cells, weight)
         ctx.roughness = roughness
         return distance
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_distance: Tensor) -> tuple[Tensor | None, ...]:
-        given, on_road = ctx.saved_tensors[:3], ctx.saved_tensors[3:]
-        gradients = tuple(torch.empty_like(values) for values in given)
-        write_gradients(given, on_road, v_distance, gradients, ctx.roughness, add=False)
+        saved = ctx.saved_tensors
+        gradients, count = [torch.empty_like(values) for values in saved[:3]], len(saved[0])
+        _distances_backward[(triton.cdiv(count, BLOCK),)](*saved, v_distance, *gradients, count, ctx.roughness, BLOCK)
         return *gradients, None, None, None
-
-
-def distance_from_road(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, road: Any, roughness: float
-) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """The distance of `TritonRoadDistance`, of contiguous tensors, and what `write_gradients` reads of the road: its
-    planes, the cell of each Gaussian, and the sum of weights."""
-    planes = road.normals.contiguous(), road.offsets.contiguous(), road.weights.contiguous()
-    count, blocks = len(means), triton.cdiv(len(means), BLOCK)
-    cells = torch.empty(count, dtype=torch.int32, device=means.device)
-    partial, distance, weight = means.new_empty(2, blocks), means.new_empty(()), means.new_empty(())
-    grid, (rows, columns) = road.cells, road.cells.shape
-    _distances[(blocks,)](
-        means, quats, scales, opacities, *planes, grid.keys, grid.lower, cells, partial, count, len(grid.keys),
-        rows, columns, grid.edge, road.reach, roughness, len(grid.keys).bit_length(), BLOCK,
-    )  # fmt: skip
-    _mean[(1,)](partial, distance, weight, blocks, SUMS)
-    return distance, (*planes, cells, weight)
-
-
-def write_gradients(
-    given: Sequence[Tensor],
-    on_road: Sequence[Tensor],
-    v_distance: Tensor,
-    gradients: Sequence[Tensor],
-    roughness: float,
-    add: bool,
-) -> None:
-    """Writes the gradients of means, quaternions and scales, which are `given`. With `add` adds those of Gaussians of
-    the road to what is there, and leaves others as they are."""
-    count = len(given[0])
-    _distances_backward[(triton.cdiv(count, BLOCK),)](
-        *given, *on_road, v_distance, *gradients, count, roughness, add, BLOCK
-    )
 
 
 @triton.jit(do_not_specialize=["count", "known", "rows", "columns", "edge", "reach", "roughness"])
@@ -135,9 +101,9 @@ def _mean(partial, distance, weight, blocks, BLOCK: tl.constexpr):
 @no_type_check
 def _distances_backward(
     means, quats, scales, normals, offsets, weights, cells, weight_sum, v_distance, v_means, v_quats, v_scales,
-    count, roughness, ADD: tl.constexpr, BLOCK: tl.constexpr,
+    count, roughness, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes all gradients; with ADD adds those of Gaussians of the road."""
+    """Writes all gradients."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     written = i < count
     cell = tl.load(cells + i, mask=written, other=-1)
@@ -156,11 +122,6 @@ def _distances_backward(
     radial = by_w * w + by_x * x + by_y * y + by_z * z
     by_w, by_x = (by_w - radial * w) / length, (by_x - radial * x) / length
     by_y, by_z = (by_y - radial * y) / length, (by_z - radial * z) / length
-    if ADD:
-        written = inside
-        by_mean, by_scale = added(by_mean, three(v_means, i, inside)), added(by_scale, three(v_scales, i, inside))
-        others = quaternion(v_quats, i, inside)
-        by_w, by_x, by_y, by_z = by_w + others[0], by_x + others[1], by_y + others[2], by_z + others[3]
     store_three(v_means, i, by_mean[0], by_mean[1], by_mean[2], written)
     store_three(v_scales, i, by_scale[0], by_scale[1], by_scale[2], written)
     store_quaternion(v_quats, i, by_w, by_x, by_y, by_z, written)

@@ -13,7 +13,7 @@ PRODUCTS = 2048
 
 
 class ColorsInWorld(torch.autograd.Function):
-    """`drivesplat.kernels.time_varying_colors.colors_in_world`; `series` and `rotations` are contiguous."""
+    """`drivesplat.kernels.placement.colors_in_world`; `series` and `rotations` are contiguous."""
 
     @staticmethod
     def forward(

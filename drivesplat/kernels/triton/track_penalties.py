@@ -15,7 +15,7 @@ BLOCK = 512
 
 
 class SumsOfSquares(torch.autograd.Function):
-    """`drivesplat.kernels.track_penalties.sums_of_squares`."""
+    """`drivesplat.kernels.regularizers.sums_of_squares`."""
 
     @staticmethod
     def forward(

@@ -2,9 +2,9 @@
 
 At 640x360 the GPU runs an iteration's hundreds of kernels faster than Python can launch them. A graph keeps the
 addresses of what it reads and writes, so it belongs to the inputs that images or LiDAR scans of one shape are copied
-into (`image_inputs`, `scan_inputs`), or to one image, and stays valid while the model's tensors keep their addresses:
-preallocated rows let the number of Gaussians grow meanwhile. A graph is captured after the first runs have shown how
-many entries its lists need.
+into (`drivesplat.training.graphs.inputs`), or to one image, and stays valid while the model's tensors keep their
+addresses: preallocated rows let the number of Gaussians grow meanwhile. A graph is captured after the first runs have
+shown how many entries its lists need.
 """
 
 import logging
@@ -15,16 +15,15 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import torch
-from torch import Tensor
 
 from drivesplat.kernels import capacity, cuda_graphs
 from drivesplat.kernels.cuda_graphs import CudaGraph, MemoryPool, capture, graphs_supported, new_pool
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
+from drivesplat.training.step import Terms
 
 log = logging.getLogger(__name__)
 
-Terms = dict[str, Tensor]
 T = TypeVar("T")
 MAX_RECORDINGS = 4096
 """A training with more images and scans captures nothing. Graphs of images read cached time states, up to three for

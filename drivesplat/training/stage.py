@@ -30,14 +30,12 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
-from drivesplat.training.dropout import dropout_share
+from drivesplat.training.augmentation import choose_mirrored, dropout_share
 from drivesplat.training.exposure_init import initial_gains
-from drivesplat.training.mirroring import choose_mirrored
-from drivesplat.training.probes import NO_PROBES, Probes
-from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
+from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
+from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, evenly_spaced
 from drivesplat.training.road import road_of
-from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
-from drivesplat.training.train import TrainingFolders, TrainingSummary, train
+from drivesplat.training.scans import TrainingScan, initial_lidar_logits, load_scans, with_scan_points
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import Supervision, TrainingView, load_views
 from drivesplat.trajectories.actor_record import ActorRecord, read_actors
@@ -181,7 +179,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         mean_sky_color(views),
         inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
-        initial_echo(inputs.scans) if job.train.scans.per_image else None,
+        initial_lidar_logits(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
     )
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device

@@ -12,7 +12,7 @@ from torch.optim import Adam
 
 from drivesplat.kernels import gsplat_private
 from drivesplat.kernels.relocation import relocation
-from drivesplat.model.part import Part
+from drivesplat.model.part import Part, preallocate
 
 INACTIVE = -1000.0
 """Log scale and opacity logit whose exponential and sigmoid are exactly 0 in single precision."""
@@ -33,7 +33,7 @@ def reserve_rows(part: Part, optimizers: dict[str, Adam], rows: int) -> None:
         return torch.cat([moments, moments.new_zeros(more, *moments.shape[1:])])
 
     gsplat_private.update_parameters(longer, unmoved, part.params, optimizers)
-    part.preallocated = rows - active
+    preallocate(part, rows - active)
 
 
 @torch.no_grad()
@@ -45,7 +45,7 @@ def release_rows(part: Part, optimizers: dict[str, Adam]) -> None:
         return nn.Parameter(values[:active].clone(), requires_grad=values.requires_grad)
 
     gsplat_private.update_parameters(shorter, lambda _, moments: moments[:active].clone(), part.params, optimizers)
-    part.preallocated = 0
+    preallocate(part, 0)
 
 
 @torch.no_grad()
@@ -62,4 +62,4 @@ def activate(part: Part, count: int, binoms: Float[Tensor, "n_max n_max"], min_o
     params["scales"][drawn] = torch.log(scales)
     for values in params.values():
         values[active : active + count] = values[drawn]
-    part.preallocated -= count
+    preallocate(part, part.preallocated - count)

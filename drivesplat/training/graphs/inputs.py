@@ -1,10 +1,11 @@
-"""The inputs of captured iterations with images: one graph serves all images of the same shape.
+"""The inputs of captured steps: one graph serves all images of the same shape, another all LiDAR scans of one shape.
 
 A capture takes as long as ten replays. A graph for each image would be captured again whenever the graphs become
-invalid: with 31 images that took a quarter of 3,500 iterations. The graph therefore reads inputs of its own, as those
-of LiDAR scans do (`scan_inputs`), into which the image of each iteration is copied.
+invalid: with 31 images that took a quarter of 3,500 steps. The graph therefore reads inputs of its own, into which the
+image or scan of each step is copied.
 """
 
+import copy
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,23 +14,24 @@ import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
-from drivesplat.model.time_states import TimeStates
+from drivesplat.model.states import ModelStates, copied, tensors_of
 from drivesplat.training.coarse_to_fine import TrainingImages
+from drivesplat.training.scans import TrainingScan
 from drivesplat.training.views import LidarDepth, TrainingView
 
 MEASURED, MEASURED_OF_CAMERA = 8, 4
-"""Iterations with images before one is captured: they measure the entries that the lists of any need. Where each camera
-has graphs of its own, a camera's share of the first, but no fewer than the second."""
+"""Steps with images before one is captured: they measure the entries that the lists of any need. Where each camera has
+graphs of its own, a camera's share of the first, but no fewer than the second."""
 
 
 @dataclass(frozen=True)
 class ImageInputs:
-    """An image with its camera, and the time states of the parts, whose tensors have the addresses that a graph reads;
+    """An image with its camera, and the states of the parts, whose tensors have the addresses that a graph reads;
     `number` counts the shapes of images."""
 
     number: int
     image: TrainingView
-    states: TimeStates
+    states: ModelStates
 
     @property
     def view(self) -> TrainingView:
@@ -39,8 +41,8 @@ class ImageInputs:
 
 @dataclass
 class SharedImageInputs:
-    """The inputs of graphs, by shape, for the `images` of a training; of each camera its own where an iteration depends
-    on the camera's name (`by_camera`)."""
+    """The inputs of graphs, by shape, for the `images` of a training; of each camera its own where a step depends on
+    the camera's name (`by_camera`)."""
 
     images: TrainingImages
     by_camera: bool
@@ -48,12 +50,12 @@ class SharedImageInputs:
 
     @cached_property
     def measured(self) -> int:
-        """The number of iterations before one is captured."""
+        """The number of steps before one is captured."""
         cameras = len({image.view.camera for image in self.images.views}) if self.by_camera else 1
         return max(1, min(max(MEASURED // cameras, MEASURED_OF_CAMERA), len(self.images.views) // cameras))
 
-    def load(self, image: TrainingView, states: TimeStates) -> ImageInputs:
-        """The inputs of this shape, which hold an image and its time states from now on."""
+    def load(self, image: TrainingView, states: ModelStates) -> ImageInputs:
+        """The inputs of this shape, which hold an image and its states from now on."""
         given = _tensors(image, states)
         camera = image.view.camera if self.by_camera else None
         shape = (camera, image.lidar is None, *_masks(image), *((values.shape, values.dtype) for values in given))
@@ -65,13 +67,13 @@ class SharedImageInputs:
             _load_depths(own.image.lidar, image.lidar)
         return own
 
-    def _copied(self, image: TrainingView, states: TimeStates) -> ImageInputs:
-        """New inputs, with the shape of an image and its time states."""
+    def _copied(self, image: TrainingView, states: ModelStates) -> ImageInputs:
+        """New inputs, with the shape of an image and its states."""
         view = replace(image.view, K=image.view.K.clone(), camera_to_world=image.view.camera_to_world.clone())
         copies = {name: mask.clone() for name, mask in _masks(image).items()}
         lidar = None if image.lidar is None else self._room_for(image.lidar)
         own = replace(image, view=view, pixels=image.pixels.clone(), lidar=lidar, **copies)
-        return ImageInputs(len(self._by_shape), own, [[values.clone() for values in state] for state in states])
+        return ImageInputs(len(self._by_shape), own, copied(states))
 
     def _room_for(self, lidar: LidarDepth) -> LidarDepth:
         """Depth of this kind, with room for that of any image."""
@@ -81,15 +83,14 @@ class SharedImageInputs:
 
 
 def can_share(image: TrainingView) -> bool:
-    """Whether an iteration with an image depends on nothing but its tensors, the parts' time states and, with
-    exposures, the name of its camera. Otherwise Python looks up what belongs to its time: its graph serves no other."""
+    """Whether a step with an image depends on nothing but its tensors, the parts' states and, with exposures, the name
+    of its camera. Otherwise Python looks up what belongs to its time: its graph serves no other."""
     return image.view.shutter is None and image.classes is None
 
 
-def _tensors(image: TrainingView, states: TimeStates) -> list[Tensor]:
-    """All tensors of an image but LiDAR depth, and those of time states, in a fixed order."""
-    masks = _masks(image).values()
-    return [image.view.K, image.view.camera_to_world, image.pixels, *masks, *(v for state in states for v in state)]
+def _tensors(image: TrainingView, states: ModelStates) -> list[Tensor]:
+    """All tensors of an image but LiDAR depth, and those of states, in a fixed order."""
+    return [image.view.K, image.view.camera_to_world, image.pixels, *_masks(image).values(), *tensors_of(states)]
 
 
 def _masks(image: TrainingView) -> dict[str, Tensor]:
@@ -104,3 +105,36 @@ def _load_depths(own: LidarDepth, given: LidarDepth) -> None:
     own.depth[:count].copy_(given.depth)
     if own.count is not None:
         own.count.fill_(count)
+
+
+@dataclass(frozen=True)
+class ScanInputs:
+    """A scan and the states of the parts, whose tensors have the addresses that a graph reads; `number` counts the
+    shapes of scans."""
+
+    number: int
+    scan: TrainingScan
+    states: ModelStates
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All tensors, in a fixed order."""
+        return [*self.scan.tensors, *tensors_of(self.states)]
+
+
+@dataclass
+class SharedScanInputs:
+    """The inputs of graphs, by shape."""
+
+    _by_shape: dict[Hashable, ScanInputs] = field(default_factory=dict)
+
+    def load(self, scan: TrainingScan, states: ModelStates) -> ScanInputs:
+        """The inputs of this shape, which hold a scan and its states from now on."""
+        given = [*scan.tensors, *tensors_of(states)]
+        shape = tuple((values.shape, values.dtype) for values in given)
+        own = self._by_shape.get(shape)
+        if own is None:
+            own = self._by_shape[shape] = ScanInputs(len(self._by_shape), copy.deepcopy(scan), copied(states))
+        else:
+            torch_private.copy_all(own.tensors, given)
+        return own

@@ -1,1 +1,0 @@
-"""Training iterations as CUDA graphs, and the rows preallocated for them."""
