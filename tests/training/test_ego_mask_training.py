@@ -39,7 +39,7 @@ from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, MaskSettings
 from drivesplat.settings.train import TrainJob
-from drivesplat.training import run
+from drivesplat.training import stage
 from drivesplat.training.stage import TrainingInputs, read_inputs, run_training
 from drivesplat.training.views import Supervision, TrainingView, load_views
 
@@ -103,7 +103,7 @@ def views_given(monkeypatch, folder: Path, inputs: TrainingInputs, job: TrainJob
         given.extend(views)
         raise EndedError
 
-    monkeypatch.setattr(run, "train", begin)
+    monkeypatch.setattr(stage, "train", begin)
     with pytest.raises(EndedError):
         run_training(inputs, job, DeviceSettings(kind="cpu"), files_in(folder / "it"), PROVENANCE, "train")
     return given
