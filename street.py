@@ -5,7 +5,7 @@
     python street.py results/0061  # a recorded drive with the workflow's defaults, on a GPU
 
 After Street Gaussians (Yan et al. 2024, arXiv 2401.01339). What a camera sees at a time consists of
-    background  static Gaussians in the world, at first one for each coloured LiDAR point (`Part`);
+    background  static Gaussians in the world, at first one for each seed point, mostly of LiDAR (`Part`);
     actors      Gaussians of moving vehicles in the frames of their boxes, which tracks place in the world (`Actors`);
     sky         a cube map behind both (`Sky`).
 `Street.render` shows them, `losses` compares that with an image and its LiDAR depth, `train` learns by Adam and MCMC
@@ -53,8 +53,8 @@ Picture = namedtuple("Picture", "image alpha depth actors_alpha gaussians")
 """(h, w, 3) with the sky, (h, w) of all Gaussians, (h, w) metres, (h, w) of actors alone or None, and `Gaussians`."""
 View = namedtuple("View", "K camera_to_world pixels sky ego static moving dynamic lidar_pixels lidar_depth time")
 """An image: (3, 3), pixels with centres at halves; (4, 4); (h, w, 3) uint8; masks (h, w) of the sky, the ego vehicle,
-static pixels, moving vehicles, these and moving people; row-major indices (k,) of pixels with LiDAR depth (k,) in
-metres along the optical axis; seconds since the first image."""
+static pixels (no box of a vehicle, person or animal; with sky), moving vehicles, these and moving people; row-major
+indices (k,) of pixels with LiDAR depth (k,) in metres along the optical axis; seconds since the first image."""
 
 
 def read_views(folder: Path, record: dict, images: np.ndarray, device: torch.device) -> list[View]:
@@ -155,7 +155,7 @@ class Part:
             rows = old[source]
             new = torch.cat([old, rows]) if target is None else old.index_copy(0, target, rows)
             p[name] = nn.Parameter(new, old.requires_grad)
-            if name in self.adam:  # new Gaussians have no moments, and those that were copied lose theirs
+            if name in self.adam:  # as gsplat: added copies have no moments; those of relocated sources are lost
                 state = self.adam[name].state.pop(old)
                 for key in ("exp_avg", "exp_avg_sq"):
                     m = state[key]
@@ -181,14 +181,14 @@ class Actors(Part):
         super().__init__(params, float(np.median(np.linalg.norm(sizes, axis=1))), cap, args, device)
         self.reach = torch.from_numpy(0.5 * sizes + 0.1).float().to(device)  # (a, 3) metres: Gaussians lie within
         self.motions, self.states = [actor.motion for actor in actors], {}
-        self.runs = [last + 1 - first for motion in self.motions for first, last in motion.runs]  # without gaps
+        self.runs = [last + 1 - first for motion in self.motions for first, last in motion.runs]  # annotations each
         zeros = (torch.zeros(sum(self.runs), *row, device=device) for row in ((3,), ()))
         self.translation, self.yaw = map(nn.Parameter, zeros)
         self.adam |= {name: Adam([getattr(self, name)], RATES[name]) for name in ("translation", "yaw")}
 
     def state_at(self, time: float) -> list[Tensor]:
         """Of each actor: its pose by annotations as quaternion (a, 4) and translation (a, 3), their weights in it
-        (a, m), presence (a,), and cos(i π t / T) (a, 5), where t runs from 0 to T over its track."""
+        (a, m), presence (a,), 0 or 1, and cos(i π t / T) (a, 5), where t runs from 0 to T over its track."""
         if time not in self.states:
             at, motions = np.array([time]), self.motions
             poses = np.concatenate([motion.poses(at) for motion in motions])
@@ -331,7 +331,7 @@ def losses(picture: Picture, view: View, model: Street) -> dict[str, Tensor]:
 def train(model: Street, views: list[View], cameras: int) -> None:
     """Fits the model to images of so many cameras, each of which is shown once before any is shown again."""
     args, parts, sums, count = model.args, model.parts, [], 0
-    dropout = 0.2 * min(1.0, 20 * cameras / len(views))  # many images overfit less
+    dropout = 0.2 * min(1.0, 20 * cameras / len(views))  # few images overfit
     torch.manual_seed(args.seed)
     for step in range(args.iterations):
         epoch, place = divmod(step, len(views))

@@ -1,6 +1,6 @@
 # Exports for other programs: the Gaussians, with the recorded trajectory.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl.
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.npz.
 # OUTPUTS: <results>/{scene}/{method}/splat.ply, cameras.json, transforms.json, parts/parts.json (and the PLYs beside
 # it); scene.usdz; viewer.html; colmap/; splat.spz; splat.sog. `export.formats` says which of them `all` and `exports`
 # make. far.npz, which all of them but colmap/ read.
@@ -13,7 +13,7 @@ rule far_gaussians:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
     output:
         far="<results>/{scene}/{method}/far.npz",
     log:
@@ -44,7 +44,7 @@ rule export:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
     output:
         splat="<results>/{scene}/{method}/splat.ply",
         cameras="<results>/{scene}/{method}/cameras.json",
@@ -102,7 +102,7 @@ rule export_viewer:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
     output:
         viewer=report(
             "<results>/{scene}/{method}/viewer.html",
@@ -133,7 +133,7 @@ rule export_colmap:
     """
     input:
         scene=plan.scene,
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
     output:
         cameras="<results>/{scene}/{method}/colmap/cameras.txt",
         images="<results>/{scene}/{method}/colmap/images.txt",

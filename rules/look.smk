@@ -1,6 +1,6 @@
 # Pictures and films of trained methods: trajectories, ghosts of moving vehicles, removal of a vehicle, LiDAR scans.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl, masks/; actors.npz if a method has
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.npz, masks/; actors.npz if a method has
 # actors, scans.npz if it renders LiDAR.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png, compare.mp4 and compare.json;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
@@ -16,7 +16,7 @@ rule tracks:
     """
     input:
         scene=plan.scene,
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
         masks=plan.of_tracks("masks/masks.json"),
         actors=plan.actors,
     output:
@@ -124,7 +124,7 @@ rule truth_film:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.annotated_scene,
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
         masks="<results>/{scene}/masks/masks.json",
         truth=plan.truth,
     output:
@@ -203,7 +203,7 @@ rule ghost_panel:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.shown_scene,
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
         masks=plan.shown_masks,
     output:
         panel=report(
@@ -241,7 +241,7 @@ rule remove_actor:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.shown_scene,
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
         masks=plan.shown_masks,
     output:
         with_car="<results>/{scene}/{method}/with_car.png",

@@ -1,6 +1,6 @@
 # Measures trained methods on held-out images, by annotated tracks whatever a method trains with.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl; with cameras masks/, without scans.npz; where a
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.npz; with cameras masks/, without scans.npz; where a
 # method has discovered tracks discovered.json.
 # OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;
 # <results>/{scene}/metrics.json; where a method renders LiDAR <results>/{scene}/scan_baselines.json;
@@ -40,7 +40,7 @@ rule evaluate:
         truth=plan.truth,
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
         masks="<results>/{scene}/masks/masks.json",
         scans=plan.measured_scans,
         lpips=plan.lpips_record,
@@ -102,7 +102,7 @@ rule evaluate_scans:
         scene=plan.annotated_scene,
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",
-        parser=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
         scans="<results>/{scene}/scans.npz",
     output:
         metrics="<results>/{scene}/{method}/eval.json",

@@ -1,7 +1,7 @@
 # Preprocessing: from a dataset's tables to the inputs of a training.
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
-# OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
+# OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl and parser.npz, masks/masks.json (and the PNGs beside it);
 # where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
 # lidar_depth.npz and scans.npz. The scene of all rules after these (plan.scene) is the refined one where there is one.
 # What depends on tracks is made for each kind of tracks that methods train with (tracks.smk): the wildcard {tracks} is
@@ -122,14 +122,15 @@ rule lidar_seed:
 
 rule parser:
     """
-    Combines cameras, splits and seed into the dictionary of gsplat's example trainer. Scenes without cameras have the
-    splits alone.
+    Combines cameras, splits and seed into the training record that all later stages read, and writes it once more as
+    the dictionary of gsplat's example trainer. Scenes without cameras have the splits alone.
     """
     input:
         scene=plan.scene,
         seed=plan.images_of_tracks("seed.ply"),
     output:
-        parser="<results>/{scene}/{tracks}parser.pkl",
+        pickle="<results>/{scene}/{tracks}parser.pkl",
+        parser="<results>/{scene}/{tracks}parser.npz",
     log:
         "<logs>/{scene}/{tracks}parser.log",
     benchmark:

@@ -1,6 +1,6 @@
 # The training of one method on one scene.
 #
-# REQUIRED INPUTS: <results>/{scene}/parser.pkl and, of scenes with cameras, masks/masks.json; actors.npz,
+# REQUIRED INPUTS: <results>/{scene}/parser.pkl with parser.npz and, of scenes with cameras, masks/masks.json; actors.npz,
 # lidar_depth.npz and scans.npz if the method has actors, is supervised with LiDAR depth, and renders LiDAR; in
 # discovered/ or unlabelled/ where the method has such tracks.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While a training
@@ -12,7 +12,8 @@ rule train:
     Fits Gaussians to training images and LiDAR scans; resumes an interrupted training of the same settings, code and inputs.
     """
     input:
-        parser=plan.of_tracks("parser.pkl"),
+        pickle=plan.of_tracks("parser.pkl"),
+        parser=plan.of_tracks("parser.npz"),
         masks=plan.images_of_tracks("masks/masks.json"),
         actors=plan.training_input("actors"),
         lidar_depth=plan.training_input("lidar_depth"),

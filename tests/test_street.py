@@ -32,7 +32,7 @@ from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.evaluation_data import EvaluationData
-from drivesplat.scene.training_record import read_training_record, write_training_record
+from drivesplat.scene.training_record import write_training_pickle, write_training_record
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, load, merged
@@ -75,20 +75,20 @@ def prepared(folder: Path, config: Config, root: Path, name: str) -> EvaluationD
     masks = make_masks(scene, settings_of(config, name, "masks", MaskJob), folder / "masks")
     write_json(folder / "masks/masks.json", {**vars(masks), "provenance": PROVENANCE})
     seed = seed_points(scene, settings_of(config, name, "lidar_seed", SeedJob))
-    write_training_record(
-        folder / "parser.pkl", training_record(scene, seed, settings_of(config, name, "parser", ParserJob))
-    )
+    record = training_record(scene, seed, settings_of(config, name, "parser", ParserJob))
+    write_training_record(folder / "parser.npz", record)
+    write_training_pickle(folder / "parser.pkl", record)
     actors = actors_record(scene, settings_of(config, name, "actors", ActorSeedJob)).actors
     write_arrays(folder / "actors.npz", ActorRecords(actors, PROVENANCE))
     depths = lidar_depths(scene, settings_of(config, name, "lidar_depth", LidarDepthJob))
     write_arrays(folder / "lidar_depth.npz", LidarDepthRecord(depths, PROVENANCE))
-    return EvaluationData(scene, read_training_record(folder / "parser.pkl"), folder / "masks")
+    return EvaluationData(scene, record, folder / "masks")
 
 
 def trained_by_rule(drive: EvaluationData, job: TrainJob, folder: Path) -> SplatModel:
     """The model that the function of the rule `train` fits to a prepared drive."""
     assert drive.masks is not None
-    parser = drive.masks.parent / "parser.pkl"
+    parser = drive.masks.parent / "parser.npz"
     others = ([str(parser.parent / name)] for name in ("masks/masks.json", "actors.npz", "lidar_depth.npz"))
     inputs, _ = read_inputs(str(parser), *others, [])
     files = TrainingFiles(folder / "checkpoint.npz", folder / "train.json")

@@ -1,4 +1,4 @@
-"""scene.json and the seed points in parser.pkl as a text model of COLMAP."""
+"""scene.json and the seed points in parser.npz as a text model of COLMAP."""
 
 from drivesplat.workflow.job import job
 from drivesplat.export.colmap import ColmapFiles, export_colmap

@@ -1,4 +1,4 @@
-"""scene.json and seed.ply into parser.pkl."""
+"""scene.json and seed.ply into parser.npz and parser.pkl."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ from drivesplat.workflow.job import job
 from drivesplat.io.point_cloud import read_ply
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.scene import read_scene
-from drivesplat.scene.training_record import write_training_record
+from drivesplat.scene.training_record import write_training_pickle, write_training_record
 from drivesplat.settings.images import ParserJob
 
 with job(snakemake) as current:
@@ -14,4 +14,6 @@ with job(snakemake) as current:
     seed = read_ply(current.input.seed[0], rule="lidar_seed") if current.input.seed else None
     record = training_record(scene, seed, current.settings(ParserJob))
     provenance = current.provenance(scene.provenance, *([seed.note["provenance"]] if seed else []))
-    write_training_record(current.output.parser, dataclasses.replace(record, provenance=provenance))
+    record = dataclasses.replace(record, provenance=provenance)
+    write_training_record(current.output.parser, record)
+    write_training_pickle(current.output.pickle, record)

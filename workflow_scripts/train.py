@@ -1,4 +1,4 @@
-"""parser.pkl, masks/ and what the method needs of other stages' records into checkpoint.npz and train.json."""
+"""parser.npz, masks/ and what the method needs of other stages' records into checkpoint.npz and train.json."""
 
 from pathlib import Path
 

@@ -96,7 +96,7 @@ def files_for(run: SnakemakeRun, method: str) -> SceneFiles:
     folder = run.folder / run.scene
     return SceneFiles(
         plan.scene(at),
-        str(folder / "parser.pkl"),
+        str(folder / "parser.npz"),
         str(folder / "masks/masks.json"),
         tuple(plan.training_input("actors")(at)),
         tuple(plan.training_input("lidar_depth")(at)),

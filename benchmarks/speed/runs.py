@@ -63,7 +63,7 @@ WARM_UP = 20
 
 def run(task: Task) -> dict[str, Any]:
     """Trains and evaluates. Returns `loop`, the seconds of the training loop; `whole`, the seconds from reading
-    parser.pkl to the written files; `busy_elsewhere`, the mean number of `processors` that other programs kept busy
+    parser.npz to the written files; `busy_elsewhere`, the mean number of `processors` that other programs kept busy
     (None if unknown); `result`, the metrics per group of held-out frames under `protocol`; and more.
 
     The rasterizer's kernels and the reduced images, which all recipes need once, are prepared before timing.

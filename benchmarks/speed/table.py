@@ -19,7 +19,7 @@ from drivesplat.evaluation.comparison import (
 from drivesplat.training.step import ITERATION
 
 LEGEND = (
-    "Loop: seconds of the training loop. Whole: seconds from parser.pkl to the written files. PSNR in dB on held-out "
+    "Loop: seconds of the training loop. Whole: seconds from parser.npz to the written files. PSNR in dB on held-out "
     "frames {where}. Means over the seeds (minimum to maximum). Difference from `plain`: mean of the paired "
     "differences ± its standard error."
 )

@@ -24,7 +24,7 @@ UNAVAILABLE = "the scene has no camera"
 
 @dataclass(frozen=True)
 class ScanEvaluationInputs:
-    """The inputs of an evaluation without cameras: the contents of checkpoint.npz, train.json, scene.json, parser.pkl
+    """The inputs of an evaluation without cameras: the contents of checkpoint.npz, train.json, scene.json, parser.npz
     and scans.npz."""
 
     checkpoint: TrainedCheckpoint

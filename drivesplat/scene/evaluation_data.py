@@ -52,7 +52,7 @@ class EvaluationData:
 def read_evaluation_data(
     scene: str | Path, parser: str | Path, masks: str | Path
 ) -> tuple[EvaluationData, list[Provenance]]:
-    """Reads scene.json, parser.pkl and masks.json; returns the drive and the provenances of these files."""
+    """Reads scene.json, parser.npz and masks.json; returns the drive and the provenances of these files."""
     drive = EvaluationData(read_scene(scene), read_training_record(parser), Path(masks).parent)
     record = read_masks_record(drive.masks)
     return drive, [drive.scene.provenance, drive.record.provenance, record.provenance]

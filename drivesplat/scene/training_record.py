@@ -1,15 +1,15 @@
-"""The content of parser.pkl: the scene as training reads it."""
+"""The training record: the scene as training reads it, in parser.npz and parser.pkl."""
 
+import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from drivesplat.io.plain_pickle import read_plain_pickle, write_plain_pickle
-from drivesplat.io.storage import Provenance, no_provenance, unreadable
-from drivesplat.io.typed_record import field_values, typed_record
+from drivesplat.io.array_file import read_typed_arrays, write_arrays
+from drivesplat.io.storage import Provenance, atomic_write, no_provenance
+from drivesplat.io.typed_record import field_values
 from drivesplat.scene.shutter import Shutter
 
 RULE = "parser"
@@ -108,16 +108,6 @@ class TrainingRecord:
             return None
         return Shutter(self.readout_s[index], self.camera_velocities[index])
 
-    def to_plain(self) -> dict[str, Any]:
-        """The content of parser.pkl: plain containers and arrays."""
-        return {**field_values(self), "scene": field_values(self.scene), "seed": field_values(self.seed)}
-
-    @classmethod
-    def from_plain(cls, plain: dict[str, Any]) -> "TrainingRecord":
-        """The inverse of `to_plain`; further keys are ignored. Raises ValueError if `plain` is not a training
-        record."""
-        return typed_record(cls, plain)
-
     def fault(self) -> str | None:
         """What no record of `parser` holds, None without a fault."""
         count = len(self.Ks)
@@ -139,13 +129,17 @@ class TrainingRecord:
 
 
 def write_training_record(path: str | Path, record: TrainingRecord) -> None:
-    write_plain_pickle(path, record.to_plain())
+    """Writes parser.npz."""
+    write_arrays(path, record)
 
 
 def read_training_record(path: str | Path) -> TrainingRecord:
-    """Reads parser.pkl. Raises ResultError if it is invalid or contains anything but plain data and arrays."""
-    content = read_plain_pickle(path, RULE)
-    try:
-        return TrainingRecord.from_plain(content)
-    except (AttributeError, TypeError, ValueError) as error:
-        raise unreadable(path, RULE, f"not a training record ({error})") from error
+    """Reads parser.npz. Raises ResultError if it is invalid."""
+    return read_typed_arrays(path, RULE, TrainingRecord, "a scene for training")
+
+
+def write_training_pickle(path: str | Path, record: TrainingRecord) -> None:
+    """Writes parser.pkl: a dictionary of plain containers and arrays under the keys of gsplat's example trainer."""
+    nested = {"scene": field_values(record.scene), "seed": field_values(record.seed)}
+    with atomic_write(path) as file:
+        pickle.dump(field_values(record) | nested, file, protocol=4)

@@ -45,7 +45,7 @@ class HoldoutSettings(Settings):
 
 
 class ParserJob(Settings):
-    """All settings that determine the parser.pkl of one scene."""
+    """All settings that determine the training record of one scene."""
 
     holdout: HoldoutSettings
     images: ImageSettings

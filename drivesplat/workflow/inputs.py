@@ -193,7 +193,7 @@ class Inputs:
 
     def first_parser(self, wildcards: Any) -> str:
         """The training record of the first method: cameras and splits are the same for all tracks."""
-        return self._of(next(iter(self.config.methods.values())).tracks, wildcards, "parser.pkl")
+        return self._of(next(iter(self.config.methods.values())).tracks, wildcards, "parser.npz")
 
     def discovered(self, wildcards: Any) -> list[str]:
         """The discovered tracks of a scene, if those of the job are discovered or, without any, those of a method."""

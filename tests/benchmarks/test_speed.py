@@ -68,7 +68,7 @@ def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_pa
         run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "scans")
     ]
     assert {Path(path).name for path in targets_of(run)} == {
-        "scene_refined.json", "parser.pkl", "masks.json", "actors.npz", "lidar_depth.npz"
+        "scene_refined.json", "parser.npz", "masks.json", "actors.npz", "lidar_depth.npz"
     }  # fmt: skip
 
 

@@ -258,6 +258,34 @@ def test_no_pickle_is_executed(tmp_path):
     assert mark.read_text() == "executed", "the test would not see a difference"
 
 
+class Forged:
+    """An array whose bytes do not fit the dtype and shape that the pickle states."""
+
+    def __init__(self, content: bytes, dtype: str, shape: tuple[int, ...]):
+        self.arguments = content, np.dtype(dtype), shape, "C"
+
+    def __reduce__(self):
+        return np.zeros(1).__reduce_ex__(5)[0], self.arguments
+
+
+@pytest.mark.parametrize(
+    ("array", "reason"),
+    [
+        (Forged(b"12345678", "O", (1,)), "an array of objects has no bytes"),
+        (Forged(b"12345678", "f8", (2,)), "another number of bytes"),
+        (Forged(b"", "f8", (-1, 0)), "no shape"),
+        (Forged(b"", "f8", (0,) * 9), "no shape"),
+        (Forged(b"\2", "?", (1,)), "no truth values"),
+        (Forged(b"\xff" * 4, "<U1", (1,)), "no truth values or characters"),
+        (Forged(b"12345678", "M8[s]", (1,)), "another dtype"),
+    ],
+)
+def test_arrays_that_do_not_fit_their_bytes_are_refused(array, reason, tmp_path):
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(array, protocol=4))
+    with pytest.raises(DatasetError, match=rf"a\.pkl cannot be read as a table of pandas.*{reason}"):
+        read_table(tmp_path / "a.pkl")
+
+
 def test_a_damaged_sequence_ends_with_a_sentence(sequence, tmp_path, capsys):
     assert pandaset.main([str(tmp_path), str(tmp_path / "out")]) == 1
     assert "has no folder front_camera" in capsys.readouterr().err

@@ -89,7 +89,7 @@ def test_each_of_100_flipped_bits_is_refused_with_file_and_rule(finished, tmp_pa
     monkeypatch.chdir(finished.folder)
     random, places = np.random.default_rng(0), readers(finished)
     kinds = {Path(path).name if is_result(path) else Path(path).suffix for path in places}
-    whole = {"scene.json", "own_car.json", "masks.json", "seed.ply", "parser.pkl", "checkpoint.npz", "train.json"}
+    whole = {"scene.json", "own_car.json", "masks.json", "seed.ply", "parser.npz", "checkpoint.npz", "train.json"}
     assert whole <= kinds
     assert {".jpg", ".bin"} <= kinds and any("masks/regions" in path for path in places)
     names, silent = list(places), []
@@ -139,13 +139,13 @@ DELETE = re.compile(r"(results/\S+): .*; delete (\S+) and rerun: the rule '(\w+)
             "results/0001/street/checkpoint.npz",
             marks=pytest.mark.slow,
         ),
-        pytest.param("results/0001/seed.ply", "lidar_seed", False, "results/0001/parser.pkl", marks=pytest.mark.slow),
+        pytest.param("results/0001/seed.ply", "lidar_seed", False, "results/0001/parser.npz", marks=pytest.mark.slow),
     ],
 )
 def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, lost, target):
     """Members that Snakemake does not know, lost and altered, and a declared output."""
     copy = finished.again(tmp_path / "copy")
-    (copy.folder / "results/0001/parser.pkl").unlink()
+    (copy.folder / "results/0001/parser.npz").unlink()
     (copy.folder / "results/0001/street/checkpoint.npz").unlink()
     damaged = sorted(copy.folder.glob(path))[-1]
     whole = damaged.read_bytes()

@@ -52,7 +52,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "discovered/scene.json": (read_scene, "relabel"),
     "unlabelled/masks/masks.json": (lambda path: read_masks_record(path.parent), "regions"),
     "seed.ply": (lambda path: read_ply(path, "lidar_seed"), "lidar_seed"),
-    "parser.pkl": (read_training_record, "parser"),
+    "parser.npz": (read_training_record, "parser"),
     "actors.npz": (read_actors, "actors"),
     "lidar_depth.npz": (read_lidar_depth, "lidar_depth"),
     "scans.npz": (read_scans, "scans"),

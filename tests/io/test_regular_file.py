@@ -9,7 +9,6 @@ import pytest
 from drivesplat.errors import DriveSplatError, ResultError
 from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.array_file import read_arrays
-from drivesplat.io.plain_pickle import read_plain_pickle
 from drivesplat.io.point_cloud import read_ply, read_positions
 from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import read_json
@@ -57,7 +56,6 @@ READERS = {
     "yaml": lambda path: read_yaml(path, "edits file"),
     "json": lambda path: read_json(path, "extract"),
     "arrays": lambda path: read_arrays(path, "train"),
-    "pickle": lambda path: read_plain_pickle(path, "parser"),
     "points": read_positions,
     "seed": lambda path: read_ply(path, "lidar_seed"),
     "splat": read_splat_ply,

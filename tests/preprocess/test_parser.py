@@ -1,4 +1,4 @@
-"""parser.pkl: what a trainer needs, under the names that users of gsplat's example trainer know."""
+"""parser.npz and parser.pkl: what a trainer needs, under the names that users of gsplat's example trainer know."""
 
 import dataclasses
 import pickle
@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.io.plain_pickle import write_plain_pickle
+from drivesplat.io.array_file import write_arrays
 from drivesplat.io.point_cloud import PointCloud
+from drivesplat.io.typed_record import field_values
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.splits import frame_groups
-from drivesplat.scene.training_record import read_training_record, write_training_record
+from drivesplat.scene.training_record import read_training_record, write_training_pickle, write_training_record
 from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 
 HOLDOUT = HoldoutSettings(every_nth=4, offset=2, last_block=2)
@@ -132,22 +133,28 @@ def test_a_scene_without_training_images_is_refused_with_the_hold_out_settings(t
         training_record(scene, seed, job(holdout=holdout))
 
 
-def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, seed, tmp_path):
+def test_both_files_hold_the_whole_record(tiny_scene, seed, tmp_path):
     record = dataclasses.replace(
         training_record(tiny_scene, seed, job()), provenance={"stages": {"made": {}}, "inputs": {}}
     )
-    write_training_record(tmp_path / "parser.pkl", record)
-    again = read_training_record(tmp_path / "parser.pkl")
-    assert pickle.dumps(again.to_plain()) == pickle.dumps(record.to_plain())
-    np.testing.assert_array_equal(again.Ks, record.Ks)
-    np.testing.assert_array_equal(again.splits["train"], record.splits["train"])
+    write_training_record(tmp_path / "parser.npz", record)
+    write_training_pickle(tmp_path / "parser.pkl", record)
+    pickled = pickle.loads((tmp_path / "parser.pkl").read_bytes())
+    assert {type(value) for value in pickled.values()} <= {np.ndarray, list, dict, float, type(None)}
+    assert pickled["scene"]["name"] == "0001" and pickled["seed"]["lidar"] == 40
+    again = read_training_record(tmp_path / "parser.npz")
+    assert pickled.keys() == field_values(again).keys()
+    for name, value in field_values(again).items():
+        plain = field_values(value) if name in ("scene", "seed") else value
+        np.testing.assert_equal(pickled[name], plain)
+        np.testing.assert_equal(getattr(record, name), value)
 
 
 @pytest.mark.parametrize("content", [{}, {"Ks": np.eye(3)}, [1], None])
 def test_an_invalid_parser_record_is_refused_naming_file_and_rule(tmp_path, content):
-    write_plain_pickle(tmp_path / "parser.pkl", content)
-    with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
-        read_training_record(tmp_path / "parser.pkl")
+    write_arrays(tmp_path / "parser.npz", content)
+    with pytest.raises(ResultError, match=r"parser\.npz.*'parser'"):
+        read_training_record(tmp_path / "parser.npz")
 
 
 @pytest.mark.parametrize(
@@ -176,6 +183,6 @@ def test_an_invalid_parser_record_is_refused_naming_file_and_rule(tmp_path, cont
     ],
 )
 def test_a_record_with_inconsistent_fields_is_refused_with_the_reason(tiny_scene, seed, tmp_path, changes, reason):
-    write_plain_pickle(tmp_path / "parser.pkl", training_record(tiny_scene, seed, job()).to_plain() | changes)
-    with pytest.raises(ResultError, match=rf"parser\.pkl: not a training record.*{reason}.*'parser'"):
-        read_training_record(tmp_path / "parser.pkl")
+    write_arrays(tmp_path / "parser.npz", field_values(training_record(tiny_scene, seed, job())) | changes)
+    with pytest.raises(ResultError, match=rf"parser\.npz: not a record of a scene for training.*{reason}.*'parser'"):
+        read_training_record(tmp_path / "parser.npz")

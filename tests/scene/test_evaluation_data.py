@@ -76,8 +76,8 @@ def test_every_image_has_its_split(tiny_scene):
 def test_a_prepared_drive_is_read_with_the_provenance_of_its_three_files(tiny_scene, masks, labels, tmp_path):
     record = dataclasses.replace(recording_of(tiny_scene, width=48).record, provenance=made("parser"))
     write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance=made("scene")))
-    write_training_record(tmp_path / "parser.pkl", record)
-    paths = (tmp_path / "scene.json", tmp_path / "parser.pkl", masks / "masks.json")
+    write_training_record(tmp_path / "parser.npz", record)
+    paths = (tmp_path / "scene.json", tmp_path / "parser.npz", masks / "masks.json")
     drive, provenances = read_evaluation_data(*paths)
     assert provenances == [made("scene"), made("parser"), made("masks")]
     assert drive.frame(2).token == tiny_scene.frames[2].token and drive.size(2) == (48, 27)

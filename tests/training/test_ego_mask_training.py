@@ -150,13 +150,13 @@ def prepared(tmp_path_factory) -> Path:
     settings = LidarSeedSettings(max_points=2000, far_points=500)
     seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0), ego_mask)
     record = training_record(scene, seed, ParserJob(holdout=holdout, images=images))
-    write_training_record(folder / "parser.pkl", record)
+    write_training_record(folder / "parser.npz", record)
     return folder
 
 
 @pytest.mark.slow
 def test_a_body_that_was_found_reaches_the_training_of_its_camera(prepared, monkeypatch, tmp_path):
-    inputs, _ = read_inputs(str(prepared / "parser.pkl"), [str(prepared / "masks/masks.json")], [], [], [])
+    inputs, _ = read_inputs(str(prepared / "parser.npz"), [str(prepared / "masks/masks.json")], [], [], [])
     assert inputs.cameras_with_ego == {"CAM_BACK"}
     assert json.loads((prepared / "masks/masks.json").read_text())["own_car"] == {"CAM_BACK": "images"}
     job = job_of(sky="mask", iterations=3, checkpoint_every=10)

@@ -89,7 +89,7 @@ def test_what_a_training_reads_comes_from_its_own_tracks(copy):
     for name in ("discovered", "unlabelled"):
         made_here = {path.name for path in (folder / name).iterdir() if not path.name.startswith(".")}
         more = {"actors.npz", "lidar_depth.npz", "scans.npz"} if name == "discovered" else set()
-        assert made_here == {"scene.json", "seed.ply", "parser.pkl", "masks", *more}
+        assert made_here == {"scene.json", "seed.ply", "parser.pkl", "parser.npz", "masks", *more}
         sky = next((folder / "masks/sky").rglob("*.png"))
         assert sky.samefile(folder / name / sky.relative_to(folder))
 

@@ -99,8 +99,8 @@ def test_pictures_show_the_tracks_of_the_method_and_annotated_ones_without_any()
 
 
 def test_the_film_of_all_methods_reads_the_record_of_the_first():
-    assert plan().first_parser(at()) == "r/a1/parser.pkl"
-    assert plan(methods={"found": METHODS["found"]}).first_parser(at()) == "r/a1/discovered/parser.pkl"
+    assert plan().first_parser(at()) == "r/a1/parser.npz"
+    assert plan(methods={"found": METHODS["found"]}).first_parser(at()) == "r/a1/discovered/parser.npz"
 
 
 OF_TRACKS = {"found": {"scans", "discover", "relabel", "regions"}, "blind": {"relabel", "regions"}}

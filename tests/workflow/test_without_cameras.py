@@ -113,7 +113,7 @@ def test_a_result_that_needs_images_is_refused_by_name(target, words):
 
 def test_what_it_has_is_not_refused():
     made = plan()
-    of_scene = ("scene.json", "parser.pkl", "actors.npz", "scans.npz", "scan_baselines.json", "metrics.json")
+    of_scene = ("scene.json", "parser.npz", "actors.npz", "scans.npz", "scan_baselines.json", "metrics.json")
     scans = "trajectories/original/scans/scans.json"
     of_method = ("checkpoint.npz", "train.json", "eval.json", "lidar.png", "lidar.mp4", scans)
     made.refuse_unknown([f"there/a2/{name}" for name in (*of_scene, *(f"with_lidar/{name}" for name in of_method))])
