@@ -36,7 +36,13 @@ def tracks_quality(
     sight. A discovered track is right where an annotated object that moves at some time is within NEAR for half of its
     own key frames. `track_ids` are those that `RecordedScan.objects` index.
     """
-    seen = movers_in_sight(scene, scans, track_ids)
+    seen: dict[str, list[tuple[int, Box]]] = {}  # boxes of annotated movers in sight, with the timestamps, by track
+    for scan in (scan for scan in scans if scan.is_key_frame):
+        numbers, counts = np.unique(scan.objects_met, return_counts=True)
+        returns = {track_ids[n]: int(c) for n, c in zip(numbers, counts, strict=True) if n >= 0}
+        for box in boxes_at(scene, scan.timestamp):
+            if box.moves and returns.get(box.track_id, 0) >= MIN_RETURNS:
+                seen.setdefault(box.track_id, []).append((scan.timestamp, box))
     matches = {track_id: _best(boxes, tracks, scene) for track_id, boxes in seen.items()}
     annotated = moving_tracks(scene)
     right = {track.id: _is_right(track, annotated, scene.key_frame_interval) for track in tracks}
@@ -56,20 +62,6 @@ def tracks_quality(
             "lateral_m": float(np.median(offsets[:, 1])) if len(offsets) else None,
             "distance_m": float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else None,
         }
-    return found
-
-
-def movers_in_sight(
-    scene: Scene, scans: Sequence[RecordedScan], track_ids: Sequence[str]
-) -> dict[str, list[tuple[int, Box]]]:
-    """The boxes of annotated objects at the key frames at which they move in sight, with the timestamps, by track."""
-    found: dict[str, list[tuple[int, Box]]] = {}
-    for scan in (scan for scan in scans if scan.is_key_frame):
-        numbers, counts = np.unique(scan.objects_met, return_counts=True)
-        returns = {track_ids[n]: int(c) for n, c in zip(numbers, counts, strict=True) if n >= 0}
-        for box in boxes_at(scene, scan.timestamp):
-            if box.moves and returns.get(box.track_id, 0) >= MIN_RETURNS:
-                found.setdefault(box.track_id, []).append((scan.timestamp, box))
     return found
 
 

@@ -79,7 +79,12 @@ class RangeGrid:
 
     def seen(self, points: Float[np.ndarray, "n 3"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """Whether this scan saw each place in the world (metres) empty, and whether it saw it occupied."""
-        places, columns = self._in_sensor(points)
+        at_timestamp = places = apply(inverse(self.scan.sensor_to_world), points)
+        for _ in range(STEPS):  # in the sensor's frame at the time when it looks at them
+            columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
+            moved = at_timestamp - self.offsets_s[columns][:, None] * self.scan.linear
+            places = np.einsum("nij,nj->ni", self._turns[columns], moved)
+        columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
         ranges = np.maximum(np.linalg.norm(places, axis=1), 1e-6)
         elevations = np.arcsin(np.clip(places[:, 2] / ranges, -1.0, 1.0))
         above = np.searchsorted(self.elevations, elevations)
@@ -96,16 +101,6 @@ class RangeGrid:
                 beyond &= ~(around <= limit)  # True for NaN
                 near |= np.abs(around - ranges) < tolerance  # False for NaN
         return beyond & (known >= MIN_KNOWN), in_view & near
-
-    def _in_sensor(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points in the sensor's frame at the times when it looks at them, and their columns."""
-        at_timestamp = apply(inverse(self.scan.sensor_to_world), points)
-        places = at_timestamp
-        for _ in range(STEPS):
-            columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
-            moved = at_timestamp - self.offsets_s[columns][:, None] * self.scan.linear
-            places = np.einsum("nij,nj->ni", self._turns[columns], moved)
-        return places, self._columns(np.arctan2(places[:, 1], places[:, 0]))
 
 
 def seen_empty(scans: Sequence[RecordedScan]) -> list[Bool[np.ndarray, " n"]]:
