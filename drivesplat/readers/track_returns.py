@@ -101,8 +101,8 @@ def _around_boxes(scene: Scene, sampled: SampledSweep) -> Iterator[_Seen]:
 
 
 def _filled(scene: Scene, sweeps: list[SampledSweep], frame: str) -> list[bool]:
-    """Whether the boxes hold returns, and more than there are beside them, if poses of tracks are taken to be in a frame
-    ('world', 'ego' or 'LiDAR'): of all boxes at all sweeps whose surroundings a LiDAR sees."""
+    """Whether the boxes hold returns, and more than there are beside them, if poses of tracks are taken to be in a
+    frame ('world', 'ego' or 'LiDAR'): of all boxes at all sweeps whose surroundings a LiDAR sees."""
     states = []
     for sampled in sweeps:
         to_world = np.eye(4)

@@ -49,7 +49,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _check(asked: argparse.Namespace) -> int:
     picture = asked.picture or asked.folder / "check.png"
     found = examine(asked.folder, picture)
-    faults = found.faults or _distortion_faults(found.scene)
+    cameras = found.scene.cameras if found.scene else ()
+    faults = found.faults or [fault for camera in cameras if (fault := distortion_fault(camera))]
     for line in grouped(faults):
         print(line)
     if found.no_picture:
@@ -68,27 +69,19 @@ def _check(asked: argparse.Namespace) -> int:
     return 0
 
 
-def _distortion_faults(scene: Scene | None) -> list[str]:
-    return [fault for camera in (scene.cameras if scene else ()) if (fault := distortion_fault(camera))]
-
-
 def camera_warnings(scene: Scene) -> list[str]:
     """`intrinsics_warnings`, and sentences about cameras whose images contradict their intrinsics, by a trial with some
     images (`drivesplat.poses.lens`)."""
-    return [*intrinsics_warnings(scene), *_image_warnings(scene)]
-
-
-def _image_warnings(scene: Scene) -> list[str]:
     try:
         from drivesplat.poses.lens import lens_warnings, with_tested_images  # imports pycolmap
+
+        with tempfile.TemporaryDirectory(prefix="drivesplat-undistorted-") as folder:
+            found = lens_warnings(undistorted(with_tested_images(scene), Path(folder)))
     except ImportError as error:
-        return [f"intrinsics are not compared with images: pycolmap or pyceres cannot be imported ({error})"]
-    tested = with_tested_images(scene)
-    with tempfile.TemporaryDirectory(prefix="drivesplat-undistorted-") as folder:
-        try:
-            return lens_warnings(undistorted(tested, Path(folder)))
-        except DatasetError as error:
-            return [f"intrinsics are not compared with images: {error}"]
+        found = [f"intrinsics are not compared with images: pycolmap or pyceres cannot be imported ({error})"]
+    except DatasetError as error:
+        found = [f"intrinsics are not compared with images: {error}"]
+    return [*intrinsics_warnings(scene), *found]
 
 
 def _schema(_: argparse.Namespace) -> int:

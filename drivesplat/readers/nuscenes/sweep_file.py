@@ -22,8 +22,11 @@ FIRING_S = 46.08e-6
 """Seconds between the firings of a beam."""
 
 
-def read_file(path: Path) -> LidarReturns:
-    """The returns with finite coordinates, of a file without a fault."""
+def read_file(path: Path) -> LidarReturns | str:
+    """The returns with finite coordinates of an existing file, or its fault."""
+    size = path.stat().st_size
+    if size == 0 or size % (4 * _COLUMNS):
+        return f"is corrupt ({size} bytes are no whole number of returns)"
     returns = np.fromfile(path, dtype=np.float32).reshape(-1, _COLUMNS)
     finite = np.isfinite(returns[:, :3]).all(axis=1)
     with np.errstate(invalid="ignore", over="ignore"):  # random bytes; `sweeps.read_returns` refuses them
@@ -42,11 +45,3 @@ def firing_times(rings: np.ndarray) -> np.ndarray | None:
     if rest or firings < 2 or (rings.reshape(firings, BEAMS) != np.arange(BEAMS)).any():
         return None
     return np.repeat(FIRING_S * np.arange(1 - firings, 1, dtype=np.float64), BEAMS)
-
-
-def file_fault(path: Path) -> str | None:
-    """The fault of an existing file, or None."""
-    size = path.stat().st_size
-    if size == 0 or size % (4 * _COLUMNS):
-        return f"is corrupt ({size} bytes are no whole number of returns)"
-    return None

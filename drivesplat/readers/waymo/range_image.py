@@ -42,11 +42,6 @@ def elevations(inclinations: np.ndarray, lowest: float, highest: float, rows: in
     return inclinations[::-1]
 
 
-def azimuths(columns: int, extrinsic: np.ndarray) -> np.ndarray:
-    """The azimuth (columns,) of each column in the laser's frame."""
-    return column_azimuth((np.arange(columns) + 0.5) / columns, extrinsic)
-
-
 def column_azimuth(fraction: Any, extrinsic: np.ndarray) -> Any:
     """The azimuth in the laser's frame after a fraction of the columns, an array or one."""
     return np.pi * (1.0 - 2.0 * fraction) - np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
