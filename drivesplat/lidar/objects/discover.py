@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.lidar.objects.boxes import Discovered, fitted_box
-from drivesplat.lidar.objects.clusters import Chain, Cluster, chains_of, clusters_of
+from drivesplat.lidar.objects.clusters import Chain, chains_of, clusters_of
 from drivesplat.lidar.objects.ends import Ends
 from drivesplat.lidar.objects.merging import after_gaps, of_parts, united
 from drivesplat.lidar.objects.seen_empty import seen_empty
@@ -164,21 +164,20 @@ class Surroundings:
         excess = clearances - [max(MAX_CLEARANCE, KERB + 2 * apart) for apart in beams_apart]
         if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
             return False
-        return bool(np.median([self._moving_share(cluster) for cluster in chain.clusters]) > MIN_MOVING)
-
-    def _moving_share(self, cluster: Cluster) -> float:
-        """The fraction of the returns in a cluster's extents, above the ground where it is known, that move."""
-        ground = self._ground.height(cluster.place)
-        floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
-        tree, heights = self._of_scan(cluster.scan)
-        low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
-        reach = 0.5 * float(np.linalg.norm(high[:2] - low[:2]))
-        near = np.array(tree.query_ball_point(cluster.place, reach), dtype=np.int64)
-        places, z = tree.data[near], heights[near]
-        inside = (places >= low[:2]).all(axis=1) & (places <= high[:2]).all(axis=1)
-        standing = int((inside & (z > floor) & (z <= high[2])).sum())
-        own = int((cluster.points[:, 2] > floor).sum())
-        return own / max(own + standing, 1)
+        moving_shares = []  # of the returns in a cluster's extents, above the ground where it is known
+        for cluster in chain.clusters:
+            ground = self._ground.height(cluster.place)
+            floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
+            tree, heights = self._of_scan(cluster.scan)
+            low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
+            reach = 0.5 * float(np.linalg.norm(high[:2] - low[:2]))
+            near = np.array(tree.query_ball_point(cluster.place, reach), dtype=np.int64)
+            places, z = tree.data[near], heights[near]
+            inside = (places >= low[:2]).all(axis=1) & (places <= high[:2]).all(axis=1)
+            standing = int((inside & (z > floor) & (z <= high[2])).sum())
+            own = int((cluster.points[:, 2] > floor).sum())
+            moving_shares.append(own / max(own + standing, 1))
+        return bool(np.median(moving_shares) > MIN_MOVING)
 
     def _of_scan(self, number: int) -> tuple[cKDTree, np.ndarray]:
         """The places of the returns of a scan that do not move, and their heights."""

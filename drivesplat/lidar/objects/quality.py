@@ -45,7 +45,14 @@ def tracks_quality(
                 seen.setdefault(box.track_id, []).append((scan.timestamp, box))
     matches = {track_id: _best(boxes, tracks, scene) for track_id, boxes in seen.items()}
     annotated = moving_tracks(scene)
-    right = {track.id: _is_right(track, annotated, scene.key_frame_interval) for track in tracks}
+    right = {}
+    for track in tracks:
+        near: dict[str, int] = {}
+        for timestamp, pose in zip(track.timestamps, track.object_to_world, strict=True):
+            for box in boxes_of(annotated, int(timestamp), scene.key_frame_interval):
+                if np.linalg.norm(box.object_to_world[:2, 3] - pose[:2, 3]) <= NEAR:
+                    near[box.track_id] = near.get(box.track_id, 0) + 1
+        right[track.id] = max(near.values(), default=0) >= HALF * len(track.timestamps)
     found = {}
     for kind, belongs in KINDS.items():
         movers = [track_id for track_id, boxes in seen.items() if belongs(boxes[0][1].object_class)]
@@ -79,14 +86,3 @@ def _best(boxes: Sequence[tuple[int, Box]], tracks: Sequence[Track], scene: Scen
         if len(offsets) > len(best):
             best = np.array(offsets)
     return best
-
-
-def _is_right(track: Track, movers: Sequence[Track], interval: float) -> bool:
-    """Whether one of the annotated `movers` is near a track for half of its key frames. `interval`: the key-frame
-    interval in microseconds."""
-    near: dict[str, int] = {}
-    for timestamp, pose in zip(track.timestamps, track.object_to_world, strict=True):
-        for box in boxes_of(movers, int(timestamp), interval):
-            if np.linalg.norm(box.object_to_world[:2, 3] - pose[:2, 3]) <= NEAR:
-                near[box.track_id] = near.get(box.track_id, 0) + 1
-    return max(near.values(), default=0) >= HALF * len(track.timestamps)

@@ -13,7 +13,6 @@ from PIL import Image, ImageDraw, ImageFont
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, Drive, structure_of
 from drivesplat.readers.drive.reader import scene_of
-from drivesplat.readers.drive.sweep_file import columns_sentence
 from drivesplat.readers.image_file import image_fault
 from drivesplat.readers.record_names import counted
 from drivesplat.readers.sweeps import read_returns, sweep_fault
@@ -109,19 +108,6 @@ def summary(scene: Scene) -> str:
         counted(len(scene.tracks), "track") if scene.tracks else "no boxes: all is treated as static",
     ]
     return ", ".join(parts)
-
-
-def column_sentences(scene: Scene) -> list[str]:
-    """What is read from the first sweep of each LiDAR, which has no fault."""
-    firsts = [next(sweep for sweep in scene.sweeps if sweep.lidar == lidar.name) for lidar in scene.lidars]
-    return [f"LiDAR {sweep.lidar}: {Path(sweep.path).name} {columns_sentence(Path(sweep.path))}" for sweep in firsts]
-
-
-def what_to_see(scene: Scene) -> str:
-    """What the picture of a scene must show, as the end of a sentence; empty where it shows images alone."""
-    seen = ["returns must lie on surfaces, also those of other times"] if scene.frames and scene.sweeps else []
-    boxes = ["boxes around objects"] if scene.tracks and scene.poses != UNPOSED else []
-    return ", and ".join([*seen, *boxes]) if seen else "".join(f"{words[:5]} must lie {words[6:]}" for words in boxes)
 
 
 def write_picture(scene: Scene, sweeps: Sequence[Sweep], path: Path) -> str | None:

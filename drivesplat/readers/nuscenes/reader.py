@@ -30,6 +30,7 @@ from drivesplat.readers.drive_checks import chain, require_microseconds
 from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.readers.nuscenes.row_checks import check_rows
 from drivesplat.readers.nuscenes.scene_tables import PREFIX, damaged, read_scene_tables, scene_file, write_scene_tables
+from drivesplat.readers.outline import frames_beyond
 from drivesplat.readers.record_names import named
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
@@ -62,8 +63,8 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
     tokens = chain(record["first_sample_token"], lambda token: _get(tables, "sample", token)["next"], "sample")
     samples = [_get(tables, "sample", token) for token in tokens]
     require_microseconds([s["timestamp"] for s in samples], f"scene {name}")
-    if frames and frames[1] > len(samples):
-        raise DatasetError(f"scene {name}: the frame range {frames} ends beyond its {len(samples)} key frames")
+    if fault := frames_beyond(name, len(samples), frames):
+        raise DatasetError(fault)
     samples = samples[slice(*(frames or (None, None)))]
     times = require_increasing([s["timestamp"] for s in samples], [s["token"] for s in samples], "sample")
     hz = 1e6 / float(np.median(np.diff(times))) if len(times) > 1 else KEY_FRAME_HZ
@@ -84,11 +85,16 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
         key_frame_range=list(frames) if frames else None,
     )
     images = [f for camera in cameras for f in _frames(tables, root, samples, camera, source.sweeps, scene)]
-    sweeps = tuple(_sweeps(tables, root, samples, source.lidar_sweeps, scene))
+    sweeps = []
+    if any(LIDAR in sample["data"] for sample in samples):
+        for data, index, _, sensor_to_world, _ in _recordings(tables, samples, LIDAR, source.lidar_sweeps, scene):
+            path = str(root / checked_path(data.get("filename"), named("sample_data", data["token"])))
+            time, is_key_frame = data["timestamp"], data["is_key_frame"]
+            sweeps.append(Sweep(path, time, sensor_to_world, is_key_frame, index, data["token"], LIDAR, READER))
     return dataclasses.replace(
         scene,
         frames=tuple(images),
-        sweeps=sweeps,
+        sweeps=tuple(sweeps),
         tracks=tuple(_tracks(tables, samples, origin)),
         cameras=tuple({frame.camera: _camera(tables, frame) for frame in images}.values()),
         lidars=(_lidar(tables, sweeps[0], version),) if sweeps else (),
@@ -238,15 +244,6 @@ def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: b
             sample_index=index,
             token=data["token"],
         )
-
-
-def _sweeps(tables: Any, root: Path, samples: list[dict], sweeps: bool, scene: Scene) -> Iterator[Sweep]:
-    if not any(LIDAR in sample["data"] for sample in samples):
-        return
-    for data, index, _, sensor_to_world, _ in _recordings(tables, samples, LIDAR, sweeps, scene):
-        path = str(root / checked_path(data.get("filename"), named("sample_data", data["token"])))
-        time, is_key_frame = data["timestamp"], data["is_key_frame"]
-        yield Sweep(path, time, sensor_to_world, is_key_frame, index, data["token"], LIDAR, READER)
 
 
 def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Track]:

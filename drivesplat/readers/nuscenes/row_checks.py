@@ -103,7 +103,19 @@ def check_rows(tables: Rows) -> None:
     for log in tables["log"]:
         if all(log["token"] not in row["log_tokens"] for row in tables["map"]):
             raise DatasetError(f"{named('log', log['token'])}: no row of the table map refers to it")
-    _check_samples(tables)
+    following = {row["token"]: row["next"] for row in tables["sample"]}
+
+    def next_of(token: str) -> str:
+        if following[token] and following[token] not in following:
+            raise _missing("sample", following[token], named("sample", token))
+        return following[token]
+
+    linked = set(chain(tables["scene"][0]["first_sample_token"], next_of, "sample"))
+    for token in following:
+        if token not in linked:
+            raise DatasetError(
+                f"{named('sample', token)}: it is in the scene, but the chain of samples does not lead to it"
+            )
     _check_key_frames(tables)
 
 
@@ -120,22 +132,6 @@ def _check_column(table: str, rows: list[dict[str, Any]], column: str, kind: _Ki
 
 def _missing(table: str, token: str, by: str) -> DatasetError:
     return DatasetError(f"{named(table, token)} is referred to by {by}, but not in the tables")
-
-
-def _check_samples(tables: Rows) -> None:
-    following = {row["token"]: row["next"] for row in tables["sample"]}
-
-    def next_of(token: str) -> str:
-        if following[token] and following[token] not in following:
-            raise _missing("sample", following[token], named("sample", token))
-        return following[token]
-
-    linked = set(chain(tables["scene"][0]["first_sample_token"], next_of, "sample"))
-    for row in tables["sample"]:
-        if row["token"] not in linked:
-            raise DatasetError(
-                f"{named('sample', row['token'])}: it is in the scene, but the chain of samples does not lead to it"
-            )
 
 
 def _check_key_frames(tables: Rows) -> None:

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,11 +24,12 @@ from drivesplat.readers.checks import (
 )
 from drivesplat.readers.drive.reader import nominal_rate
 from drivesplat.readers.drive_checks import require_microseconds
+from drivesplat.readers.outline import frames_beyond
 from drivesplat.readers.record_names import named, shown
 from drivesplat.readers.waymo import v1, v2
 from drivesplat.readers.waymo.calibration import camera_mount, camera_of, laser_mount, lidar_of, pose_of, readout_middle
 from drivesplat.readers.waymo.layout import segment_files
-from drivesplat.readers.waymo.names import CAMERAS, LASERS, V1
+from drivesplat.readers.waymo.names import CAMERAS, LASERS, V1, V2
 from drivesplat.readers.waymo.segment import BoxRecord, ImageRecord, Segment, frame_name
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import rigid
@@ -48,6 +48,8 @@ CLASSES = {
 """Name and class by `Label.Type`. Waymo has one class for all vehicles, so that no pixel belongs to the region `car`.
 Signs never move: OTHER_MOVABLE is what the protocol treats as static. Other types are of an unknown class, the same."""
 UNKNOWN = ("unknown", ObjectClass.OTHER_MOVABLE)
+FORMATS = {V1: v1, V2: v2}
+"""The modules that read the files of each version."""
 MAX_APART_US = 1_000_000
 """Maximum time in microseconds between a frame and its images."""
 
@@ -61,12 +63,7 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
     Raises DatasetError naming the first fault.
     """
     files = segment_files(root, source.version, source.scene)
-    return scene_of(format_of(files.version).read_segment(files), source)
-
-
-def format_of(version: str) -> ModuleType:
-    """The module that reads a version's files."""
-    return v1 if version == V1 else v2
+    return scene_of(FORMATS[files.version].read_segment(files), source)
 
 
 def scene_of(segment: Segment, source: SceneSource) -> Scene:
@@ -79,10 +76,8 @@ def scene_of(segment: Segment, source: SceneSource) -> Scene:
     if not every:
         raise DatasetError(f"scene {source.scene}: segment {segment.name} has no frames; download it again")
     require_microseconds(every, f"scene {source.scene}")
-    if source.frames and source.frames[1] > len(every):
-        raise DatasetError(
-            f"scene {source.scene}: the frame range {source.frames} ends beyond its {len(every)} key frames"
-        )
+    if fault := frames_beyond(source.scene, len(every), source.frames):
+        raise DatasetError(fault)
     times = np.array(every[slice(*(source.frames or (None, None)))], dtype=np.int64)
     poses = [pose_of(segment.frames[int(time)], frame_name(int(time))) for time in times]
     reading = _SegmentReading(segment, times, poses, poses[0][:3, 3].copy())

@@ -21,7 +21,7 @@ from drivesplat.readers.waymo.calibration import laser_elevations, laser_mount, 
 from drivesplat.readers.waymo.layout import segment_files
 from drivesplat.readers.waymo.names import CAMERAS, LASERS, MAX_CLASS, SKY_CLASS, UNDEFINED_CLASS
 from drivesplat.readers.waymo.range_image import column_azimuth, points_of
-from drivesplat.readers.waymo.reader import format_of
+from drivesplat.readers.waymo.reader import FORMATS
 from drivesplat.readers.waymo.segment import ChosenRecordings, PanopticLabel, RangeImage, sweep_name
 from drivesplat.readers.waymo.sweep_file import rays_of, write_file
 from drivesplat.scene.images import DECODING_ERRORS, write_png
@@ -52,7 +52,7 @@ def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene
         frozenset((times[frame.sample_index], cameras[frame.camera]) for frame in scene.frames),
         frozenset((times[sweep.sample_index], lasers[sweep.lidar]) for sweep in scene.sweeps),
     )
-    for recording in format_of(files.version).read_recordings(files, wanted):
+    for recording in FORMATS[files.version].read_recordings(files, wanted):
         if isinstance(recording, RangeImage):
             _write_sweep(recording, sweeps[f"{LASERS[recording.laser.number]}/{recording.frame}"])
             continue

@@ -6,6 +6,7 @@ sensors and timestamps may be texts, and floats of single precision.
 
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ from drivesplat.readers.waymo.segment import (
 TIME, CAMERA, LASER, OBJECT = (
     f"key.{name}" for name in ("frame_timestamp_micros", "camera_name", "laser_name", "laser_object_id")
 )
+NUMBERS = (TIME, CAMERA, LASER, ".type", ".rolling_shutter_direction")
+"""Ends of names of columns that hold whole numbers."""
 INTRINSIC = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 RANGES, POSES = "[LiDARComponent].range_image_return1", "[LiDARPoseComponent].range_image_return1"
 IMAGE = "[CameraImageComponent].image"
@@ -43,15 +46,13 @@ Key = tuple[int, int]
 
 def read_segment(files: SegmentFiles) -> Segment:
     """The segment of these files, without its images and the values of its range images."""
-    read = _Rows(files)
-    segment = _frames_and_lasers(files, read)
+    read = partial(_rows, files)
+    segment = _frames_and_lasers(files)
     at = "[CameraCalibrationComponent]."
     others = [f"{at}{name}" for name in ("extrinsic.transform", "width", "height", "rolling_shutter_direction")]
     for row in read("camera_calibration", CAMERA, *(f"{at}intrinsic.{name}" for name in INTRINSIC), *others):
-        extrinsic, width, height, direction = (row[name] for name in others)
         intrinsic = [row[f"{at}intrinsic.{name}"] for name in INTRINSIC]
-        turn = read.number("camera_calibration", direction, others[3])
-        segment.cameras[row[CAMERA]] = CameraRecord(row[CAMERA], intrinsic, extrinsic, width, height, turn)
+        segment.cameras[row[CAMERA]] = CameraRecord(row[CAMERA], intrinsic, *(row[name] for name in others))
     at, times = "[CameraImageComponent].", ("shutter", "camera_trigger_time", "camera_readout_done_time")
     columns = [f"{at}{name}" for name in ("pose.transform", "pose_timestamp")]
     columns += [f"{at}rolling_shutter_params.{name}" for name in times]
@@ -61,9 +62,8 @@ def read_segment(files: SegmentFiles) -> Segment:
     center, size = ([f"{at}box.{part}.{axis}" for axis in "xyz"] for part in ("center", "size"))
     kind, heading = f"{at}type", f"{at}box.heading"
     for row in read("lidar_box", TIME, OBJECT, *center, *size, heading, kind):
-        number = read.number("lidar_box", row[kind], kind)
         values = ([row[name] for name in names] for names in (center, size))
-        segment.boxes.append(BoxRecord(row[TIME], row[OBJECT], number, *values, row[heading]))
+        segment.boxes.append(BoxRecord(row[TIME], row[OBJECT], row[kind], *values, row[heading]))
     for row in read("lidar", TIME, LASER, f"{RANGES}.shape"):
         shape = row[f"{RANGES}.shape"]
         if shape:
@@ -89,36 +89,26 @@ def read_recordings(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[I
     yield from _range_images(files, wanted)
 
 
-def _frames_and_lasers(files: SegmentFiles, read: "_Rows") -> Segment:
+def _frames_and_lasers(files: SegmentFiles) -> Segment:
     segment = Segment(files.name, files.version)
     pose = "[VehiclePoseComponent].world_from_vehicle.transform"
-    for row in read("vehicle_pose", TIME, pose):
+    for row in _rows(files, "vehicle_pose", TIME, pose):
         if row[TIME] in segment.frames:
             raise DatasetError(f"{frame_name(row[TIME])}: {files.files['vehicle_pose']} has it twice")
         segment.frames[row[TIME]] = row[pose]
     at = "[LiDARCalibrationComponent]."
     columns = [f"{at}beam_inclination.{name}" for name in ("values", "min", "max")] + [f"{at}extrinsic.transform"]
-    for row in read("lidar_calibration", LASER, *columns):
+    for row in _rows(files, "lidar_calibration", LASER, *columns):
         inclinations, lowest, highest, extrinsic = (row[name] for name in columns)
         segment.lasers[row[LASER]] = LaserRecord(row[LASER], inclinations or [], lowest, highest, extrinsic)
     return segment
 
 
-class _Rows:
-    """Rows of the components of a segment, with whole numbers in the columns of keys."""
-
-    def __init__(self, files: SegmentFiles):
-        self._files = files
-
-    def __call__(self, component: str, *columns: str) -> Iterator[dict[str, Any]]:
-        path = self._files.files[component]
-        numbers = [column for column in columns if column in (TIME, CAMERA, LASER)]
-        for row in rows(path, columns, self._files.name):
-            yield row | {column: whole(row[column], path, column) for column in numbers}
-
-    def number(self, component: str, value: Any, column: str) -> int:
-        """A whole number of another column."""
-        return whole(value, self._files.files[component], column)
+def _rows(files: SegmentFiles, component: str, *columns: str) -> Iterator[dict[str, Any]]:
+    """Rows of a component of a segment, with whole numbers in the columns NUMBERS."""
+    path, numbers = files.files[component], [column for column in columns if column.endswith(NUMBERS)]
+    for row in rows(path, columns, files.name):
+        yield row | {column: whole(row[column], path, column) for column in numbers}
 
 
 def _range_images(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[RangeImage]:
@@ -126,7 +116,7 @@ def _range_images(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[Ran
     have another order, poses wait for their range images."""
     if not wanted.sweeps:
         return
-    segment = _frames_and_lasers(files, _Rows(files))
+    segment = _frames_and_lasers(files)
     poses, waiting = _matrices(files, "lidar_pose", POSES, 6, wanted), dict[Key, np.ndarray]()
     for key, values in _matrices(files, "lidar", RANGES, 4, wanted):
         if key[1] == TOP:

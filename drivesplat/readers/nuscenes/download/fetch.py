@@ -118,7 +118,8 @@ def _connect(source: NuscenesMiniSettings, part: Path) -> None:
     start, size = size_of(part) if validator else 0, source.size_bytes
     headers = {"User-Agent": "drivesplat", **({"Range": f"bytes={start}-", "If-Range": validator} if start else {})}
     request = urllib.request.Request(source.url, headers=headers)
-    with open_url(request, source.timeout_s) as response:
+    opener = urllib.request.build_opener(_HttpHandler, _HttpsHandler)
+    with opener.open(request, timeout=source.timeout_s) as response:
         try:
             if response.status == 206:
                 found = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers.get("Content-Range", "").strip())
@@ -224,8 +225,3 @@ class _HttpHandler(urllib.request.HTTPHandler):
 class _HttpsHandler(urllib.request.HTTPSHandler):
     def https_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
         return self.do_open(_HttpsConnection, request)
-
-
-def open_url(request: urllib.request.Request, timeout: float) -> http.client.HTTPResponse:
-    """As `urllib.request.urlopen`, but raises TimeoutError where the headers take longer than `timeout` seconds."""
-    return urllib.request.build_opener(_HttpHandler, _HttpsHandler).open(request, timeout=timeout)
