@@ -119,7 +119,14 @@ def scan_of(returns: LidarReturns, lidar: Lidar, poses: SensorPoses, spin: Spin 
     returns = LidarReturns(*(None if column is None else column[measured] for column in columns))
     offsets, azimuths, elevations, ranges = (values[measured] for values in seen)
     rings, beams = _beams(returns, lidar, elevations)
-    steps = lidar.azimuth_steps or _steps(lidar, azimuths, rings)
+    steps = lidar.azimuth_steps
+    if not steps:  # by the median gap between neighbouring returns of a beam
+        order = np.lexsort([azimuths, rings])
+        gaps = np.diff(azimuths[order])[np.diff(rings[order]) == 0]
+        gaps = gaps[gaps > 1e-5]  # duplicated returns
+        if not len(gaps):
+            raise DatasetError(f"LiDAR {lidar.name}: a sweep with so few returns needs azimuth_steps to tell its rays")
+        steps = max(1, round(2.0 * np.pi / float(np.median(gaps))))
     # The shift of a beam's firings from evenly spaced azimuths is the circular mean of its returns', or that of all.
     turns = np.exp(1j * steps * (azimuths + np.pi))
     of_beams = np.bincount(rings, turns.real, len(beams)) + 1j * np.bincount(rings, turns.imag, len(beams))
@@ -237,16 +244,6 @@ def _medians(elevations: np.ndarray, rings: np.ndarray, count: int = 0) -> Float
     present = np.unique(rings)
     numbers = np.arange(max(count, present.max() + 1))
     return np.interp(numbers, present, [np.median(elevations[rings == ring]) for ring in present])
-
-
-def _steps(lidar: Lidar, azimuths: np.ndarray, rings: np.ndarray) -> int:
-    """The number of firings of a revolution, by the median gap between neighbouring returns of a beam."""
-    order = np.lexsort([azimuths, rings])
-    gaps = np.diff(azimuths[order])[np.diff(rings[order]) == 0]
-    gaps = gaps[gaps > 1e-5]  # duplicated returns
-    if not len(gaps):
-        raise DatasetError(f"LiDAR {lidar.name}: a sweep with so few returns needs azimuth_steps to tell its rays")
-    return max(1, round(2.0 * np.pi / float(np.median(gaps))))
 
 
 def _of_firings(columns: np.ndarray, offsets: np.ndarray, steps: int) -> Float[np.ndarray, " steps"]:

@@ -42,7 +42,7 @@ class RangeGrid:
     @cached_property
     def elevations(self) -> Float[np.ndarray, " b"]:
         """The elevation of each beam in radians, ascending."""
-        return np.sort(self._of_beams)
+        return np.sort(self.scan.scan.rays.beam_elevations)
 
     @cached_property
     def ranges(self) -> Float[np.ndarray, "b a"]:
@@ -52,7 +52,7 @@ class RangeGrid:
         grid = np.full(known.shape, np.nan, dtype=np.float32)
         beams = np.broadcast_to(np.arange(len(known))[:, None], known.shape)
         grid[beams, self._columns(own.scan.rays.azimuths)] = known
-        return grid[np.argsort(self._of_beams, kind="stable")]
+        return grid[np.argsort(own.scan.rays.beam_elevations, kind="stable")]
 
     @cached_property
     def offsets_s(self) -> Float[np.ndarray, " a"]:
@@ -68,10 +68,6 @@ class RangeGrid:
     def _turns(self) -> Float[np.ndarray, "a 3 3"]:
         """The rotation from the sensor at its timestamp to the sensor at the time of each column."""
         return Rotation.from_rotvec(-self.offsets_s[:, None] * self.scan.angular).as_matrix()
-
-    @cached_property
-    def _of_beams(self) -> Float[np.ndarray, " b"]:
-        return self.scan.scan.rays.beam_elevations
 
     def _columns(self, azimuths: np.ndarray) -> np.ndarray:
         count = self.scan.scan.rays.shape[1]
