@@ -49,12 +49,6 @@ def split_sweep(sweep: Sweep, points: np.ndarray, seconds: float, objects: list[
     return Cloud(sweep.timestamp, sweep.sample_index, sweep.sensor_to_world[:3, 3], points[static], dynamic)
 
 
-def nearest_cloud(clouds: list[Cloud], timestamp: int, interval: float) -> Cloud | None:
-    """The cloud nearest in time to `timestamp`; None if none is within `interval`, both in microseconds."""
-    nearest = min(clouds, key=lambda cloud: abs(cloud.timestamp - timestamp), default=None)
-    return nearest if nearest and abs(nearest.timestamp - timestamp) < interval else None
-
-
 def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body: np.ndarray) -> PixelDepths:
     """The nearest return of a cloud at each pixel of a frame. Returns of objects that are absent at the frame's time,
     and pixels of the ego vehicle's `body` (h, w) bool, are left out."""
@@ -72,22 +66,16 @@ def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body
     ranges = np.linalg.norm(points[index] - cloud.origin, axis=1)
     front = unoccluded(rows, columns, depth, patches(ranges, depth, intrinsics, job.ray_spacing), shape)
     index, rows, columns, depth = index[front], rows[front], columns[front], depth[front]
-    boxes = box_depths(scene, frame, size, {item.track.id for item, _ in cloud.dynamic})
+    # Static returns behind the box of a moved object are occluded: its own returns are too sparse to decide that.
+    boxes, moved_ids = np.full(shape, np.inf), {item.track.id for item, _ in cloud.dynamic}
+    for hull in hulls_in(scene, frame, size):
+        if hull.box.track_id in moved_ids:
+            corners = (hull.box.corners - frame.camera_to_world[:3, 3]) @ frame.camera_to_world[:3, 2]
+            inside = fill(hull.polygon, size)
+            boxes[inside] = np.minimum(boxes[inside], corners.min())
     kept = (index >= len(cloud.static)) | (depth < boxes[rows, columns])
     kept &= ~body[rows, columns]
     return nearest_per_pixel(np.column_stack([rows, columns, depth])[kept])
-
-
-def box_depths(scene: Scene, frame: Frame, size: tuple[int, int], track_ids: set[str]) -> np.ndarray:
-    """The smallest depth (h, w) in metres of the tracks' boxes at every pixel of a frame, inf without a box. Static
-    returns behind it are occluded: LiDAR returns of a moved object are too sparse to decide that."""
-    nearest = np.full((size[1], size[0]), np.inf)
-    for hull in hulls_in(scene, frame, size):
-        if hull.box.track_id in track_ids:
-            corners = (hull.box.corners - frame.camera_to_world[:3, 3]) @ frame.camera_to_world[:3, 2]
-            inside = fill(hull.polygon, size)
-            nearest[inside] = np.minimum(nearest[inside], corners.min())
-    return nearest
 
 
 def nearest_per_pixel(found: np.ndarray) -> PixelDepths:

@@ -60,18 +60,26 @@ class GroundMap:
         """A plane through the ground around each cell, where it is known and even enough.
 
         The low points show which points are ground, but they lie below it by the noise of ranges. A plane through them
-        is therefore followed by one through the mean of the points nearest to it, within NEAR metres of it.
+        is therefore followed by one through the mean of the points nearest to it in the horizontal, within CELL metres
+        there and within NEAR metres of it.
         """
         if not len(self._lowest):
             return Planes(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0))
-        return _planes_through(_means_near(_planes_through(self._lowest[self._is_ground()]), self._points))
-
-    def _is_ground(self) -> Bool[np.ndarray, " k"]:
-        """Which cells are as low as their neighbours."""
         near, found, _ = _neighbours(self._lowest[:, :2])
         heights = np.sort(np.where(found, self._lowest[near, 2], np.inf), axis=1)
         chosen = (LOW * (found.sum(axis=1) - 1)).astype(int)
-        return np.abs(self._lowest[:, 2] - heights[np.arange(len(heights)), chosen]) < ABOVE
+        as_low_as_around = np.abs(self._lowest[:, 2] - heights[np.arange(len(heights)), chosen]) < ABOVE
+        planes = _planes_through(self._lowest[as_low_as_around])
+        if not len(planes.places):
+            return planes
+        distances, nearest = cKDTree(planes.places).query(self._points[:, :2], distance_upper_bound=CELL)
+        inside = np.isfinite(distances)
+        points, nearest = self._points[inside].astype(np.float64), nearest[inside]
+        close = np.abs((points * planes.normals[nearest]).sum(axis=1) - planes.offsets[nearest]) < NEAR
+        points, nearest = points[close], nearest[close]
+        counts = np.bincount(nearest, minlength=len(planes.places))
+        sums = np.stack([np.bincount(nearest, weights=column, minlength=len(counts)) for column in points.T], axis=1)
+        return _planes_through(sums[counts > 0] / counts[counts > 0, None])
 
 
 def _planes_through(ground: Float[np.ndarray, "k 3"]) -> Planes:
@@ -93,21 +101,6 @@ def _planes_through(ground: Float[np.ndarray, "k 3"]) -> Planes:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     through = np.column_stack([ground[:, :2], fitted[:, 0]])
     return Planes(ground[known, :2], normals[known], (normals * through).sum(axis=1)[known])
-
-
-def _means_near(planes: Planes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
-    """The mean of the points near each plane: of those to which it is the nearest in the horizontal, within CELL
-    metres there, and which lie within NEAR metres of it."""
-    if not len(planes.places):
-        return np.zeros((0, 3))
-    distances, nearest = cKDTree(planes.places).query(points[:, :2], distance_upper_bound=CELL)
-    inside = np.isfinite(distances)
-    points, nearest = points[inside].astype(np.float64), nearest[inside]
-    close = np.abs((points * planes.normals[nearest]).sum(axis=1) - planes.offsets[nearest]) < NEAR
-    points, nearest = points[close], nearest[close]
-    counts = np.bincount(nearest, minlength=len(planes.places))
-    sums = np.stack([np.bincount(nearest, weights=column, minlength=len(counts)) for column in points.T], axis=1)
-    return sums[counts > 0] / counts[counts > 0, None]
 
 
 def _neighbours(

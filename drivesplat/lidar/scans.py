@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
@@ -115,11 +115,22 @@ def scan_of(returns: LidarReturns, lidar: Lidar, poses: SensorPoses, spin: Spin 
     """
     seen = _seen(returns, poses, spin)
     measured = seen.ranges >= MIN_RANGE
-    returns, seen = _chosen(returns, measured), SeenReturns(*(values[measured] for values in seen))
-    offsets, azimuths, elevations, ranges = seen
+    columns = (returns.points, returns.intensity, returns.rings, returns.offsets_s)
+    returns = LidarReturns(*(None if column is None else column[measured] for column in columns))
+    offsets, azimuths, elevations, ranges = (values[measured] for values in seen)
     rings, beams = _beams(returns, lidar, elevations)
-    steps = lidar.azimuth_steps or _steps(lidar, azimuths, rings)
-    phases = _phases(azimuths, rings, len(beams), steps)
+    steps = lidar.azimuth_steps
+    if not steps:  # by the median gap between neighbouring returns of a beam
+        order = np.lexsort([azimuths, rings])
+        gaps = np.diff(azimuths[order])[np.diff(rings[order]) == 0]
+        gaps = gaps[gaps > 1e-5]  # duplicated returns
+        if not len(gaps):
+            raise DatasetError(f"LiDAR {lidar.name}: a sweep with so few returns needs azimuth_steps to tell its rays")
+        steps = max(1, round(2.0 * np.pi / float(np.median(gaps))))
+    # The shift of a beam's firings from evenly spaced azimuths is the circular mean of its returns', or that of all.
+    turns = np.exp(1j * steps * (azimuths + np.pi))
+    of_beams = np.bincount(rings, turns.real, len(beams)) + 1j * np.bincount(rings, turns.imag, len(beams))
+    phases = np.angle(np.where(np.bincount(rings, minlength=len(beams)) > 0, of_beams, turns.sum())) / steps
     columns = np.round((azimuths + np.pi - phases[rings]) * steps / (2.0 * np.pi)).astype(np.int64) % steps
     shape = (len(beams), steps)
     nearest = np.argsort(-ranges, kind="stable")  # of several values for one cell numpy keeps the last
@@ -140,11 +151,6 @@ def scan_of(returns: LidarReturns, lidar: Lidar, poses: SensorPoses, spin: Spin 
         rays, filled(nothing, np.ones(len(ranges))) > 0, filled(nothing, ranges),
         None if intensity is None else filled(nothing, np.nan_to_num(intensity)),
     )  # fmt: skip
-
-
-def _chosen(returns: LidarReturns, chosen: Bool[np.ndarray, " n"]) -> LidarReturns:
-    columns = (returns.points, returns.intensity, returns.rings, returns.offsets_s)
-    return LidarReturns(*(None if column is None else column[chosen] for column in columns))
 
 
 def _seen(returns: LidarReturns, poses: SensorPoses, spin: Spin | None) -> SeenReturns:
@@ -206,7 +212,13 @@ def _beams(returns: LidarReturns, lidar: Lidar, elevations: np.ndarray) -> tuple
                 )
         return nearest, known
     if known is not None and (not len(rings) or rings.max() < len(known)):
-        return rings, known if _are_of_rings(known, elevations, rings) else _medians(elevations, rings, len(known))
+        present = np.unique(rings)
+        if not len(present):
+            return rings, known
+        # Most rings lie nearest to their known elevations, unless these are of another sensor or in another order.
+        nearest, _ = _nearest(_medians(elevations, rings)[present], known)
+        are_of_rings = float(np.mean(nearest == present)) >= 0.5
+        return rings, known if are_of_rings else _medians(elevations, rings, len(known))
     if not len(rings):
         raise DatasetError(f"LiDAR {lidar.name}: a sweep without returns needs beam_elevations to tell its rays")
     return rings, _medians(elevations, rings)
@@ -226,38 +238,12 @@ def _nearest(elevations: np.ndarray, known: np.ndarray) -> tuple[Int[np.ndarray,
     return order[found], np.abs(elevations - beams[found]) / np.maximum(half, MIN_SPACING)
 
 
-def _are_of_rings(known: np.ndarray, elevations: np.ndarray, rings: np.ndarray) -> bool:
-    """Whether most rings lie nearest to the elevations that are known for them; otherwise these are of another sensor,
-    or in another order."""
-    present = np.unique(rings)
-    measured = _medians(elevations, rings)[present] if len(present) else np.zeros(0)
-    return not len(present) or float(np.mean(_nearest(measured, known)[0] == present)) >= 0.5
-
-
 def _medians(elevations: np.ndarray, rings: np.ndarray, count: int = 0) -> Float[np.ndarray, " b"]:
     """The median elevation of each ring's returns, of at least `count` rings; those without returns lie between their
     neighbours."""
     present = np.unique(rings)
     numbers = np.arange(max(count, present.max() + 1))
     return np.interp(numbers, present, [np.median(elevations[rings == ring]) for ring in present])
-
-
-def _steps(lidar: Lidar, azimuths: np.ndarray, rings: np.ndarray) -> int:
-    """The number of firings of a revolution, by the median gap between neighbouring returns of a beam."""
-    order = np.lexsort([azimuths, rings])
-    gaps = np.diff(azimuths[order])[np.diff(rings[order]) == 0]
-    gaps = gaps[gaps > 1e-5]  # duplicated returns
-    if not len(gaps):
-        raise DatasetError(f"LiDAR {lidar.name}: a sweep with so few returns needs azimuth_steps to tell its rays")
-    return max(1, round(2.0 * np.pi / float(np.median(gaps))))
-
-
-def _phases(azimuths: np.ndarray, rings: np.ndarray, beams: int, steps: int) -> Float[np.ndarray, " beams"]:
-    """The shift of each beam's firings from evenly spaced azimuths, the circular mean of its returns', in radians; for
-    beams without returns that of all."""
-    turns = np.exp(1j * steps * (azimuths + np.pi))
-    of_beams = np.bincount(rings, turns.real, beams) + 1j * np.bincount(rings, turns.imag, beams)
-    return np.angle(np.where(np.bincount(rings, minlength=beams) > 0, of_beams, turns.sum())) / steps
 
 
 def _of_firings(columns: np.ndarray, offsets: np.ndarray, steps: int) -> Float[np.ndarray, " steps"]:

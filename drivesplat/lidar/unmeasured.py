@@ -26,7 +26,7 @@ def measured_rays(scans: Sequence[Scan], ego_radius: float) -> list[Bool[np.ndar
     which meet the ego vehicle too near to be measured; and all rays of a sector of MIN_SECTOR or more without a single
     return.
     """
-    near = [near_sensor(scan, ego_radius) for scan in scans]
+    near = [scan.returned & (scan.ranges * np.cos(scan.rays.elevations) <= ego_radius) for scan in scans]
     beams = max((scan.rays.shape[0] for scan in scans), default=0)
     counts = np.zeros((beams, AZIMUTH_BINS), dtype=np.int64)
     for scan, close in zip(scans, near, strict=True):
@@ -34,10 +34,13 @@ def measured_rays(scans: Sequence[Scan], ego_radius: float) -> list[Bool[np.ndar
         met[_cells(scan)[0][close], _cells(scan)[1][close]] = True
         counts += met
     often = counts > 0.5 * len(scans)
-    return [
-        ~close & ~(~scan.returned & _from_above(often, scan)[_cells(scan)]) & ~skipped(scan)
-        for scan, close in zip(scans, near, strict=True)
-    ]
+    found = []
+    for scan, close in zip(scans, near, strict=True):
+        downwards = np.argsort(-scan.rays.beam_elevations, kind="stable")
+        met_from_above = np.empty((len(downwards), AZIMUTH_BINS), dtype=bool)
+        met_from_above[downwards] = np.logical_or.accumulate(often[downwards], axis=0)
+        found.append(~close & ~(~scan.returned & met_from_above[_cells(scan)]) & ~skipped(scan))
+    return found
 
 
 def blocked_rays(
@@ -61,19 +64,6 @@ def blocked_rays(
     mostly = returns.sum(axis=1) >= 0.5 * rays.sum(axis=1)
     empty = mostly[:, None] & (rays > 0) & (returns == 0)
     return [empty[_cells(scan)] & (scan.rays.beam_elevations < 0)[:, None] for scan in scans]
-
-
-def _from_above(cells: Bool[np.ndarray, "beams bins"], scan: Scan) -> Bool[np.ndarray, "b bins"]:
-    """The cells of each beam of a scan, with those that are set for a beam above it."""
-    downwards = np.argsort(-scan.rays.beam_elevations, kind="stable")
-    out = np.empty((len(downwards), cells.shape[1]), dtype=bool)
-    out[downwards] = np.logical_or.accumulate(cells[downwards], axis=0)
-    return out
-
-
-def near_sensor(scan: Scan, radius: float) -> Bool[np.ndarray, "b a"]:
-    """The rays with a return within `radius` metres of the sensor, horizontally."""
-    return scan.returned & (scan.ranges * np.cos(scan.rays.elevations) <= radius)
 
 
 def skipped(scan: Scan) -> Bool[np.ndarray, "b a"]:

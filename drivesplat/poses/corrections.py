@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from drivesplat.scene.rigid import interpolate, inverse, rigid
-from drivesplat.scene.scene import UNPOSED, Scene, Sweep
+from drivesplat.scene.scene import UNPOSED, Scene
 
 
 @dataclass(frozen=True)
@@ -74,24 +74,20 @@ def apply_corrections(scene: Scene, corrections: Corrections, poses: str = "refi
         )
         for frame, delta in zip(scene.frames, deltas, strict=True)
     )
-    sweeps = tuple(_corrected_sweep(sweep, corrections, scene.poses == UNPOSED) for sweep in scene.sweeps)
+    sweeps = []
+    for sweep in scene.sweeps:
+        placed = corrections.in_world(np.array([sweep.timestamp]))[0] @ sweep.sensor_to_world
+        motion = sweep.motion
+        if motion is not None and scene.poses == UNPOSED:
+            begin, end = sweep.timestamp + np.round(motion.offsets_s[[0, -1]] * 1e6).astype(np.int64)
+            within = corrections.timestamps[(corrections.timestamps > begin) & (corrections.timestamps < end)]
+            times = np.unique([begin, *within, end])
+            ego_to_world = sweep.sensor_to_world @ motion.ego_to_sweep[0] @ corrections.at(times)
+            offsets_s = (times - sweep.timestamp) * 1e-6
+            motion = replace(motion, offsets_s=offsets_s, ego_to_sweep=inverse(placed) @ ego_to_world)
+        sweeps.append(replace(sweep, sensor_to_world=placed, motion=motion))
     tracks = tuple(
         replace(track, object_to_world=corrections.in_world(track.timestamps) @ track.object_to_world)
         for track in scene.tracks
     )
-    return replace(scene, frames=frames, sweeps=sweeps, tracks=tracks, poses=poses)
-
-
-def _corrected_sweep(sweep: Sweep, corrections: Corrections, stands: bool) -> Sweep:
-    """A sweep with its corrected pose, and where the given vehicle `stands`, with its corrected motion."""
-    placed = corrections.in_world(np.array([sweep.timestamp]))[0] @ sweep.sensor_to_world
-    if not stands or sweep.motion is None:
-        return replace(sweep, sensor_to_world=placed)
-    begin, end = sweep.timestamp + np.round(sweep.motion.offsets_s[[0, -1]] * 1e6).astype(np.int64)
-    within = corrections.timestamps[(corrections.timestamps > begin) & (corrections.timestamps < end)]
-    times = np.unique([begin, *within, end])
-    ego_to_world = sweep.sensor_to_world @ sweep.motion.ego_to_sweep[0] @ corrections.at(times)
-    motion = replace(
-        sweep.motion, offsets_s=(times - sweep.timestamp) * 1e-6, ego_to_sweep=inverse(placed) @ ego_to_world
-    )
-    return replace(sweep, sensor_to_world=placed, motion=motion)
+    return replace(scene, frames=frames, sweeps=tuple(sweeps), tracks=tracks, poses=poses)

@@ -19,7 +19,7 @@ from drivesplat.poses.mapping import REMEDY, MappedImages, map_images
 from drivesplat.poses.rig import RigImages, ego_to_camera
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.refine_poses import LimitSettings, PriorSettings, RefinePosesJob
+from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob
 
 ROUNDS = 2
 """The first round places sweeps by recorded poses, the second by the estimated ones."""
@@ -47,8 +47,18 @@ def estimate_poses(images: RigImages, database: Path, job: RefinePosesJob, threa
     for _ in range(ROUNDS):
         source, scales = _scales(scene, images, model, job)
         outliers = scale.scale_outliers(scales, limits.max_scale_drift)
-        _require_constant_scale(scene, source, scales, outliers, limits)
         model, scales = model.without(outliers), scales[~outliers]
+        drift = scale.scale_drift(scales)
+        problem = None
+        if outliers.mean() > 1.0 - limits.min_images:
+            problem = f"{outliers.sum()} of {len(outliers)} images are misplaced (min_images)"
+        elif not drift <= limits.max_scale_drift:
+            problem = f"the scale changes by a factor of {drift:.2f} along the drive (max_scale_drift)"
+        if problem:
+            raise DatasetError(
+                f"scene {scene.name}: no poses from images alone: according to {source}, {problem}, more than "
+                f"refine_poses.limits allows, as where a vehicle drives straight ahead; {REMEDY}"
+            )
         mounts = np.stack([ego_to_camera(images.frames[i]) for i in model.placed])
         recorded, poses = given[model.placed], metric_poses(model.camera_to_model, scales) @ mounts
         poses = align_poses(recorded, poses, job.refine_poses.priors)
@@ -62,26 +72,10 @@ def estimate_poses(images: RigImages, database: Path, job: RefinePosesJob, threa
         "models": list(model.sizes),
         "scale_from": source,
         "scale": float(np.nanmedian(scales)),
-        "scale_drift": scale.scale_drift(scales),
+        "scale_drift": drift,
         "aligned_to": "recorded poses" if recorded_move else "first image",
     }
     return EstimatedPoses(corrections, recorded_move, record)
-
-
-def _require_constant_scale(
-    scene: Scene, source: str, scales: np.ndarray, outliers: np.ndarray, limits: LimitSettings
-) -> None:
-    problem = None
-    drift = scale.scale_drift(scales[~outliers])
-    if outliers.mean() > 1.0 - limits.min_images:
-        problem = f"{outliers.sum()} of {len(outliers)} images are misplaced (min_images)"
-    elif not drift <= limits.max_scale_drift:
-        problem = f"the scale changes by a factor of {drift:.2f} along the drive (max_scale_drift)"
-    if problem:
-        raise DatasetError(
-            f"scene {scene.name}: no poses from images alone: according to {source}, {problem}, more than "
-            f"refine_poses.limits allows, as where a vehicle drives straight ahead; {REMEDY}"
-        )
 
 
 def _scales(scene: Scene, images: RigImages, model: MappedImages, job: RefinePosesJob) -> tuple[str, np.ndarray]:

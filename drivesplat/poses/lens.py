@@ -85,10 +85,14 @@ class LensTrial:
         return float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-12))
 
     def warning(self) -> str | None:
-        """A sentence where images contradict the stated lens."""
-        return self._matrix_warning() or self._distortion_warning()
+        """A sentence where images contradict the stated lens: its camera matrix, or else its distortion."""
 
-    def _matrix_warning(self) -> str | None:
+        def better(kind: Kind) -> str:
+            return (
+                f"points that were not adjusted fit better (median error {self.errors[kind]:.3f} instead of "
+                f"{self.errors['fixed']:.3f} pixels)"
+            )
+
         old, new = self.stated, self.lenses["free"]
         changes = [
             [lens.focal / old.focal - 1.0 for lens in new],
@@ -96,33 +100,24 @@ class LensTrial:
             [(lens.centre[1] - old.centre[1]) / self.height for lens in new],
         ]
         limits = (MIN_FOCAL_CHANGE, MIN_CENTRE_CHANGE, MIN_CENTRE_CHANGE)
-        if not any(_both_beyond(pair, limit) for pair, limit in zip(changes, limits, strict=True)):
-            return None
-        if min(self.significance("free", "fixed"), self.significance("free", "radial")) < MIN_SIGNIFICANCE:
-            return None
-        focal, x, y = (np.mean(each) for each in zip(*((lens.focal, *lens.centre) for lens in new), strict=True))
-        return (
-            f"images of camera {self.camera} contradict its camera matrix K: {self._gain('free')} with a focal length "
-            f"of {focal:.0f} pixels instead of {old.focal:.0f} and the principal point ({x:.0f}, {y:.0f}) instead of "
-            f"({old.centre[0]:.0f}, {old.centre[1]:.0f}); K may belong to another image size"
-        )
-
-    def _distortion_warning(self) -> str | None:
+        significance = min(self.significance("free", "fixed"), self.significance("free", "radial"))
+        beyond = (_both_beyond(pair, limit) for pair, limit in zip(changes, limits, strict=True))
+        if any(beyond) and not significance < MIN_SIGNIFICANCE:
+            focal, x, y = (np.mean(each) for each in zip(*((lens.focal, *lens.centre) for lens in new), strict=True))
+            return (
+                f"images of camera {self.camera} contradict its camera matrix K: {better('free')} with a focal length "
+                f"of {focal:.0f} pixels instead of {old.focal:.0f} and the principal point ({x:.0f}, {y:.0f}) instead "
+                f"of ({old.centre[0]:.0f}, {old.centre[1]:.0f}); K may belong to another image size"
+            )
         corner = np.hypot(self.width, self.height) / 2.0
         pair = [lens.k1 * (corner / lens.focal) ** 2 for lens in self.lenses["radial"]]
         if not _both_beyond(pair, MIN_DISTORTION) or self.significance("radial", "fixed") < MIN_SIGNIFICANCE:
             return None
         k1 = float(np.mean([lens.k1 for lens in self.lenses["radial"]]))
         return (
-            f"images of camera {self.camera} look distorted: {self._gain('radial')} with k1 = {k1:.2g} "
+            f"images of camera {self.camera} look distorted: {better('radial')} with k1 = {k1:.2g} "
             f"({abs(np.mean(pair)) * corner:.0f} pixels at the corner); state the distortion of the lens, or correct "
             "the stated one"
-        )
-
-    def _gain(self, kind: Kind) -> str:
-        return (
-            f"points that were not adjusted fit better (median error {self.errors[kind]:.3f} instead of "
-            f"{self.errors['fixed']:.3f} pixels)"
         )
 
 
@@ -157,29 +152,22 @@ def with_tested_images(scene: Scene) -> Scene:
         if frame.is_key_frame and scene.poses != UNPOSED:
             by_camera.setdefault(frame.camera, []).append(frame)
     number = max(MIN_IMAGES, min(MAX_IMAGES[0], MAX_IMAGES[1] // max(1, len(by_camera))))
-    chosen = [_window(_apart(frames), number) for frames in by_camera.values()]
+    chosen = []
+    for frames in by_camera.values():
+        apart = frames[:1]
+        for frame in frames[1:]:
+            last = apart[-1].ego_to_world
+            moved = np.linalg.norm(frame.ego_to_world[:3, 3] - last[:3, 3])
+            if moved > MIN_STEP or _turn(last, frame.ego_to_world) > MIN_TURN:
+                apart.append(frame)
+        # the window in which the vehicle turns most: turns determine a focal length
+        turns = np.array([_turn(a.ego_to_world, b.ego_to_world) for a, b in pairwise(apart)])
+        sums = [turns[i : i + number - 1].sum() for i in range(max(1, len(apart) - number + 1))]
+        first = int(np.argmax(np.round(sums, 3)))
+        chosen.append(apart[first : first + number])
     usable = [frames for frames in chosen if len(frames) >= MIN_IMAGES][: MAX_IMAGES[1] // number]
     tested = [dataclasses.replace(frame, sample_index=i) for frames in usable for i, frame in enumerate(frames)]
     return dataclasses.replace(scene, frames=tuple(tested))
-
-
-def _apart(frames: list[Frame]) -> list[Frame]:
-    """Those of some images, in the order of time, from places or headings that differ."""
-    chosen = frames[:1]
-    for frame in frames[1:]:
-        last = chosen[-1].ego_to_world
-        moved = np.linalg.norm(frame.ego_to_world[:3, 3] - last[:3, 3])
-        if moved > MIN_STEP or _turn(last, frame.ego_to_world) > MIN_TURN:
-            chosen.append(frame)
-    return chosen
-
-
-def _window(frames: list[Frame], number: int) -> list[Frame]:
-    """The successive images, so many at most, among which the vehicle turns most: turns determine a focal length."""
-    turns = np.array([_turn(a.ego_to_world, b.ego_to_world) for a, b in pairwise(frames)])
-    sums = [turns[i : i + number - 1].sum() for i in range(max(1, len(frames) - number + 1))]
-    first = int(np.argmax(np.round(sums, 3)))
-    return frames[first : first + number]
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> float:
@@ -197,7 +185,15 @@ def lens_trial(
     numbers = np.array(sorted(unadjusted.points3D), dtype=np.int64)
     if len(numbers) < MIN_POINTS:
         return None
-    model = _with_radial_lens(unadjusted)
+    # A copy whose camera has one focal length and a radial coefficient; rows of features are scaled accordingly.
+    model = pycolmap.Reconstruction(unadjusted)
+    camera = model.cameras[1]
+    focal, vertical, x, y = camera.params
+    for image in model.images.values():
+        for feature in image.points2D:
+            feature.xy = feature.xy * [1.0, focal / vertical]
+    camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+    camera.params = [focal, x, y * focal / vertical, 0.0]
     halves = np.array_split(np.random.default_rng(job.random_seed).permutation(numbers), 2)
     lenses: dict[Kind, tuple[Lens, Lens]] = {}
     losses: dict[Kind, np.ndarray] = {}
@@ -209,22 +205,7 @@ def lens_trial(
         lenses[kind] = (tried[0][0], tried[1][0])
         losses[kind] = np.concatenate([loss for _, loss, _ in tried])
         errors[kind] = float(np.median(np.concatenate([error for _, _, error in tried])))
-    camera = model.cameras[1]
-    stated = _lens(camera)
-    return LensTrial(images.cameras[0], camera.width, camera.height, stated, lenses, losses, errors)
-
-
-def _with_radial_lens(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """A copy whose camera has one focal length and a radial coefficient; rows of features are scaled accordingly."""
-    copy = pycolmap.Reconstruction(reconstruction)
-    camera = copy.cameras[1]
-    focal, vertical, x, y = camera.params
-    for image in copy.images.values():
-        for feature in image.points2D:
-            feature.xy = feature.xy * [1.0, focal / vertical]
-    camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
-    camera.params = [focal, x, y * focal / vertical, 0.0]
-    return copy
+    return LensTrial(images.cameras[0], camera.width, camera.height, _lens(camera), lenses, losses, errors)
 
 
 def _lens(camera: pycolmap.Camera) -> Lens:

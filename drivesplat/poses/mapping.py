@@ -68,21 +68,58 @@ def map_images(images: RigImages, database: Path, job: RefinePosesJob, threads: 
     models = {camera: _models(images, camera, database, job, threads) for camera in images.cameras}
     camera = max(models, key=lambda name: _extent(models[name][0]) if models[name] else (0, 0))
     sizes = tuple(model.num_reg_images() for model in models[camera])
-    _require_enough(images, camera, sizes, job.refine_poses.limits.min_images)
-    largest = models[camera][0]
+    failure = f"scene {images.scene.name}: no poses from images alone"
+    if not sizes:
+        raise DatasetError(
+            f"{failure}: no two of the {len(images)} images share enough features from positions far enough apart, as "
+            f"where the vehicle stands, rotates in place, or drives by night; {REMEDY}"
+        )
+    key_frames, fraction = len({frame.sample_index for frame in images.frames}), job.refine_poses.limits.min_images
+    if sizes[0] < fraction * key_frames:
+        formed = "one model" if len(sizes) == 1 else f"{len(sizes)} models ({', '.join(map(str, sizes))} images)"
+        raise DatasetError(
+            f"{failure}: the images of {camera}, the best camera, form {formed}; the largest places {sizes[0]} of "
+            f"{key_frames} key frames, less than refine_poses.limits.min_images, {fraction:g}; {REMEDY}"
+        )
+    largest, poses, points = models[camera][0], [], []
     numbers = sorted(largest.reg_image_ids())
-    poses = np.stack([inverse(from_pycolmap(largest.images[number].cam_from_world())) for number in numbers])
-    points = tuple(_image_points(largest, number) for number in numbers)
-    return MappedImages(camera, np.array(numbers) - 1, poses, points, sizes)
+    for number in numbers:
+        image = largest.images[number]
+        features = image.get_observation_points2D()
+        pixels = np.array([feature.xy for feature in features]).reshape(-1, 2)
+        seen = np.array([largest.points3D[feature.point3D_id].xyz for feature in features]).reshape(-1, 3)
+        camera_from_model = image.cam_from_world().matrix()
+        points.append(ImagePoints(pixels, seen @ camera_from_model[2, :3] + camera_from_model[2, 3]))
+        poses.append(inverse(from_pycolmap(image.cam_from_world())))
+    return MappedImages(camera, np.array(numbers) - 1, np.stack(poses), tuple(points), sizes)
 
 
 def _models(
     images: RigImages, camera: str, database: Path, job: RefinePosesJob, threads: int
 ) -> list[pycolmap.Reconstruction]:
-    """The mapper's models of a camera's images, the largest first."""
+    """The mapper's models of a camera's images, the largest first. The options are those for a vehicle: mostly forward
+    motion, small angles, calibrated cameras."""
+    settings = job.refine_poses
     folder = database.parent / "models" / camera
     folder.mkdir(parents=True, exist_ok=True)
-    options = _options(job, threads)
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=job.random_seed,
+        num_threads=threads,
+        extract_colors=False,
+        min_model_size=MIN_MODEL_IMAGES,
+        ba_refine_focal_length=False,
+        ba_refine_principal_point=False,
+        ba_refine_extra_params=False,
+        ba_refine_sensor_from_rig=False,
+    )
+    options.mapper.random_seed = options.triangulation.random_seed = job.random_seed
+    options.mapper.num_threads = threads
+    options.mapper.init_max_forward_motion = 1.0
+    options.mapper.init_min_tri_angle = INITIAL_ANGLE
+    options.mapper.abs_pose_min_num_inliers = settings.limits.min_points
+    options.mapper.abs_pose_refine_focal_length = False
+    options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = max(MIN_ANGLE, settings.min_angle)
     options.image_names = [image_name(number) for number in images.key_frames()[camera].values()]
     progress = MappingProgress(camera, len(options.image_names))
     models = pycolmap.incremental_mapping(
@@ -121,52 +158,3 @@ class MappingProgress:
 
 def _extent(model: pycolmap.Reconstruction) -> tuple[int, int]:
     return model.num_reg_images(), model.compute_num_observations()
-
-
-def _require_enough(images: RigImages, camera: str, sizes: tuple[int, ...], fraction: float) -> None:
-    failure = f"scene {images.scene.name}: no poses from images alone"
-    if not sizes:
-        raise DatasetError(
-            f"{failure}: no two of the {len(images)} images share enough features from positions far enough apart, as "
-            f"where the vehicle stands, rotates in place, or drives by night; {REMEDY}"
-        )
-    key_frames = len({frame.sample_index for frame in images.frames})
-    if sizes[0] < fraction * key_frames:
-        models = "one model" if len(sizes) == 1 else f"{len(sizes)} models ({', '.join(map(str, sizes))} images)"
-        raise DatasetError(
-            f"{failure}: the images of {camera}, the best camera, form {models}; the largest places {sizes[0]} of "
-            f"{key_frames} key frames, less than refine_poses.limits.min_images, {fraction:g}; {REMEDY}"
-        )
-
-
-def _options(job: RefinePosesJob, threads: int) -> pycolmap.IncrementalPipelineOptions:
-    """Mapper options for a vehicle: mostly forward motion, small angles, calibrated cameras."""
-    settings = job.refine_poses
-    options = pycolmap.IncrementalPipelineOptions(
-        random_seed=job.random_seed,
-        num_threads=threads,
-        extract_colors=False,
-        min_model_size=MIN_MODEL_IMAGES,
-        ba_refine_focal_length=False,
-        ba_refine_principal_point=False,
-        ba_refine_extra_params=False,
-        ba_refine_sensor_from_rig=False,
-    )
-    options.mapper.random_seed = options.triangulation.random_seed = job.random_seed
-    options.mapper.num_threads = threads
-    options.mapper.init_max_forward_motion = 1.0
-    options.mapper.init_min_tri_angle = INITIAL_ANGLE
-    options.mapper.abs_pose_min_num_inliers = settings.limits.min_points
-    options.mapper.abs_pose_refine_focal_length = False
-    options.mapper.abs_pose_refine_extra_params = False
-    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = max(MIN_ANGLE, settings.min_angle)
-    return options
-
-
-def _image_points(model: pycolmap.Reconstruction, number: int) -> ImagePoints:
-    image = model.images[number]
-    features = image.get_observation_points2D()
-    pixels = np.array([feature.xy for feature in features]).reshape(-1, 2)
-    points = np.array([model.points3D[feature.point3D_id].xyz for feature in features]).reshape(-1, 3)
-    camera_from_model = image.cam_from_world().matrix()
-    return ImagePoints(pixels, points @ camera_from_model[2, :3] + camera_from_model[2, 3])

@@ -49,11 +49,6 @@ class WithheldTrial:
     before: float
     after: float
 
-    def record(self) -> dict[str, Any]:
-        """The key `trial` of poses.json."""
-        pixels = {"before_px": _finite(self.before), "after_px": _finite(self.after)}
-        return {"points": self.points, "observations": self.observations, **pixels}
-
 
 def refine_poses(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_MASK, threads: int = 1) -> Refinement:
     """Refines a scene's poses; features on the ego vehicle are ignored. Where images cannot improve the given poses,
@@ -149,18 +144,13 @@ def _trial(
     for point in withheld.tolist():
         reduced.delete_point3D(point)
     bundle_adjust(reduced, priors, settings.robust_pixels, threads)
-    fitted = [_fitted(start, poses, job, threads) for poses in (priors.given, poses_of(reduced))]
+    fitted = []
+    for poses in (priors.given, poses_of(reduced)):
+        whole = with_poses(start, poses)
+        bundle_adjust(whole, None, settings.robust_pixels, threads)
+        fitted.append(observations_of(whole))
     errors = [points.error[np.isin(points.numbers[points.point], withheld)] for points in fitted]
     return WithheldTrial(len(withheld), len(errors[-1]), *map(_median, errors)), fitted[0]
-
-
-def _fitted(
-    reconstruction: pycolmap.Reconstruction, poses: np.ndarray, job: RefinePosesJob, threads: int
-) -> Observations:
-    """The points of a reconstruction, fitted to other poses (n, 4, 4), ego_to_world, of its images."""
-    fitted = with_poses(reconstruction, poses)
-    bundle_adjust(fitted, None, job.refine_poses.robust_pixels, threads)
-    return observations_of(fitted)
 
 
 def unusable(
@@ -216,7 +206,13 @@ def _record(
         "observations": len(observations.point),
         "points_per_image": {"least": int(points.min()), "median": float(np.median(points))},
         "reprojection_px": _finite(_median(observations.error)),
-        "trial": None if trial is None else trial.record(),
+        "trial": trial
+        and {
+            "points": trial.points,
+            "observations": trial.observations,
+            "before_px": _finite(trial.before),
+            "after_px": _finite(trial.after),
+        },
         "shift_m": {"median": float(np.median(shift)), "largest": float(shift.max())},
         "turn_deg": {"median": float(np.median(turn)), "largest": float(turn.max())},
         "corrections": [

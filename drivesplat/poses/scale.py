@@ -12,11 +12,11 @@ from scipy.spatial import QhullError, cKDTree
 from drivesplat.lidar.coloring import visible
 from drivesplat.lidar.occlusion import patches, unoccluded
 from drivesplat.lidar.sweeps import nearest_returns
-from drivesplat.poses.mapping import ImagePoints, MappedImages
+from drivesplat.poses.mapping import MappedImages
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import LidarRays
 
 MAX_INTERVAL_US = 100_000.0
@@ -37,31 +37,24 @@ MIN_SEGMENT_IMAGES = 4
 def scales_from_lidar(scene: Scene, images: RigImages, model: MappedImages, rays: LidarRays) -> np.ndarray:
     """Metres per unit (n,) of the model's images, NaN where too few of an image's points have LiDAR depth. Poses of
     images and sweeps are those of `scene`."""
-    frames = [scene.frames[images.indices[i]] for i in model.placed]
-    return np.array([depth_ratio(scene, *pair, rays) for pair in zip(frames, model.points, strict=True)])
-
-
-def depth_ratio(scene: Scene, frame: Frame, points: ImagePoints, rays: LidarRays) -> float:
-    """The median ratio of LiDAR depth to model depth over an image's points, NaN where there are too few."""
-    returns = nearest_returns(scene.sweeps, frame.timestamp, MAX_INTERVAL_US, rays.own_car_radius)
-    if returns is None:
-        return np.nan
-    depth = depth_at(points.pixels, *_visible_returns(frame, returns, rays))
-    known = np.isfinite(depth) & (points.depth > 0)
-    return float(np.median(depth[known] / points.depth[known])) if known.sum() >= MIN_DEPTHS else np.nan
-
-
-def _visible_returns(frame: Frame, points: np.ndarray, rays: LidarRays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The m of the world points (n, 3) that an image sees: pixels (m, 2), depth (m,), and half the size (m, 2) of the
-    window in pixels that each stands for."""
-    k, world_to_camera = continuous_intrinsics(frame, (frame.width, frame.height)), inverse(frame.camera_to_world)
-    shape = (frame.height, frame.width)
-    index, rows, columns, depth = visible(points, world_to_camera, k, shape)
-    ranges = np.linalg.norm(points[index] - frame.camera_to_world[:3, 3], axis=1)
-    windows = patches(ranges, depth, k, rays.ray_spacing)
-    front = unoccluded(rows, columns, depth, windows, shape)
-    pixels, _ = project(points[index[front]], world_to_camera, k)
-    return pixels, depth[front], windows[front].clip(MIN_WINDOW)
+    scales = np.full(len(model.placed), np.nan)
+    for i, (placed, points) in enumerate(zip(model.placed, model.points, strict=True)):
+        frame = scene.frames[images.indices[placed]]
+        returns = nearest_returns(scene.sweeps, frame.timestamp, MAX_INTERVAL_US, rays.own_car_radius)
+        if returns is None:
+            continue
+        k, world_to_camera = continuous_intrinsics(frame, (frame.width, frame.height)), inverse(frame.camera_to_world)
+        shape = (frame.height, frame.width)
+        index, rows, columns, depth = visible(returns, world_to_camera, k, shape)
+        ranges = np.linalg.norm(returns[index] - frame.camera_to_world[:3, 3], axis=1)
+        windows = patches(ranges, depth, k, rays.ray_spacing)
+        front = unoccluded(rows, columns, depth, windows, shape)
+        pixels, _ = project(returns[index[front]], world_to_camera, k)
+        measured = depth_at(points.pixels, pixels, depth[front], windows[front].clip(MIN_WINDOW))
+        known = np.isfinite(measured) & (points.depth > 0)
+        if known.sum() >= MIN_DEPTHS:
+            scales[i] = np.median(measured[known] / points.depth[known])
+    return scales
 
 
 def depth_at(queries: np.ndarray, pixels: np.ndarray, depth: np.ndarray, windows: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
@@ -84,33 +83,22 @@ def gathered_points(
     if len(lidar) < settings.min_points:
         filling = random.uniform(-0.5, 0.5, (max(0, target - len(lidar)), 3)) * track.size
     elif len(lidar) and track.object_class.is_solid:
-        filling = points_above(lidar, track.size, target, random)
+        # on the sides and the roof above what LiDAR reaches: `target` times the share of the height that it does not
+        reached, half = float(np.quantile(lidar[:, 2], HIGHEST)), track.size[2] / 2.0
+        unreached = half - reached
+        count = round(target * min(1.0, unreached / track.size[2])) if unreached >= MIN_UNREACHED else 0
+        filling = random.uniform(-0.5, 0.5, (count, 3)) * track.size
+        filling[:, 2] = random.uniform(reached, max(reached, half), count)
+        sides = np.where(filling < 0.0, -0.5, 0.5) * track.size
+        sides[:, 2] = half
+        rows, nearest = np.arange(count), np.abs(sides - filling).argmin(axis=1)
+        filling[rows, nearest] = sides[rows, nearest]
     else:
         filling = np.empty((0, 3))
     most = settings.max_points - len(filling)
     if len(lidar) > most:
         lidar = lidar[np.sort(random.choice(len(lidar), most, replace=False))]
     return np.concatenate([lidar, filling]), len(lidar)
-
-
-def points_above(
-    lidar: Float[np.ndarray, "n 3"], size: Float[np.ndarray, "3"], per_box: int, random: np.random.Generator
-) -> Float[np.ndarray, "m 3"]:
-    """Random points on the sides and the roof of a box of `size` (metres) above its LiDAR points, all in the box's own
-    frame: `per_box` times the share of its height that LiDAR does not reach, or none where this is less than
-    MIN_UNREACHED metres."""
-    reached = float(np.quantile(lidar[:, 2], HIGHEST))
-    unreached = size[2] / 2.0 - reached
-    if unreached < MIN_UNREACHED:
-        return np.empty((0, 3))
-    count = round(per_box * min(1.0, unreached / size[2]))
-    points = random.uniform(-0.5, 0.5, (count, 3)) * size
-    points[:, 2] = random.uniform(reached, size[2] / 2.0, count)
-    sides = np.where(points < 0.0, -0.5, 0.5) * size
-    sides[:, 2] = size[2] / 2.0
-    rows, nearest = np.arange(count), np.abs(sides - points).argmin(axis=1)
-    points[rows, nearest] = sides[rows, nearest]
-    return points
 
 
 @dataclass(frozen=True)
@@ -163,20 +151,17 @@ class Seed:
         if number is None or pose is None:
             return
         self.pixels += int((view.owners == number).sum())
-        points = apply(pose, self._points)
+        seen_at = points = apply(pose, self._points)
+        if view.shutter is not None:
+            (height, width), own = view.owners.shape, self.dynamic_object.velocities(self._points, view.seconds)
+            camera_to_world = view.frame.camera_to_world
+            seen_at = where_seen(points, view.shutter, camera_to_world, view.intrinsics, (width, height), own)
         camera = inverse(view.frame.camera_to_world), view.intrinsics
-        index, rows, columns, _ = in_image(self._where_seen(points, view), *camera, view.owners.shape)
+        index, rows, columns, _ = in_image(seen_at, *camera, view.owners.shape)
         distances = np.linalg.norm(points[index] - view.frame.camera_to_world[:3, 3], axis=1)
         nearer = (view.owners[rows, columns] == number) & (distances < self._distances[index])
         self._distances[index[nearer]] = distances[nearer]
         self._colors[index[nearer]] = view.pixels[rows[nearer], columns[nearer]]
-
-    def _where_seen(self, points: np.ndarray, view: ActorView) -> np.ndarray:
-        """The world points (n, 3) of the object as `drivesplat.scene.shutter.where_seen` moves them."""
-        if view.shutter is None:
-            return points
-        (height, width), own = view.owners.shape, self.dynamic_object.velocities(self._points, view.seconds)
-        return where_seen(points, view.shutter, view.frame.camera_to_world, view.intrinsics, (width, height), own)
 
     def record(self) -> ActorRecord:
         """The actor's record. Points that no image shows get the mean colour of the others, or UNSEEN."""

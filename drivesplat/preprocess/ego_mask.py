@@ -13,10 +13,10 @@ Anything else is not masked. A missed body costs Gaussians in front of one camer
 """
 
 import logging
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -96,16 +96,14 @@ class ComparedImages:
 
     @classmethod
     def of(cls, scene: Scene, camera: str, search: EgoMaskSearch) -> "ComparedImages":
-        """From a scene's training images and training sweeps."""
+        """From a scene's training images, each at least MIN_STEP metres from the previous one, and training sweeps."""
         frames = [scene.frames[i] for i in training_images(scene, search.holdout) if scene.frames[i].camera == camera]
-        moving = spaced_frames(frames)
+        spaced: list[Frame] = []
+        for frame in sorted(frames, key=lambda frame: frame.timestamp):
+            if not spaced or _distance(spaced[-1], frame) >= MIN_STEP:
+                spaced.append(frame)
         sweeps = tuple(sweeps_of(scene, search.holdout))
-        return cls(len(frames), tuple(moving), sweeps, scene.key_frame_interval, search.own_car_radius)
-
-    @property
-    def path_length(self) -> float:
-        """Length in metres of the camera's path from the first image to the last."""
-        return float(sum(_distance(a, b) for a, b in zip(self.frames, self.frames[1:], strict=False)))
+        return cls(len(frames), tuple(spaced), sweeps, scene.key_frame_interval, search.own_car_radius)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -131,15 +129,6 @@ class ComparedImages:
         return max(1, round(at_full_width * self.size[0] / WIDTH))
 
 
-def spaced_frames(frames: Sequence[Frame]) -> list[Frame]:
-    """Frames in time order, each at least MIN_STEP metres from the previous one."""
-    kept: list[Frame] = []
-    for frame in sorted(frames, key=lambda frame: frame.timestamp):
-        if not kept or _distance(kept[-1], frame) >= MIN_STEP:
-            kept.append(frame)
-    return kept
-
-
 def _distance(a: Frame, b: Frame) -> float:
     return float(np.linalg.norm(a.camera_to_world[:3, 3] - b.camera_to_world[:3, 3]))
 
@@ -148,25 +137,33 @@ def find_outlines(drive: ComparedImages) -> tuple[tuple[Outline, ...], str | Non
     """The body's outlines, where the images show it with certainty; otherwise none, and the reason."""
     if drive.recorded < MIN_IMAGES:
         return (), f"too few images: {drive.recorded} for training; {MIN_IMAGES} are needed"
-    if len(drive.frames) < MIN_IMAGES or drive.path_length < MIN_PATH_LENGTH:
+    path_length = sum(_distance(a, b) for a, b in pairwise(drive.frames))
+    if len(drive.frames) < MIN_IMAGES or path_length < MIN_PATH_LENGTH:
         return (), (
             f"too short a path: {len(drive.frames)} images at least {MIN_STEP:g} m apart over "
-            f"{drive.path_length:.0f} m; {MIN_IMAGES} over {MIN_PATH_LENGTH:g} m are needed"
+            f"{path_length:.0f} m; {MIN_IMAGES} over {MIN_PATH_LENGTH:g} m are needed"
         )
     hits = lidar_images(drive)
     if len(hits) < MIN_IMAGES:
         return (), f"{len(hits)} images have LiDAR; {MIN_IMAGES} are needed to tell the body from an even road"
-    unreached = touching_edge(below_ego_horizon(drive) & (np.sum(hits, axis=0) < 2))
+    first = drive.frames[0]
+    camera_to_ego = inverse(first.ego_to_world) @ first.camera_to_world
+    below_horizon = upward_rays(drive.size, continuous_intrinsics(first, drive.size), camera_to_ego) < 0.0
+    unreached = touching_edge(below_horizon & (np.sum(hits, axis=0) < 2))
     if not unreached.any():
         return (), "LiDAR has returns all along the edge of the images"
     varies, median = variation(drive.images)
     whole = float(np.median(varies))
     if whole < MIN_VARIATION:
         return (), f"half of the pixels vary by {whole:.0f} grey levels or less: too little to detect constant ones"
-    varies, _ = variation(equal_brightness(drive.images, unreached & _rim(unreached.shape, drive.pixels(RING))))
-    constant = (
-        (varies < MAX_BODY_VARIATION * whole) & (median > LEVELS[0]) & (median < LEVELS[1]) & below_ego_horizon(drive)
-    )
+    # A body, if there is one, is lit as a whole: an image's brightness is the median ratio of the pixels near the edges
+    # to their medians over all images.
+    rim, width = unreached.copy(), drive.pixels(RING)
+    rim[:-width, width:-width] = False
+    pixels = drive.images[:, rim].astype(np.float64)
+    brightness = np.median(pixels / np.maximum(np.median(pixels, axis=0), 1.0), axis=1)
+    varies, _ = variation(drive.images / np.maximum(brightness, 1e-3)[:, None, None, :])
+    constant = (varies < MAX_BODY_VARIATION * whole) & (median > LEVELS[0]) & (median < LEVELS[1]) & below_horizon
     candidates = components(constant & dilated(unreached, drive.pixels(REACH)), drive)
     bodies = [piece for piece in candidates if contrasts(piece, varies, drive)]
     if not bodies:
@@ -177,33 +174,11 @@ def find_outlines(drive: ComparedImages) -> tuple[tuple[Outline, ...], str | Non
     return outlines_of(dilated(mask, drive.pixels(MARGIN))), None
 
 
-def equal_brightness(images: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Images (n, h, w, 3) float64 with equal brightness per channel. An image's brightness is the median, over the
-    pixels `where` (h, w) bool, of the ratio to the pixel's median over all images: the body is lit as a whole."""
-    pixels = images[:, where].astype(np.float64)
-    brightness = np.median(pixels / np.maximum(np.median(pixels, axis=0), 1.0), axis=1)
-    return images / np.maximum(brightness, 1e-3)[:, None, None, :]
-
-
-def _rim(shape: tuple[int, int], width: int) -> np.ndarray:
-    """The pixels (h, w) bool within `width` of an image's lower and side edges, where a body is if there is one."""
-    rim = np.ones(shape, dtype=bool)
-    rim[:-width, width:-width] = False
-    return rim
-
-
 def variation(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The variation of every pixel of `images` (n, h, w, 3) in grey levels: the range (h, w) from its 10th to its 90th
     percentile, in the channel where it is largest; and its median (h, w), averaged over the channels."""
     low, middle, high = np.percentile(images, (10, 50, 90), axis=0)
     return (high - low).max(axis=-1), middle.mean(axis=-1)
-
-
-def below_ego_horizon(drive: ComparedImages) -> np.ndarray:
-    """The pixels (h, w) bool whose rays point downwards in the ego frame."""
-    frame = drive.frames[0]
-    camera_to_ego = inverse(frame.ego_to_world) @ frame.camera_to_world
-    return upward_rays(drive.size, continuous_intrinsics(frame, drive.size), camera_to_ego) < 0.0
 
 
 def lidar_images(drive: ComparedImages) -> list[np.ndarray]:
@@ -250,7 +225,8 @@ def _padded(mask: np.ndarray) -> np.ndarray:
 def contrasts(body: np.ndarray, varies: np.ndarray, drive: ComparedImages) -> bool:
     """Whether pixels of the body (h, w) bool vary much less than those outside it, in a ring around its border."""
     near, far = drive.pixels(1), drive.pixels(RING)
-    inside = body & ~_eroded(body, far) & _eroded(body, near)
+    eroded = [cv2.erode(_padded(body), _disc(by))[PAD:-PAD, PAD:-PAD].astype(bool) for by in (far, near)]
+    inside = body & ~eroded[0] & eroded[1]
     beside = dilated(body, far) & ~dilated(body, near)
     if not inside.any() or not beside.any():
         return False
@@ -260,10 +236,6 @@ def contrasts(body: np.ndarray, varies: np.ndarray, drive: ComparedImages) -> bo
 def dilated(mask: np.ndarray, by: int) -> np.ndarray:
     """A mask (h, w) bool dilated by a disc with radius `by` pixels."""
     return cv2.dilate(mask.astype(np.uint8), _disc(by)).astype(bool)
-
-
-def _eroded(mask: np.ndarray, by: int) -> np.ndarray:
-    return cv2.erode(_padded(mask), _disc(by))[PAD:-PAD, PAD:-PAD].astype(bool)
 
 
 def _disc(radius: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from drivesplat.preprocess.undistort import undistorted
 from drivesplat.readers.datasets import reader, unpacker
 from drivesplat.readers.drive_warnings import drive_warnings
 from drivesplat.readers.image_file import image_fault
-from drivesplat.scene.scene import Frame, Scene, place_of
+from drivesplat.scene.scene import Scene, place_of
 from drivesplat.scene.scene_warnings import luminance, scene_warnings
 from drivesplat.settings.extract import SceneSource
 
@@ -50,7 +50,12 @@ def extract_scene(
         faults = list(pool.map(image_fault, scene.frames))
     bad = [(frame, fault) for frame, fault in zip(scene.frames, faults, strict=True) if fault]
     if bad and source.on_missing == "stop":
-        raise DatasetError(_remedied(*bad[0]))
+        frame, fault = bad[0]
+        no_sweeps = "" if frame.is_key_frame else "sweeps: false to do without all images between key frames, or "
+        raise DatasetError(
+            f"{place_of(frame)} ({frame.camera}): {fault}; "
+            f"restore the file, or set {no_sweeps}extract.on_missing: warn to go on without it"
+        )
     for frame, fault in bad[:MAX_NAMED]:
         log.warning("%s: %s; left out", place_of(frame), fault)
     if len(bad) > MAX_NAMED:
@@ -76,12 +81,3 @@ def _folder(results: Path | None, source: SceneSource) -> Path:
     if results is None:
         raise DatasetError(f"scene {source.scene}: its images have to be written anew, and there is no folder for them")
     return results
-
-
-def _remedied(frame: Frame, fault: str) -> str:
-    """The error message for a fault that stops the extraction, with the remedy."""
-    no_sweeps = "" if frame.is_key_frame else "sweeps: false to do without all images between key frames, or "
-    return (
-        f"{place_of(frame)} ({frame.camera}): {fault}; "
-        f"restore the file, or set {no_sweeps}extract.on_missing: warn to go on without it"
-    )

@@ -8,7 +8,7 @@ import logging
 
 import numpy as np
 
-from drivesplat.lidar.depth import depths_in, nearest_cloud, nearest_per_pixel, split_sweeps
+from drivesplat.lidar.depth import depths_in, nearest_per_pixel, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import target_size
@@ -24,9 +24,13 @@ def lidar_depths(scene: Scene, job: LidarDepthJob, ego_mask: EgoMask = NO_EGO_MA
     outside the training split."""
     clouds, images = split_sweeps(scene, job, ("train",)), []
     for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
-        cloud = nearest_cloud(clouds, frame.timestamp, scene.key_frame_interval) if group == "train" else None
-        body = ego_mask.pixels(frame.camera, target_size(frame, job.images))
-        images.append(depths_in(scene, frame, cloud, job, body) if cloud else nearest_per_pixel(np.empty((0, 3))))
+        time, interval = frame.timestamp, scene.key_frame_interval
+        cloud = min(clouds, key=lambda cloud: abs(cloud.timestamp - time), default=None) if group == "train" else None
+        if cloud and abs(cloud.timestamp - time) < interval:
+            body = ego_mask.pixels(frame.camera, target_size(frame, job.images))
+            images.append(depths_in(scene, frame, cloud, job, body))
+        else:
+            images.append(nearest_per_pixel(np.empty((0, 3))))
     known = [len(image) for image in images if len(image)]
     log.info("%d depths in %d of %d images", sum(known), len(known), len(images))
     return images

@@ -79,13 +79,23 @@ def seed_points(
     views = KeptViews(lambda i: color_view(scene, frames[i], job.images, ego_mask))
     colors, seen = color_by_visibility(positions, times, prefetch(views.__getitem__, range(len(frames))))
     if job.lidar_seed.points_file:
-        of_file = source == list(sources).index("points_file")
-        _warn_of_misplaced(scene, frames, Path(job.lidar_seed.points_file).name, positions[of_file], seen[of_file] > 0)
+        of_file = seen[source == list(sources).index("points_file")] > 0
+        _warn_of_misplaced(scene, frames, Path(job.lidar_seed.points_file).name, extra, of_file)
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
     positions, colors, source = positions[kept], colors[kept], source[kept]
-    far, far_colors = _far_points(frames, views, positions, job, random)
+    ground = [float(frame.ego_to_world[2, 3]) for frame in frames]
+
+    def view_of(i: int) -> tuple[int, ColorView, Uncovered]:
+        view = views[i]
+        return i, view, uncovered(view, positions, ground[i])
+
+    settings, parts = job.lidar_seed, [(np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8))]
+    shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
+    for i, view, candidates in prefetch(view_of, range(len(frames))):
+        parts.append(far_points(view, ground[i], candidates, shares[i], settings.far_depths, random, settings.far_near))
+    far, far_colors = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     note = {
         **{name: int((source == i).sum()) for i, name in enumerate(sources)},
         "far": len(far),
@@ -193,25 +203,6 @@ def color_view(scene: Scene, frame: Frame, images: ImageSettings, ego_mask: EgoM
         usable,
         shutter_of(scene, frame),
     )
-
-
-def _far_points(
-    frames: list[Frame], views: KeptViews, covered: np.ndarray, job: SeedJob, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    ground = [float(frame.ego_to_world[2, 3]) for frame in frames]
-
-    def view_of(i: int) -> tuple[int, ColorView, Uncovered]:
-        view = views[i]
-        return i, view, uncovered(view, covered, ground[i])
-
-    settings = job.lidar_seed
-    positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
-    shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
-    for i, view, candidates in prefetch(view_of, range(len(frames))):
-        p, c = far_points(view, ground[i], candidates, shares[i], settings.far_depths, random, settings.far_near)
-        positions.append(p)
-        colors.append(c)
-    return np.concatenate(positions), np.concatenate(colors)
 
 
 class Uncovered(NamedTuple):

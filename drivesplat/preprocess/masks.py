@@ -9,7 +9,7 @@ of a scene for other tracks than the annotated ones.
 
 import dataclasses
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -69,12 +69,25 @@ def make_masks(
     Raises DatasetError naming the file where a user's mask is missing, unreadable, in colours or of another aspect
     ratio than its image, ConfigError where a user's folder is the output.
     """
-    _refuse_own_folder(job, folder)
+    for setting in ("regions_folder", "sky_folder", "semantic_folder"):
+        given = getattr(job.masks, setting)
+        if given and Path(given).expanduser().resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(
+                f"masks.{setting}: {given} is where the rule 'masks' writes; copy it, and name the copy (docs/masks.md)"
+            )
     groups, training = frame_groups(scene, job.holdout), sweeps_of(scene, job.holdout)
 
     def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
         size = target_size(frame, job.images)
-        labels = _regions(scene, frame, job, size)
+        if job.masks.regions_folder:
+            labels = _users_mask(job.masks.regions_folder, frame, size).copy()
+            if labels.max() > max(LABELS.values()):
+                raise DatasetError(
+                    f"masks.regions_folder: {users_file(job.masks.regions_folder, frame)} holds label {labels.max()}; "
+                    f"the highest label is {max(LABELS.values())}"
+                )
+        else:
+            labels = label_image(scene, frame, size)
         labels[ego_mask.pixels(frame.camera, size)] = LABELS["own_car"]
         body = labels == LABELS["own_car"]
         sweeps = training if group == "train" else scene.sweeps
@@ -138,29 +151,11 @@ def _sky(sweeps: Sequence[Sweep], scene: Scene, frame: Frame, job: MaskJob, size
         return _datasets_classes(frame, size) == scene.sky_class
     lidar = nearest_returns(sweeps, frame.timestamp, scene.key_frame_interval)
     pixels, intrinsics = read_image(frame.image_path, size), continuous_intrinsics(frame, size)
-    return sky_mask(pixels, intrinsics, frame.camera_to_world, lidar, solid_pixels(scene, frame, size))
-
-
-def solid_pixels(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    """The pixels (h, w) bool of a frame at `size` (width, height) in the boxes of vehicles that fill them: they hardly
-    show the sky."""
-    solid = np.zeros((size[1], size[0]), dtype=bool)
+    solid = np.zeros((size[1], size[0]), dtype=bool)  # vehicles that fill their boxes hardly show the sky
     for hull in hulls_in(scene, frame, size):
         if hull.box.object_class.is_solid:
             solid |= fill(hull.polygon, size)
-    return solid
-
-
-def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) -> np.ndarray:
-    if not job.masks.regions_folder:
-        return label_image(scene, frame, size)
-    labels = _users_mask(job.masks.regions_folder, frame, size).copy()
-    if labels.max() > max(LABELS.values()):
-        raise DatasetError(
-            f"masks.regions_folder: {users_file(job.masks.regions_folder, frame)} holds label {labels.max()}; "
-            f"the highest label is {max(LABELS.values())}"
-        )
-    return labels
+    return sky_mask(pixels, intrinsics, frame.camera_to_world, lidar, solid)
 
 
 def _users_mask(folder: str, frame: Frame, size: tuple[int, int]) -> np.ndarray:
@@ -176,16 +171,6 @@ def users_file(folder: str, frame: Frame) -> Path:
         if path.is_file():
             return path
     raise DatasetError(f"mask {by_name} is missing, and so is {by_time.name} (docs/masks.md)")
-
-
-def _refuse_own_folder(job: MaskJob, folder: Path) -> None:
-    """Raises ConfigError where a folder of the user's is that of the masks written here."""
-    for setting in ("regions_folder", "sky_folder", "semantic_folder"):
-        given = getattr(job.masks, setting)
-        if given and Path(given).expanduser().resolve().is_relative_to(folder.resolve()):
-            raise ConfigError(
-                f"masks.{setting}: {given} is where the rule 'masks' writes; copy it, and name the copy (docs/masks.md)"
-            )
 
 
 def sky_mask(
@@ -212,9 +197,12 @@ def sky_mask(
     candidate &= gradient < SMOOTH / scale
     candidate &= upward_rays((width, height), intrinsics, camera_to_world) > MIN_ELEVATION
     if lidar is not None:
-        candidate &= ~_near_returns(
-            lidar, np.linalg.inv(camera_to_world), intrinsics, (height, width), max(1, round(LIDAR_REACH * scale))
-        )
+        hit, reach = np.zeros((height, width), dtype=np.uint8), max(1, round(LIDAR_REACH * scale))
+        at, depth = project(lidar, np.linalg.inv(camera_to_world), intrinsics)
+        inside = (depth > 0.5) & (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
+        columns, rows = at[inside].astype(np.int64).T
+        hit[rows, columns] = 1
+        candidate &= ~cv2.dilate(hit, np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)).astype(bool)
     if solid is not None:
         candidate &= ~solid
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -224,17 +212,6 @@ def sky_mask(
     at_top[labels[: max(1, round(2 * scale))]] = True
     at_top[0] = False
     return at_top[labels]
-
-
-def _near_returns(
-    lidar: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, shape: tuple[int, int], reach: int
-) -> np.ndarray:
-    hit = np.zeros(shape, dtype=np.uint8)
-    at, depth = project(lidar, world_to_camera, intrinsics)
-    inside = (depth > 0.5) & (at >= 0).all(axis=1) & (at[:, 0] < shape[1]) & (at[:, 1] < shape[0])
-    columns, rows = at[inside].astype(np.int64).T
-    hit[rows, columns] = 1
-    return cv2.dilate(hit, np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)).astype(bool)
 
 
 def relabelled_masks(scene: Scene, job: RegionJob, masks: Path, folder: Path) -> MasksRecord:
@@ -251,11 +228,7 @@ def relabelled_masks(scene: Scene, job: RegionJob, masks: Path, folder: Path) ->
 
     with ThreadPoolExecutor() as pool:
         list(pool.map(label, scene.frames))
-    _link_shared(masks, folder, scene.frames)
-    return dataclasses.replace(made, regions="boxes", visibility=visibility_source(scene.tracks))
-
-
-def _link_shared(masks: Path, folder: Path, frames: Iterable[Frame]) -> None:
-    for name in (mask_name(kind, frame.camera, frame.timestamp) for frame in frames for kind in SHARED):
+    for name in (mask_name(kind, frame.camera, frame.timestamp) for frame in scene.frames for kind in SHARED):
         if (masks / name).is_file():
             link_or_copy(masks / name, folder / name)
+    return dataclasses.replace(made, regions="boxes", visibility=visibility_source(scene.tracks))

@@ -26,13 +26,21 @@ def training_record(scene: Scene, seed: PointCloud | None, job: ParserJob) -> Tr
     cameras = list(dict.fromkeys(frame.camera for frame in frames))
     groups = np.array(frame_groups(scene, job.holdout), dtype=str)
     splits = {group: np.flatnonzero(groups == group) for group in get_args(Group)}
-    centers = _training_positions(scene, job)
+    if frames:
+        placed = [frame.camera_to_world for frame, group in zip(frames, groups, strict=True) if group == "train"]
+    else:
+        swept = zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True)
+        placed = [sweep.sensor_to_world for sweep, group in swept if group == "train"]
+    centers = _stacked([pose[:3, 3] for pose in placed], 3)
     if len(centers) == 0:
         raise DatasetError(
             f"scene {scene.name}: no training {'image' if frames else 'sweep'} is left; "
             "hold out fewer key frames (holdout.every_nth, holdout.last_block)"
         )
-    readout_s, velocities = _rolling_shutters(scene)
+    found, readout_s, velocities = shutters(scene), None, None
+    if any(found):
+        readout_s = np.stack([np.zeros(3) if shutter is None else shutter.readout_s for shutter in found])
+        velocities = np.stack([np.zeros(6) if shutter is None else shutter.velocity for shutter in found])
     seed = NO_SEED if seed is None else seed
     return TrainingRecord(
         Ks=_stacked([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)], 3, 3),
@@ -66,26 +74,6 @@ def training_record(scene: Scene, seed: PointCloud | None, job: ParserJob) -> Tr
     )
 
 
-def _training_positions(scene: Scene, job: ParserJob) -> np.ndarray:
-    """The positions (n, 3) of the cameras of training images, in a scene without images of the LiDARs of training
-    sweeps."""
-    if scene.frames:
-        chosen = zip(scene.frames, frame_groups(scene, job.holdout), strict=True)
-        return _stacked([frame.camera_to_world[:3, 3] for frame, group in chosen if group == "train"], 3)
-    swept = zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True)
-    return _stacked([sweep.sensor_to_world[:3, 3] for sweep, group in swept if group == "train"], 3)
-
-
 def _stacked(values: list[np.ndarray], *shape: int) -> np.ndarray:
     """Arrays of a `shape` along a new first axis, which may be empty."""
     return np.stack(values) if values else np.empty((0, *shape))
-
-
-def _rolling_shutters(scene: Scene) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """`TrainingRecord.readout_s` (n, 3) and `camera_velocities` (n, 6)."""
-    found = shutters(scene)
-    if not any(found):
-        return None, None
-    readouts = [np.zeros(3) if shutter is None else shutter.readout_s for shutter in found]
-    velocities = [np.zeros(6) if shutter is None else shutter.velocity for shutter in found]
-    return np.stack(readouts), np.stack(velocities)

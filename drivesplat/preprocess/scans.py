@@ -53,18 +53,27 @@ def scan_records(scene: Scene, job: ScansJob) -> ScanRecords:
         blocked = blocked_rays(
             [item.scan for item in found], [item.sweep.sensor_to_world for item in found], in_training
         )
-        records += [
-            _record(scene, item, rays, hidden, boxes)
-            for item, rays, hidden in zip(found, measured, blocked, strict=True)
-        ]
+        for item, rays, hidden in zip(found, measured, blocked, strict=True):
+            sweep, scan, seconds = item.sweep, item.scan, scene.seconds(item.sweep.timestamp)
+            offsets = scan.rays.offsets_s.astype(np.float64)
+            linear, angular = mean_velocity(item.poses, float(offsets.min()), float(offsets.max()))
+            objects = np.full(scan.returned.shape, NO_OBJECT, dtype=np.int16)
+            points, origins = world_returns(scan, sweep.sensor_to_world, item.poses)
+            objects[scan.returned] = boxes.met(points, origins, seconds + offsets[scan.returned])
+            record = RecordedScan(
+                sweep.lidar, sweep.timestamp, seconds, sweep.sample_index, sweep.is_key_frame, item.group,
+                sweep.sensor_to_world, linear, angular, scan, np.ascontiguousarray(rays), objects,
+                np.ascontiguousarray(hidden),
+            )  # fmt: skip
+            records.append(record)
     if not records:
         raise DatasetError(without_scans(scene.name))
-    rays = sum(record.scan.returned.size for record in records)
+    count = sum(record.scan.returned.size for record in records)
     log.info(
         "%d scans with %d rays: %.1f %% return, %.1f %% say nothing, %.1f %% are blocked by the vehicle",
-        len(records), rays, 100.0 * sum(int(record.scan.returned.sum()) for record in records) / rays,
-        100.0 * sum(int((~record.measured).sum()) for record in records) / rays,
-        100.0 * sum(int(record.blocked.sum()) for record in records) / rays,
+        len(records), count, 100.0 * sum(int(record.scan.returned.sum()) for record in records) / count,
+        100.0 * sum(int((~record.measured).sum()) for record in records) / count,
+        100.0 * sum(int(record.blocked.sum()) for record in records) / count,
     )  # fmt: skip
     return ScanRecords(records, [track.id for track in scene.tracks])
 
@@ -130,23 +139,6 @@ def firings(returns: LidarReturns, stated: int | None) -> int | None:
         return stated
     counted = round(float((times[-1] - times[0]) / np.median(np.diff(times)))) + 1
     return counted if abs(counted - stated) <= MAX_DEVIATION * stated else stated
-
-
-def _record(
-    scene: Scene, found: FoundScan, measured: np.ndarray, blocked: np.ndarray, boxes: TrackedBoxes
-) -> RecordedScan:
-    sweep, scan = found.sweep, found.scan
-    offsets = scan.rays.offsets_s.astype(np.float64)
-    linear, angular = mean_velocity(found.poses, float(offsets.min()), float(offsets.max()))
-    seconds = scene.seconds(sweep.timestamp)
-    objects = np.full(scan.returned.shape, NO_OBJECT, dtype=np.int16)
-    points, origins = world_returns(scan, sweep.sensor_to_world, found.poses)
-    objects[scan.returned] = boxes.met(points, origins, seconds + offsets[scan.returned])
-    return RecordedScan(
-        sweep.lidar, sweep.timestamp, seconds, sweep.sample_index, sweep.is_key_frame, found.group,
-        sweep.sensor_to_world, linear, angular, scan, np.ascontiguousarray(measured), objects,
-        np.ascontiguousarray(blocked),
-    )  # fmt: skip
 
 
 def world_returns(scan: Scan, sensor_to_world: np.ndarray, poses: SensorPoses) -> tuple[np.ndarray, np.ndarray]:

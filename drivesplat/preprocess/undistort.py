@@ -50,17 +50,14 @@ def undistorted(scene: Scene, folder: Path) -> Scene:
 
     with ThreadPoolExecutor() as pool:
         frames = tuple(pool.map(one, scene.frames))
-    cameras = tuple(_pinhole(camera, maps) for camera in scene.cameras)
-    return dataclasses.replace(scene, frames=frames, cameras=cameras)
-
-
-def _pinhole(camera: Camera, maps: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Camera:
-    if camera.name not in maps:
-        return camera
-    k, x, y = maps[camera.name]
-    return dataclasses.replace(
-        camera, intrinsics=k, distortion=np.zeros(5), distortion_model="none", readout_s=_readout(camera, x, y)
-    )
+    cameras = list(scene.cameras)
+    for i, camera in enumerate(cameras):
+        if camera.name in maps:
+            k, x, y = maps[camera.name]
+            cameras[i] = dataclasses.replace(
+                camera, intrinsics=k, distortion=np.zeros(5), distortion_model="none", readout_s=_readout(camera, x, y)
+            )
+    return dataclasses.replace(scene, frames=frames, cameras=tuple(cameras))
 
 
 def _readout(camera: Camera, x: np.ndarray, y: np.ndarray) -> float | None:
@@ -73,20 +70,15 @@ def _readout(camera: Camera, x: np.ndarray, y: np.ndarray) -> float | None:
     return camera.readout_s * float(np.polyfit(lines, sources.mean(axis=0), 1)[0])
 
 
-def _require_small_tangential(camera: Camera) -> None:
-    """Raises DatasetError where radial coefficients stand in the place of tangential ones."""
+def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The new intrinsics (3, 3), and for each pixel of the new image (h, w) the x and the y of its source."""
     assert camera.distortion is not None
     if camera.distortion_model == "opencv" and np.abs(camera.distortion[2:4]).max() > MAX_TANGENTIAL:
-        p1, p2 = camera.distortion[2:4]
+        p1, p2 = camera.distortion[2:4]  # radial coefficients in their place
         raise DatasetError(
             f"camera {camera.name}: its distortion has p1 = {p1:g} and p2 = {p2:g}, more than {MAX_TANGENTIAL:g}; the "
             f"order of opencv coefficients is k1, k2, p1, p2, k3, and {_LIKELY_CAUSE}"
         )
-
-
-def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The new intrinsics (3, 3), and for each pixel of the new image (h, w) the x and the y of its source."""
-    _require_small_tangential(camera)
     if fault := lens_fault(camera):
         raise DatasetError(f"camera {camera.name}: {fault}")
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -99,7 +91,14 @@ def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             sources = _sources(camera, k, every.reshape(-1, 2))
             if _inside(camera, sources):
                 x, y = sources.T.reshape(2, camera.height, camera.width).astype(np.float32)
-                _require_unfolded(camera, x, y)
+                # A step to the right and a step down in the new image are so in their sources, up to a rotation.
+                (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
+                folded = float((x_right * y_down - x_down * y_right <= 0).mean())
+                if folded:
+                    raise DatasetError(
+                        f"camera {camera.name}: its distortion folds in {folded:.1%} of the image: two directions have "
+                        f"one pixel; {_LIKELY_CAUSE}"
+                    )
                 return k, x, y
         factor *= LONGER
     raise DatasetError(
@@ -116,18 +115,6 @@ def _sources(camera: Camera, k: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def _inside(camera: Camera, pixels: np.ndarray) -> bool:
     """Whether all pixels (n, 2) are within the image."""
     return bool(((pixels >= -0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5])).all())
-
-
-def _require_unfolded(camera: Camera, x: np.ndarray, y: np.ndarray) -> None:
-    """Raises DatasetError where a step to the right and a step down in the new image (h, w) are not so, up to a
-    rotation, in their sources: two directions would have one pixel."""
-    (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
-    folded = float((x_right * y_down - x_down * y_right <= 0).mean())
-    if folded:
-        raise DatasetError(
-            f"camera {camera.name}: its distortion folds in {folded:.1%} of the image: two directions have one pixel; "
-            f"{_LIKELY_CAUSE}"
-        )
 
 
 def distortion_fault(camera: Camera) -> str | None:

@@ -139,7 +139,8 @@ def checked_intrinsics(matrix: Any, record: str, size: tuple[int, int] | None = 
     focal lengths are outside FOCAL_RANGE.
     """
     k = _matrix(matrix, 3)
-    if k is None or not _is_pinhole(k):
+    no_skew = k is not None and k[0, 1] == 0 and k[1, 0] == 0
+    if not (no_skew and k[0, 0] > 0 and k[1, 1] > 0 and np.allclose(k[2], [0, 0, 1])):
         raise DatasetError(f"{record}: its camera matrix is singular or not a pinhole matrix")
     if size is not None:
         least, most = FOCAL_RANGE[0] * size[0], FOCAL_RANGE[1] * size[0]
@@ -155,11 +156,6 @@ def checked_intrinsics(matrix: Any, record: str, size: tuple[int, int] | None = 
                 f"{size[0]}x{size[1]} pixels; the camera matrix must be that of these images"
             )
     return k
-
-
-def _is_pinhole(k: np.ndarray) -> bool:
-    no_skew = k[0, 1] == 0 and k[1, 0] == 0
-    return bool(no_skew and k[0, 0] > 0 and k[1, 1] > 0 and np.allclose(k[2], [0, 0, 1]))
 
 
 def checked_size(width: Any, height: Any, record: str) -> tuple[int, int]:

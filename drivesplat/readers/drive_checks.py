@@ -89,28 +89,23 @@ def returns_fault(returns: LidarReturns) -> str | None:
 
 def jumps(scene: Scene) -> list[str]:
     """A sentence if the ego vehicle has a speed above MAX_SPEED, otherwise one for every track that has it between two
-    annotations (at most MAX_NAMED). These are warnings, since annotations and positions have errors."""
-    tracks = []
-    for times, positions in _ego_paths(scene):
-        where = _jump(times, positions)
+    annotations (at most MAX_NAMED). These are warnings, since annotations and positions have errors. The ego vehicle's
+    path is given by the images of each camera, without images by the sweeps of each LiDAR."""
+    recorded = [(frame.camera, frame.timestamp, frame.ego_to_world) for frame in scene.frames]
+    if not recorded:
+        recorded = [(sweep.lidar, sweep.timestamp, sweep.sensor_to_world) for sweep in scene.sweeps]
+    for sensor in dict.fromkeys(name for name, _, _ in recorded):
+        own = sorted(((time, pose) for name, time, pose in recorded if name == sensor), key=lambda item: item[0])
+        where = _jump(np.array([time for time, _ in own]), np.stack([pose[:3, 3] for _, pose in own]))
         if where:
             return [f"the ego vehicle jumps, {where}: check its poses, that they are metres, and their times"]
+    tracks = []
     for track in scene.tracks:
         where = _jump(track.timestamps, track.object_to_world[:, :3, 3])
         if where:
             tracks.append(f"track {track.id} ({track.category}) jumps, {where}: check its boxes")
     more = [f"{len(tracks) - MAX_NAMED} more tracks jump"] if len(tracks) > MAX_NAMED else []
     return [*tracks[:MAX_NAMED], *more]
-
-
-def _ego_paths(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Times (n,) in microseconds and positions (n, 3) of the ego vehicle, by camera; without images of each LiDAR."""
-    recorded = [(frame.camera, frame.timestamp, frame.ego_to_world) for frame in scene.frames]
-    if not recorded:
-        recorded = [(sweep.lidar, sweep.timestamp, sweep.sensor_to_world) for sweep in scene.sweeps]
-    for sensor in dict.fromkeys(name for name, _, _ in recorded):
-        own = sorted(((time, pose) for name, time, pose in recorded if name == sensor), key=lambda item: item[0])
-        yield np.array([time for time, _ in own]), np.stack([pose[:3, 3] for _, pose in own])
 
 
 def _jump(timestamps: np.ndarray, positions: np.ndarray) -> str | None:

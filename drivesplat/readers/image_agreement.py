@@ -44,9 +44,9 @@ MAX_VIEWS = 24
 
 
 class _View(NamedTuple):
-    """An image and the silhouettes of a sweep in it: its `edges` (h, w), relative to those around, `points` (n, 3) in
-    the world, those (m, 3) of the world `mirrored` at the ego vehicle, and the images of its camera in the order of
-    time."""
+    """An image and the silhouettes of a sweep in it: its upright `edges` (h, w), relative to those around, `points`
+    (n, 3) in the world, those (m, 3) of the world `mirrored` at the ego vehicle, and the images of its camera in the
+    order of time."""
 
     frame: Frame
     edges: np.ndarray
@@ -99,10 +99,20 @@ def image_warnings(scene: Scene, sweeps: list[SampledSweep]) -> list[str]:
 def _camera_warnings(name: str, views: list[_View]) -> Iterator[str]:
     """The hypothesis about the images `views` that fits best, if one fits clearly better than what is given."""
     given = [view.score(view.frame.camera_to_world) for view in views]
-    found: dict[str, float] = {}
-    for hypothesis, scores in _hypotheses(views):
-        if _is_better(given, scores, MARGIN):
-            found[hypothesis] = _mean(scores)
+    tried: dict[str, list[float]] = {}
+    for shift in SHIFTS if all(len(view.of_camera) > 1 for view in views) else ():
+        way, fault = ("later", "early") if shift > 0 else ("earlier", "late")
+        said = f"with poses {abs(shift):.2f} s {way}: timestamps of images seem to be too {fault}"
+        tried[said] = [view.score(view.later(shift)) for view in views]
+    for factor in FACTORS:
+        said = f"if K is multiplied by {factor:.2f}: K must be that of images of the stated size"
+        tried[said] = [view.score(view.frame.camera_to_world, factor) for view in views]
+    for turn in TURNS:
+        side = "right" if turn > 0 else "left"
+        said = f"if the camera is turned by {abs(turn):.1f} degrees to the {side}: check sensor_to_ego"
+        turned = rigid(Rotation.from_euler("y", turn, degrees=True).as_matrix(), np.zeros(3))
+        tried[said] = [view.score(view.frame.camera_to_world @ turned) for view in views]
+    found = {said: _mean(scores) for said, scores in tried.items() if _is_better(given, scores, MARGIN)}
     if found:
         best = max(found, key=lambda hypothesis: found[hypothesis])
         yield (
@@ -114,22 +124,6 @@ def _camera_warnings(name: str, views: list[_View]) -> Iterator[str]:
             f"{name}: LiDAR returns do not lie on the edges of images (score {_mean(given):.2f}; 1 is that of random "
             "places): check K, distortion, sensor_to_ego and the times of images and sweeps"
         )
-
-
-def _hypotheses(views: list[_View]) -> Iterator[tuple[str, list[float]]]:
-    """Hypotheses in words, and their scores for all `views`."""
-    for shift in SHIFTS if all(len(view.of_camera) > 1 for view in views) else ():
-        way, fault = ("later", "early") if shift > 0 else ("earlier", "late")
-        said = f"with poses {abs(shift):.2f} s {way}: timestamps of images seem to be too {fault}"
-        yield said, [view.score(view.later(shift)) for view in views]
-    for factor in FACTORS:
-        said = f"if K is multiplied by {factor:.2f}: K must be that of images of the stated size"
-        yield said, [view.score(view.frame.camera_to_world, factor) for view in views]
-    for turn in TURNS:
-        side = "right" if turn > 0 else "left"
-        said = f"if the camera is turned by {abs(turn):.1f} degrees to the {side}: check sensor_to_ego"
-        turned = rigid(Rotation.from_euler("y", turn, degrees=True).as_matrix(), np.zeros(3))
-        yield said, [view.score(view.frame.camera_to_world @ turned) for view in views]
 
 
 def _is_better(given: Sequence[float], other: Sequence[float], margin: float) -> bool:
@@ -161,13 +155,10 @@ def _views(scene: Scene, sweeps: list[SampledSweep], camera: str) -> Iterator[_V
         points = _silhouettes(sampled.points, frame, size)
         mirrored = _silhouettes(apply(mirror, sampled.points), frame, size)
         with suppress(DatasetError):  # the check of images names it
-            yield _View(frame, _edges(read_image(frame.image_path, size)), points, mirrored, of_camera)
-
-
-def _edges(image: np.ndarray) -> np.ndarray:
-    """The upright edges (h, w) of an image (h, w, 3), relative to those around."""
-    gradient = np.abs(cv2.Sobel(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), cv2.CV_32F, 1, 0))
-    return np.minimum(cv2.GaussianBlur(gradient, (0, 0), 1.2) / (cv2.blur(gradient, (41, 41)) + 4.0), 4.0)
+            grey = cv2.cvtColor(read_image(frame.image_path, size), cv2.COLOR_RGB2GRAY).astype(np.float32)
+            gradient = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0))
+            edges = np.minimum(cv2.GaussianBlur(gradient, (0, 0), 1.2) / (cv2.blur(gradient, (41, 41)) + 4.0), 4.0)
+            yield _View(frame, edges, points, mirrored, of_camera)
 
 
 def _silhouettes(points: np.ndarray, frame: Frame, size: tuple[int, int]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The outline of a recording: what it holds, as far as that is known before it is read, and what it is unfit for."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -40,16 +40,15 @@ class Outline:
         return total
 
 
-def unknown_camera(scene: str, outline: Outline, cameras: Sequence[str]) -> str | None:
-    """A sentence about the first of `cameras` that a recording does not have; None where it has all of them."""
-    absent = [name for name in cameras if name not in outline.cameras]
-    known = ", ".join(outline.cameras) or "none"
-    return f"scene {scene}: the drive has no camera {absent[0]!r}; there are: {known}" if absent else None
+def unknown_camera(scene: str, known: Collection[str], cameras: Sequence[str]) -> str | None:
+    """A sentence about the first of `cameras` that is not `known` of a recording; None where all are."""
+    absent = [name for name in cameras if name not in known]
+    there = ", ".join(known) or "none"
+    return f"scene {scene}: the drive has no camera {absent[0]!r}; there are: {there}" if absent else None
 
 
-def frames_beyond(scene: str, outline: Outline, frames: Sequence[int] | None) -> str | None:
-    """A sentence about a range of key frames [first, last + 1) that ends beyond a recording's last."""
-    count = len(outline.key_frames)
+def frames_beyond(scene: str, count: int, frames: Sequence[int] | None) -> str | None:
+    """A sentence about a range of key frames [first, last + 1) that ends beyond the last of `count`."""
     if not frames or frames[1] <= count:
         return None
     return f"scene {scene}: the frame range {tuple(frames)} ends beyond its {count} key frames"

@@ -1,12 +1,12 @@
 """What a drive's own geometry says against its poses and mounts, in sentences. These are warnings: a camera may be
 mounted on its side, and a vehicle may reverse all the time."""
 
-from collections.abc import Iterator
 from typing import TypeVar
 
 import numpy as np
 
 from drivesplat.readers.sweeps import sound_returns
+from drivesplat.readers.track_plausibility import degrees_between
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep
@@ -28,10 +28,45 @@ SAMPLED_SWEEPS = 5
 
 
 def pose_warnings(scene: Scene) -> list[str]:
-    """Sentences about ego poses that contradict the vehicle's motion, and about cameras that are not upright."""
+    """Sentences about ego poses that contradict the vehicle's motion, which is along its x axis, on the ground; and
+    about cameras that are not upright."""
     if scene.poses == UNPOSED or not scene.frames:
         return []
-    return [*_heading_warnings(scene), *_camera_warnings(scene)]
+    found = []
+    poses = np.stack([frame.ego_to_world for frame in _frames_of(scene, scene.frames[0].camera)])
+    tilt = float(np.median(degrees_between(poses[:, 2, 2])))
+    if tilt > MAX_TURN:
+        found.append(
+            f"the ego vehicle is tilted by {tilt:.0f} degrees (median): its z axis must point up, as the world's does; "
+            "check that rotations of poses are w, x, y, z and map the ego frame to the world"
+        )
+    apart = poses[:1]
+    for pose in poses[1:]:
+        if np.linalg.norm(pose[:3, 3] - apart[-1, :3, 3]) > MIN_STEP:
+            apart = np.concatenate([apart, pose[None]])
+    steps = np.diff(apart[:, :3, 3], axis=0)
+    along = np.einsum("ni,ni->n", steps, apart[:-1, :3, 0]) / np.linalg.norm(steps, axis=1)
+    angle = float(np.median(degrees_between(along))) if len(steps) else 0.0
+    if angle > MAX_TURN and not (angle > REVERSING and tilt <= MAX_TURN):
+        found.append(
+            f"the ego vehicle moves at {angle:.0f} degrees to its x axis (median of {len(steps)} steps): x must "
+            "point forward; check that rotations of poses are w, x, y, z and map the ego frame to the world, not the "
+            "reverse"
+        )
+    elif angle > REVERSING:
+        found.append(
+            f"the ego vehicle moves backwards (median of {len(steps)} steps): its x axis must point forward; "
+            "unless it reverses, check that rotations of poses are w, x, y, z"
+        )
+    for camera in dict.fromkeys(frame.camera for frame in scene.frames):
+        mount = _frames_of(scene, camera)[0].camera_to_ego
+        roll = float(degrees_between(-mount[2:3, 1])[0])
+        if roll > MAX_ROLL:
+            found.append(
+                f"camera {camera}: its y axis, which points down in the image, is {roll:.0f} degrees from the "
+                "vehicle's downward direction: check that the axes of sensor_to_ego are x right, y down, z forward"
+            )
+    return found
 
 
 def lidar_warnings(scene: Scene) -> list[str]:
@@ -42,83 +77,33 @@ def lidar_warnings(scene: Scene) -> list[str]:
     if scene.poses == UNPOSED or not scene.frames:
         return []
     found = []
-    for lidar in scene.lidars:
-        chosen = _spread([sweep for sweep in scene.sweeps if sweep.lidar == lidar.name])
-        if chosen and _ground_share(scene, chosen) < MIN_GROUND:
+    by_lidar = {lidar.name: [sweep for sweep in scene.sweeps if sweep.lidar == lidar.name] for lidar in scene.lidars}
+    for lidar, sweeps in by_lidar.items():
+        near = total = 0
+        for sweep in _spread(sweeps):
+            returns = sound_returns(sweep)
+            if returns is None:
+                continue
+            image = min(scene.frames, key=lambda frame: abs(frame.timestamp - sweep.timestamp))
+            points = apply(inverse(image.ego_to_world) @ sweep.sensor_to_world, returns.points)
+            distances = np.linalg.norm(points[:, :2], axis=1)
+            around = (distances > GROUND_RING[0]) & (distances < GROUND_RING[1])
+            near += int((np.abs(points[around, 2]) < GROUND_HEIGHT).sum())
+            total += int(around.sum())
+        if total and near / total < MIN_GROUND:
             found.append(
-                f"LiDAR {lidar.name}: hardly any return lies near the ground (z = 0 of the ego frame): check its "
+                f"LiDAR {lidar}: hardly any return lies near the ground (z = 0 of the ego frame): check its "
                 "sensor_to_ego, the rotations of ego_poses, and that points of sweeps are in the sensor's frame, "
                 "not in the world"
             )
-    return [*found, *_unseen_warnings(scene)]
-
-
-def _heading_warnings(scene: Scene) -> Iterator[str]:
-    """The vehicle must move along its x axis, and stand on the ground."""
-    frames = _frames_of(scene, scene.frames[0].camera)
-    poses = np.stack([frame.ego_to_world for frame in frames])
-    tilt = float(np.median(_degrees(poses[:, 2, 2])))
-    if tilt > MAX_TURN:
-        yield (
-            f"the ego vehicle is tilted by {tilt:.0f} degrees (median): its z axis must point up, as the world's does; "
-            "check that rotations of poses are w, x, y, z and map the ego frame to the world"
-        )
-    poses = _apart(poses)
-    if len(poses) < 2:
-        return
-    steps = np.diff(poses[:, :3, 3], axis=0)
-    along = np.einsum("ni,ni->n", steps, poses[:-1, :3, 0]) / np.linalg.norm(steps, axis=1)
-    angle = float(np.median(_degrees(along)))
-    if angle > MAX_TURN and not (angle > REVERSING and tilt <= MAX_TURN):
-        yield (
-            f"the ego vehicle moves at {angle:.0f} degrees to its x axis (median of {len(steps)} steps): x must "
-            "point forward; check that rotations of poses are w, x, y, z and map the ego frame to the world, not the "
-            "reverse"
-        )
-    elif angle > REVERSING:
-        yield (
-            f"the ego vehicle moves backwards (median of {len(steps)} steps): its x axis must point forward; "
-            "unless it reverses, check that rotations of poses are w, x, y, z"
-        )
-
-
-def _camera_warnings(scene: Scene) -> Iterator[str]:
-    for camera in dict.fromkeys(frame.camera for frame in scene.frames):
-        mount = _frames_of(scene, camera)[0].camera_to_ego
-        roll = float(_degrees(-mount[2:3, 1])[0])
-        if roll > MAX_ROLL:
-            yield (
-                f"camera {camera}: its y axis, which points down in the image, is {roll:.0f} degrees from the "
-                "vehicle's downward direction: check that the axes of sensor_to_ego are x right, y down, z forward"
-            )
-
-
-def _ground_share(scene: Scene, sweeps: list[Sweep]) -> float:
-    """The share of the returns around the vehicle that lie near the ground under it."""
-    near = total = 0
-    for sweep in sweeps:
-        returns = sound_returns(sweep)
-        if returns is None:
-            continue
-        points = apply(inverse(_ego_at(scene, sweep.timestamp)) @ sweep.sensor_to_world, returns.points)
-        distances = np.linalg.norm(points[:, :2], axis=1)
-        around = (distances > GROUND_RING[0]) & (distances < GROUND_RING[1])
-        near += int((np.abs(points[around, 2]) < GROUND_HEIGHT).sum())
-        total += int(around.sum())
-    return near / total if total else 1.0
-
-
-def _unseen_warnings(scene: Scene) -> Iterator[str]:
-    by_lidar = [[sweep for sweep in scene.sweeps if sweep.lidar == lidar.name] for lidar in scene.lidars]
-    if not any(by_lidar):
-        return
-    for camera in dict.fromkeys(frame.camera for frame in scene.frames):
+    for camera in dict.fromkeys(frame.camera for frame in scene.frames) if any(by_lidar.values()) else ():
         frames = _spread(_frames_of(scene, camera))
-        if not any(_seen(frame, sweeps) for frame in frames for sweeps in by_lidar if sweeps):
-            yield (
+        if not any(_seen(frame, sweeps) for frame in frames for sweeps in by_lidar.values() if sweeps):
+            found.append(
                 f"camera {camera}: no return of a LiDAR falls into its images: check its sensor_to_ego (x right, y "
                 "down, z forward, in metres) and that of the LiDAR"
             )
+    return found
 
 
 def _seen(frame: Frame, sweeps: list[Sweep]) -> bool:
@@ -133,20 +118,6 @@ def _seen(frame: Frame, sweeps: list[Sweep]) -> bool:
     return bool(((depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)).any())
 
 
-def _ego_at(scene: Scene, timestamp: int) -> np.ndarray:
-    """The ego pose (4, 4) of the image nearest in time."""
-    return min(scene.frames, key=lambda frame: abs(frame.timestamp - timestamp)).ego_to_world
-
-
-def _apart(poses: np.ndarray) -> np.ndarray:
-    """Those of the poses (n, 4, 4) that are more than MIN_STEP apart, one after the other."""
-    chosen = [0]
-    for i in range(1, len(poses)):
-        if np.linalg.norm(poses[i, :3, 3] - poses[chosen[-1], :3, 3]) > MIN_STEP:
-            chosen.append(i)
-    return poses[chosen]
-
-
 def _frames_of(scene: Scene, camera: str) -> list[Frame]:
     return sorted((frame for frame in scene.frames if frame.camera == camera), key=lambda frame: frame.timestamp)
 
@@ -155,7 +126,3 @@ def _spread(items: list[T]) -> list[T]:
     """At most SAMPLED_SWEEPS of some items, from the first to the last."""
     chosen = np.unique(np.linspace(0, len(items) - 1, SAMPLED_SWEEPS).round().astype(int)) if items else []
     return [items[i] for i in chosen]
-
-
-def _degrees(cosines: np.ndarray) -> np.ndarray:
-    return np.degrees(np.arccos(cosines.clip(-1.0, 1.0)))

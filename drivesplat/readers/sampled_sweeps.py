@@ -9,7 +9,6 @@ from jaxtyping import Float64
 from drivesplat.readers.sweeps import sound_returns
 from drivesplat.scene.rigid import apply, interpolate, inverse
 from drivesplat.scene.scene import Scene, Sweep
-from drivesplat.scene.sensors import LidarReturns
 
 PAIRS = 6
 """Pairs of sweeps of each LiDAR, from its first sweep to its last."""
@@ -35,8 +34,11 @@ def sampled_sweeps(scene: Scene) -> list[SampledSweep]:
         times = np.array([sweep.timestamp for sweep in own])
         firsts = np.linspace(0, len(own) - 1, PAIRS).round().astype(int) if own else np.zeros(0, dtype=int)
         seconds = np.minimum(np.searchsorted(times, times[firsts] + PAIR_US), len(own) - 1) if own else firsts
-        found += [own[i] for i in np.union1d(firsts, seconds)]
-    return [_in_world(sweep, returns) for sweep in found if (returns := sound_returns(sweep)) is not None]
+        for sweep in (own[i] for i in np.union1d(firsts, seconds)):
+            if (returns := sound_returns(sweep)) is not None:
+                offsets = np.zeros(len(returns.points)) if returns.offsets_s is None else returns.offsets_s
+                found.append(SampledSweep(sweep, apply(sweep.sensor_to_world, returns.points), offsets))
+    return found
 
 
 def ego_pose(scene: Scene, sweep: Sweep) -> np.ndarray:
@@ -53,8 +55,3 @@ def ego_pose(scene: Scene, sweep: Sweep) -> np.ndarray:
         return frames[min(after, len(frames) - 1)].ego_to_world
     share = (sweep.timestamp - times[after - 1]) / (times[after] - times[after - 1])
     return interpolate(frames[after - 1].ego_to_world, frames[after].ego_to_world, share)
-
-
-def _in_world(sweep: Sweep, returns: LidarReturns) -> SampledSweep:
-    offsets = np.zeros(len(returns.points)) if returns.offsets_s is None else returns.offsets_s
-    return SampledSweep(sweep, apply(sweep.sensor_to_world, returns.points), offsets)

@@ -1,7 +1,6 @@
 """What sweeps say against each other, in sentences: the height and tilt of the ground, and the places of surfaces.
 These are warnings about poses."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -40,6 +39,16 @@ class _Pair(NamedTuple):
     distance: float
 
 
+class _Ground(NamedTuple):
+    """The returns `points` (n, 3) of a sweep within RING, the number of the horizontal cell `cells` (n,) of each; the
+    `known` cells (k,) in order, and the `lowest` returns (k, 3), a low one in each."""
+
+    points: np.ndarray
+    cells: np.ndarray
+    known: np.ndarray
+    lowest: np.ndarray
+
+
 def agreement_warnings(sweeps: list[SampledSweep]) -> list[str]:
     """Sentences about sweeps that disagree on the ground or on surfaces. `sweeps` are in the world."""
     ordered = sorted(sweeps, key=lambda sampled: (sampled.sweep.lidar, sampled.sweep.timestamp))
@@ -48,39 +57,38 @@ def agreement_warnings(sweeps: list[SampledSweep]) -> list[str]:
         for one, other in pairwise(ordered)
         if one.sweep.lidar == other.sweep.lidar and (found := _compared(one, other)) is not None
     ]
-    return list(_disagreements(pairs)) if len(pairs) >= MIN_PAIRS else []
-
-
-def _disagreements(pairs: list[_Pair]) -> Iterator[str]:
+    if len(pairs) < MIN_PAIRS:
+        return []
     seconds, heights, tilts, distances = np.array(pairs).T
     nearby = seconds <= np.median(seconds)
     height, rate = np.median(np.abs(heights)), np.median(np.abs(heights) / seconds)
     tilt, distance = np.median(tilts), np.median(distances[nearby])
     if distance > MAX_DISTANCE:
-        yield (
+        return [
             f"sweeps {np.median(seconds[nearby]):.1f} s apart lie {distance:.2f} m from each other on upright surfaces "
             "(median): check the unit and times of ego_poses, the rotations of poses, and the unit of sweeps"
-        )
-    elif rate > MAX_RATE and height > MIN_STEP:
-        yield (
+        ]
+    if rate > MAX_RATE and height > MIN_STEP:
+        return [
             f"sweeps disagree on the height of the ground by {rate:.2f} m per second (median of {len(pairs)} pairs): z "
             "of ego poses drifts, or is not the height of the road"
-        )
-    elif tilt > MAX_TILT:
-        yield (
+        ]
+    if tilt > MAX_TILT:
+        return [
             f"sweeps disagree on the tilt of the ground by {tilt:.1f} degrees (median of {len(pairs)} pairs): roll or "
             "pitch of ego poses is missing or wrong, or their times are; refine_poses may "
             "mend it (docs/poses.md)"
-        )
+        ]
+    return []
 
 
 def _compared(one: SampledSweep, other: SampledSweep) -> _Pair | None:
     """What differs between two sweeps; None where they have too little ground in common."""
     grounds = [_ground(sampled) for sampled in (one, other)]
-    _, mine, theirs = np.intersect1d(grounds[0][0], grounds[1][0], return_indices=True)
+    _, mine, theirs = np.intersect1d(grounds[0].known, grounds[1].known, return_indices=True)
     if len(mine) < MIN_CELLS:
         return None
-    (here, there) = grounds[0][1][mine], grounds[1][1][theirs]
+    here, there = grounds[0].lowest[mine], grounds[1].lowest[theirs]
     middle = (_place(one.sweep) + _place(other.sweep)) / 2
     design = np.column_stack([np.ones(len(here)), here[:, :2] - middle])
     differences, weights = there[:, 2] - here[:, 2], np.ones(len(here))
@@ -88,7 +96,10 @@ def _compared(one: SampledSweep, other: SampledSweep) -> _Pair | None:
         root = np.sqrt(weights)
         fitted = np.linalg.lstsq(design * root[:, None], differences * root, rcond=None)[0]
         weights = np.square(np.minimum(1.0, SAME / np.maximum(np.abs(design @ fitted - differences), 1e-9)))
-    surfaces = [_surfaces(sampled, ground) for sampled, ground in zip((one, other), grounds, strict=True)]
+    surfaces = []
+    for points, cells, known, lowest in grounds:
+        rows = np.minimum(np.searchsorted(known, cells), len(known) - 1)
+        surfaces.append(points[(known[rows] == cells) & (points[:, 2] - lowest[rows, 2] > UPRIGHT)])
     if not all(map(len, surfaces)):
         return None
     distances, _ = cKDTree(surfaces[1]).query(surfaces[0][:: 1 + len(surfaces[0]) // SURFACE_POINTS])
@@ -104,34 +115,13 @@ def _place(sweep: Sweep) -> np.ndarray:
     return sweep.sensor_to_world[:2, 3]
 
 
-def _near(sampled: SampledSweep) -> np.ndarray:
-    """The returns (n, 3) within RING."""
+def _ground(sampled: SampledSweep) -> _Ground:
     distances = np.linalg.norm(sampled.points[:, :2] - _place(sampled.sweep), axis=1)
-    return sampled.points[(distances > RING[0]) & (distances < RING[1])]
-
-
-def _cells(points: np.ndarray) -> np.ndarray:
-    """A number (n,) for the horizontal cell of each point (n, 3)."""
+    points = sampled.points[(distances > RING[0]) & (distances < RING[1])]
     columns = np.floor(points[:, :2] / CELL).astype(np.int64)
-    return columns[:, 0] * (1 << 32) + columns[:, 1]
-
-
-def _ground(sampled: SampledSweep) -> tuple[np.ndarray, np.ndarray]:
-    """The cells (k,) of a sweep in order, and a low return (k, 3) in each."""
-    points = _near(sampled)
-    cells = _cells(points)
+    cells = columns[:, 0] * (1 << 32) + columns[:, 1]
     order = np.lexsort((points[:, 2], cells))
     found, starts, counts = np.unique(cells[order], return_index=True, return_counts=True)
     enough = counts >= MIN_RETURNS
     lowest = points[order[(starts + counts * LOW_PERCENT // 100)[enough]]]
-    return found[enough], lowest
-
-
-def _surfaces(sampled: SampledSweep, ground: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """The returns (n, 3) of a sweep that lie UPRIGHT above the ground."""
-    points, (known, lowest) = _near(sampled), ground
-    if not len(known):
-        return points[:0]
-    cells = _cells(points)
-    rows = np.minimum(np.searchsorted(known, cells), len(known) - 1)
-    return points[(known[rows] == cells) & (points[:, 2] - lowest[rows, 2] > UPRIGHT)]
+    return _Ground(points, cells, found[enough], lowest)

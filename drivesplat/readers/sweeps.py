@@ -12,7 +12,7 @@ from drivesplat.scene.scene import Sweep, place_of
 from drivesplat.scene.sensors import LidarReturns, Spin
 
 SWEEP_FILE = "drivesplat.readers.*.sweep_file"
-"""The module of a reader with `read_file` and `file_fault`, or `read_checked`, which reads a file once for both."""
+"""The module of a reader with `read_file`."""
 
 
 def read_returns(sweep: Sweep) -> LidarReturns:
@@ -57,13 +57,10 @@ def sound_returns(sweep: Sweep) -> LidarReturns | None:
 
 def _returns(sweep: Sweep, compensate: bool = True) -> LidarReturns | str:
     """The returns of a sweep, or the fault of its file."""
-    path, files = Path(sweep.path), _files(sweep)
+    path = Path(sweep.path)
     if not path.is_file():
         return "is missing"
-    if (read_checked := getattr(files, "read_checked", None)) is not None:
-        returns = read_checked(path)
-    else:
-        returns = files.file_fault(path) or files.read_file(path)
+    returns = _files(sweep).read_file(path)
     if isinstance(returns, str):
         return returns
     if fault := returns_fault(returns):

@@ -1,6 +1,6 @@
 """What tracks alone say against their rotations, sizes and frame, in sentences. These are warnings."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -38,38 +38,41 @@ SIZES = {
 
 def shape_warnings(tracks: Sequence[Track]) -> list[str]:
     """Sentences about tracks whose boxes are tilted, or have sizes that their class has not."""
-    return [*_tilt_warnings(tracks), *_size_warnings(tracks)]
-
-
-def path_warnings(scene: Scene) -> list[str]:
-    """Sentences about tracks that move with the ego vehicle, or not along their x axes."""
-    return list(_ego_frame_warnings(scene)) or list(_heading_warnings(scene.tracks))
-
-
-def degrees_between(cosines: np.ndarray) -> np.ndarray:
-    """Angles in degrees of their cosines."""
-    return np.degrees(np.arccos(cosines.clip(-1.0, 1.0)))
-
-
-def _tilt_warnings(tracks: Sequence[Track]) -> Iterator[str]:
+    found = []
     tilts = np.array([np.median(degrees_between(track.object_to_world[:, 2, 2])) for track in tracks])
     tilted = tilts[tilts > MAX_TILT]
     if len(tilted) > MAX_TILTED * len(tracks):
-        yield (
+        found.append(
             f"tracks: the z axes of {len(tilted)} of {counted(len(tracks), 'track')} are tilted by "
             f"{np.median(tilted):.0f} degrees (median): they must point up; check that rotations of tracks are w, x, "
             "y, z and map the object's frame to the world"
         )
+    for kind in dict.fromkeys(track.object_class for track in tracks):
+        sizes = np.stack([track.size for track in tracks if track.object_class is kind])
+        if kind not in SIZES:
+            continue
+        wide, median = int((sizes[:, 0] < sizes[:, 1]).sum()), np.median(sizes, axis=0)
+        if kind.is_vehicle and wide > len(sizes) / 2:
+            found.append(
+                f"tracks: length < width for {wide} of {counted(len(sizes), 'track')} of class {kind.value}: size is "
+                "length, width, height"
+            )
+        elif not all(low <= value <= high for value, (low, high) in zip(median, SIZES[kind], strict=True)):
+            shown = " x ".join(f"{value:.3g}" for value in median)
+            found.append(
+                f"tracks: boxes of class {kind.value} are {shown} m (median of {counted(len(sizes), 'track')}), which "
+                "none is: size is the whole length, width and height in metres"
+            )
+    return found
 
 
-def _ego_frame_warnings(scene: Scene) -> Iterator[str]:
-    """Tracks most of which stand still if they are taken to be in the ego frame, while hardly one does as it is."""
+def path_warnings(scene: Scene) -> list[str]:
+    """A sentence about tracks most of which stand still if they are taken to be in the ego frame, while hardly one does
+    as it is; or about vehicles that do not move along their x axes."""
     frames = sorted({frame.timestamp: frame for frame in scene.frames}.items())
-    if not frames:
-        return
     times = np.array([time for time, _ in frames])
     given, in_ego = [], []
-    for track in scene.tracks:
+    for track in scene.tracks if frames else ():
         nearest = [frames[int(np.argmin(np.abs(times - time)))][1] for time in track.timestamps]
         if len(nearest) < 2:
             continue
@@ -79,15 +82,12 @@ def _ego_frame_warnings(scene: Scene) -> Iterator[str]:
         for found, path in ((given, places), (in_ego, moved)):
             found.append(float(np.median(np.linalg.norm(np.diff(path, axis=0), axis=1) / seconds)) < STANDING)
     if len(given) >= MIN_TRACKS and np.mean(in_ego) > MANY > FEW > np.mean(given):
-        yield (
+        return [
             f"tracks: {sum(in_ego)} of {len(given)} stand still if their poses are taken to be in the ego frame, and "
             f"{sum(given)} as they are: they must be in the world"
-        )
-
-
-def _heading_warnings(tracks: Sequence[Track]) -> Iterator[str]:
+        ]
     angles = []
-    for track in tracks:
+    for track in scene.tracks:
         steps = np.diff(track.object_to_world[:, :2, 3], axis=0)
         lengths = np.linalg.norm(steps, axis=1)
         fast = lengths > MIN_SPEED * 1e-6 * np.diff(track.timestamps)
@@ -95,30 +95,15 @@ def _heading_warnings(tracks: Sequence[Track]) -> Iterator[str]:
             headings = track.object_to_world[:-1, :2, 0][fast]
             norms = np.maximum(np.linalg.norm(headings, axis=1), 1e-9) * lengths[fast]
             angles.append(np.median(degrees_between((headings * steps[fast]).sum(axis=1) / norms)))
-    if angles and np.median(angles) > MAX_TURN:
-        yield (
-            f"tracks: {counted(len(angles), 'moving vehicle')} move{'s' if len(angles) == 1 else ''} at "
-            f"{np.median(angles):.0f} degrees to the x axis of the box (median): x must point forward; check the "
-            "direction of headings, and that rotations of tracks are w, x, y, z"
-        )
+    if not angles or np.median(angles) <= MAX_TURN:
+        return []
+    return [
+        f"tracks: {counted(len(angles), 'moving vehicle')} move{'s' if len(angles) == 1 else ''} at "
+        f"{np.median(angles):.0f} degrees to the x axis of the box (median): x must point forward; check the direction "
+        "of headings, and that rotations of tracks are w, x, y, z"
+    ]
 
 
-def _size_warnings(tracks: Sequence[Track]) -> Iterator[str]:
-    for kind in dict.fromkeys(track.object_class for track in tracks):
-        sizes = np.stack([track.size for track in tracks if track.object_class is kind])
-        if kind not in SIZES:
-            continue
-        wide = int((sizes[:, 0] < sizes[:, 1]).sum())
-        if kind.is_vehicle and wide > len(sizes) / 2:
-            yield (
-                f"tracks: length < width for {wide} of {counted(len(sizes), 'track')} of class {kind.value}: size is "
-                "length, width, height"
-            )
-            continue
-        median = np.median(sizes, axis=0)
-        if not all(low <= value <= high for value, (low, high) in zip(median, SIZES[kind], strict=True)):
-            shown = " x ".join(f"{value:.3g}" for value in median)
-            yield (
-                f"tracks: boxes of class {kind.value} are {shown} m (median of {counted(len(sizes), 'track')}), which "
-                "none is: size is the whole length, width and height in metres"
-            )
+def degrees_between(cosines: np.ndarray) -> np.ndarray:
+    """Angles in degrees of their cosines."""
+    return np.degrees(np.arccos(cosines.clip(-1.0, 1.0)))

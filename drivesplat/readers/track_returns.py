@@ -101,27 +101,23 @@ def _around_boxes(scene: Scene, sampled: SampledSweep) -> Iterator[_Seen]:
 
 
 def _filled(scene: Scene, sweeps: list[SampledSweep], frame: str) -> list[bool]:
-    """Whether the boxes hold returns, if poses of tracks are taken to be in a frame ('world', 'ego' or 'LiDAR'): of all
-    boxes at all sweeps whose surroundings a LiDAR sees."""
+    """Whether the boxes hold returns, and more than there are beside them, if poses of tracks are taken to be in a
+    frame ('world', 'ego' or 'LiDAR'): of all boxes at all sweeps whose surroundings a LiDAR sees."""
     states = []
     for sampled in sweeps:
         to_world = np.eye(4)
         if frame != "world":
             to_world = ego_pose(scene, sampled.sweep) if frame == "ego" else sampled.sweep.sensor_to_world
         boxes = (box for box in boxes_at(scene, sampled.sweep.timestamp) if box.object_class.is_dynamic)
-        states += [_is_filled(box, to_world @ box.object_to_world, sampled) for box in boxes]
-    return [state for state in states if state is not None]
-
-
-def _is_filled(box: Box, pose: np.ndarray, sampled: SampledSweep) -> bool | None:
-    """Whether a box at a `pose` (4, 4) holds returns, and more of them than there are beside it; None where the LiDAR
-    does not see its surroundings."""
-    offset = np.linalg.norm(sampled.points[:, :2] - pose[:2, 3], axis=1)
-    near = sampled.points[offset < np.linalg.norm(box.size) / 2 + AROUND]
-    if len(near) < MIN_AROUND or np.linalg.norm(pose[:3, 3] - sampled.sweep.sensor_to_world[:3, 3]) > REACH:
-        return None
-    inside, around = (int(in_box(near, pose, box.size, margin, LIFTED).sum()) for margin in (MARGIN, BESIDE))
-    return inside >= MIN_INSIDE and inside > around / 2
+        for box in boxes:
+            pose = to_world @ box.object_to_world
+            offset = np.linalg.norm(sampled.points[:, :2] - pose[:2, 3], axis=1)
+            near = sampled.points[offset < np.linalg.norm(box.size) / 2 + AROUND]
+            away = np.linalg.norm(pose[:3, 3] - sampled.sweep.sensor_to_world[:3, 3])
+            if len(near) >= MIN_AROUND and away <= REACH:
+                inside, around = (int(in_box(near, pose, box.size, by, LIFTED).sum()) for by in (MARGIN, BESIDE))
+                states.append(inside >= MIN_INSIDE and inside > around / 2)
+    return states
 
 
 def _floor_warnings(seen: list[_Seen]) -> Iterator[str]:

@@ -112,9 +112,9 @@ class Recordings:
         if outline is None:
             return
         frames = self._frames(scene)
-        beyond = frames_beyond(scene, outline, frames)
+        beyond = frames_beyond(scene, len(outline.key_frames), frames)
         if "extract" in rules:
-            yield from filter(None, (unknown_camera(scene, outline, settings.cameras), beyond))
+            yield from filter(None, (unknown_camera(scene, outline.cameras, settings.cameras), beyond))
         if "lidar_seed" in rules:
             times = outline.key_frames[slice(*frames)] if frames else outline.key_frames
             if not settings.sweeps and not trained_key_frames(times, settings.holdout):

@@ -7,7 +7,7 @@ from plyfile import PlyData, PlyElement
 from drivesplat.errors import ResultError
 from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.point_cloud import PointCloud, read_ply, read_positions, write_ply
-from drivesplat.readers.drive.sweep_file import file_fault
+from drivesplat.readers.drive.sweep_file import read_file
 
 
 def some_points(count: int = 5) -> PointCloud:
@@ -111,7 +111,7 @@ def test_a_header_without_bounds_is_refused_by_every_reader(tmp_path, monkeypatc
         read_ply(path, rule="lidar_seed")
     with pytest.raises(ResultError, match=message):
         read_splat_ply(path)
-    assert message in str(file_fault(path))
+    assert message in str(read_file(path))
 
 
 def test_a_long_comment_within_the_bound_is_read(tmp_path):

@@ -15,7 +15,7 @@ from drivesplat.io.storage import read_json
 from drivesplat.io.yaml_file import read_yaml
 from drivesplat.readers.drive.format import structure_of
 from drivesplat.readers.drive.nerfstudio_file import content_of
-from drivesplat.readers.drive.sweep_file import file_fault
+from drivesplat.readers.drive.sweep_file import read_file
 
 
 def circle(path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_drive_json_and_a_sweep_that_are_no_files_are_faults(tmp_path):
     for name in ("drive.json", "sweep.npz", "sweep.ply"):
         a_device(tmp_path / name)
     assert "it is a device" in structure_of(tmp_path / "drive.json")[0][0]
-    assert all("it is a device" in str(file_fault(tmp_path / name)) for name in ("sweep.npz", "sweep.ply"))
+    assert all("it is a device" in str(read_file(tmp_path / name)) for name in ("sweep.npz", "sweep.ply"))
 
 
 def test_json_that_is_nested_too_deeply_is_refused(tmp_path):

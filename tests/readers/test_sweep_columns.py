@@ -9,7 +9,7 @@ from helpers import REPOSITORY
 from plyfile import PlyData, PlyElement
 
 from drivesplat.readers.drive.__main__ import main
-from drivesplat.readers.drive.sweep_file import columns_sentence, file_fault, read_file
+from drivesplat.readers.drive.sweep_file import columns_sentence, read_file
 
 
 def ply(path: Path, **columns: np.ndarray) -> Path:
@@ -27,7 +27,6 @@ VALUES = np.array([0.0, 1.0, 30.0, 130.0, 255.0], dtype=np.float32)
 @pytest.mark.parametrize("factor", [255.0, 1.0])
 def test_intensities_of_other_programs_are_between_0_and_1(name, factor, tmp_path):
     path = ply(tmp_path / "top.ply", **{name: VALUES * np.float32(factor / 255.0), "nx": VALUES})
-    assert file_fault(path) is None
     np.testing.assert_allclose(read_file(path).intensity, VALUES / 255.0, atol=1e-6)
     scaled = ", whose intensities are divided by 255" if factor == 255.0 else ""
     assert columns_sentence(path) == f"has x, y, z, intensity ({name}){scaled}; not used: nx"
@@ -48,7 +47,7 @@ def test_intensities_of_8_bits_count_to_255_however_dark(tmp_path):
     ],
 )
 def test_values_that_no_rule_covers_are_refused(columns, words, tmp_path):
-    assert words in (file_fault(ply(tmp_path / "top.ply", **columns)) or "")
+    assert words in str(read_file(ply(tmp_path / "top.ply", **columns)))
 
 
 def test_a_column_of_the_documented_name_counts_before_others(tmp_path):
@@ -59,12 +58,12 @@ def test_a_column_of_the_documented_name_counts_before_others(tmp_path):
 
 def test_a_file_without_coordinates_is_named_with_its_columns(tmp_path):
     np.savez(tmp_path / "top.npz", points=np.zeros((5, 3)))
-    assert "it has no x, y, z; its columns are points" in (file_fault(tmp_path / "top.npz") or "")
+    assert "it has no x, y, z; its columns are points" in str(read_file(tmp_path / "top.npz"))
 
 
 def test_a_file_of_another_kind_is_not_called_corrupt(tmp_path):
     (tmp_path / "top.bin").write_bytes(bytes(160))
-    assert file_fault(tmp_path / "top.bin") == (
+    assert read_file(tmp_path / "top.bin") == (
         "is no sweep that can be read: sweeps are .npz, .ply, .pcd files (docs/own_data.md)"
     )
 

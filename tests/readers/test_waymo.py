@@ -16,8 +16,9 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.readers.waymo.calibration import readout_middle
+from drivesplat.readers.waymo.range_image import LaserRays
 from drivesplat.readers.waymo.segment import ImageRecord
-from drivesplat.readers.waymo.sweep_file import read_rays
+from drivesplat.readers.waymo.sweep_file import rays_of
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import apply
 from drivesplat.scene.scene import Scene, read_scene, write_scene
@@ -175,6 +176,12 @@ def test_points_of_range_images_are_where_the_rays_end(version, scenes, recorded
         np.testing.assert_allclose(returns.intensity, np.tanh(0.25), atol=1e-6)
         rows = np.repeat(np.arange(recording.values.shape[0]), recording.values.shape[1])
         np.testing.assert_array_equal(returns.rings, rows[there])
+
+
+def read_rays(path: Path) -> LaserRays:
+    """All rays of a sweep, row by row."""
+    with np.load(path) as arrays:
+        return rays_of(arrays["azimuth"], arrays["elevation"], arrays["range"].astype(np.float64))
 
 
 def test_ignoring_the_poses_of_pixels_would_move_points(scenes, recorded):

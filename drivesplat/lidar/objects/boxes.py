@@ -4,7 +4,6 @@ A LiDAR sees the sides of an object that face it. The size of a vehicle that was
 and its box is placed by the sides that were seen.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,11 +67,20 @@ def fitted_box(chain: Chain, grounds: Float[np.ndarray, " k"], blind: float = 0.
     weights = np.sqrt([len(cluster.points) for cluster in clusters])
     rough = smooth_path(seconds, chain.places, np.tile(weights[:, None], 2))
     headings = headings_of(rough, seconds)
-    frames = [_frame(heading) for heading in headings]
-    extents = np.stack([_extents(cluster, frame) for cluster, frame in zip(clusters, frames, strict=True)])
+    axes = [(np.cos(heading), np.sin(heading)) for heading in headings]
+    frames = [np.array([[cos, sin], [-sin, cos]]) for cos, sin in axes]  # rows ahead, left
+    extents = np.empty((len(clusters), 2, 2))
+    for own, cluster, frame in zip(extents, clusters, frames, strict=True):
+        places = cluster.points[:, :2] @ frame.T
+        stray = 1.0 if len(places) >= 50 else 0.0  # percent of large clusters
+        own[:, 0], own[:, 1] = np.percentile(places, stray, axis=0), np.percentile(places, 100.0 - stray, axis=0)
+    lengths = extents[:, :, 1] - extents[:, :, 0]
+    rich = np.array([len(cluster.points) >= RICH for cluster in clusters])
+    chosen = lengths[rich] if rich.any() else lengths
+    seen = np.array([np.percentile(chosen[:, k], share) for k, share in enumerate(SEEN)]) + MARGIN
     height = float(np.percentile([np.percentile(c.points[:, 2], 95) for c in clusters] - grounds, 75))
     speed = float(np.median(np.linalg.norm(rough.velocities(seconds), axis=1)))
-    object_class, size = class_and_size(_seen(extents, clusters), height, speed)
+    object_class, size = class_and_size(seen, height, speed)
     centers, trusts = zip(
         *(_center(*of_one, size[:2], blind) for of_one in zip(clusters, frames, extents, strict=True)), strict=True
     )
@@ -108,27 +116,6 @@ def class_and_size(
     sides = np.where(seen > WHOLE * typical[:2], seen, typical[:2])
     sides[1] = min(sides[1], WIDEST[found])
     return found, np.array([*sides, tall if tall > 0.7 * typical[2] else typical[2]])
-
-
-def _frame(heading: float) -> Float[np.ndarray, "2 2"]:
-    """The axes ahead and to the left, as rows."""
-    return np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
-
-
-def _extents(cluster: Cluster, frame: np.ndarray) -> Float[np.ndarray, "2 2"]:
-    """The least and the largest coordinate of a cluster along both axes: rows ahead, left; without stray returns of
-    large clusters."""
-    places = cluster.points[:, :2] @ frame.T
-    stray = 1.0 if len(places) >= 50 else 0.0
-    return np.stack([np.percentile(places, stray, axis=0), np.percentile(places, 100.0 - stray, axis=0)], axis=1)
-
-
-def _seen(extents: Float[np.ndarray, "k 2 2"], clusters: Sequence[Cluster]) -> Float[np.ndarray, "2"]:
-    """The length and width that were seen."""
-    lengths = extents[:, :, 1] - extents[:, :, 0]
-    rich = np.array([len(cluster.points) >= RICH for cluster in clusters])
-    chosen = lengths[rich] if rich.any() else lengths
-    return np.array([np.percentile(chosen[:, k], share) for k, share in enumerate(SEEN)]) + MARGIN
 
 
 def _center(

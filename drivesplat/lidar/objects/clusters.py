@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -61,26 +62,17 @@ class Chain:
     def places(self) -> Float[np.ndarray, "k 2"]:
         return np.stack([cluster.place for cluster in self.clusters])
 
-    def motion_at_end(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-        """Where it was seen last, and its velocity (m/s) then: a line through the last MEMORY_S seconds, or through the
-        last two clusters."""
-        return _line(self.clusters[-1].seconds, self.seconds, self.places)
-
-    def motion_at_begin(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-        """Where it was seen first, and its velocity (m/s) then."""
-        return _line(self.clusters[0].seconds, self.seconds, self.places)
-
-
-def _line(at: float, seconds: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place and velocity at one end of places (k, 2) at `seconds` (k,)."""
-    order = np.argsort(np.abs(seconds - at), kind="stable")
-    near = order[: max(2, int((np.abs(seconds - at) <= MEMORY_S).sum()))]
-    if len(near) < 2:
-        return places[order[0]], np.zeros(2)
-    offsets = seconds[near] - at
-    design = np.stack([np.ones(len(near)), offsets], axis=1)
-    place, velocity = np.linalg.lstsq(design, places[near], rcond=None)[0]
-    return place, velocity
+    def motion_at(self, end: Literal[0, -1]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+        """Where it was seen first (0) or last (-1), and its velocity (m/s) then: a line through MEMORY_S seconds there,
+        or through the two clusters there."""
+        seconds, places, at = self.seconds, self.places, self.clusters[end].seconds
+        order = np.argsort(np.abs(seconds - at), kind="stable")
+        near = order[: max(2, int((np.abs(seconds - at) <= MEMORY_S).sum()))]
+        if len(near) < 2:
+            return places[order[0]], np.zeros(2)
+        design = np.stack([np.ones(len(near)), seconds[near] - at], axis=1)
+        place, velocity = np.linalg.lstsq(design, places[near], rcond=None)[0]
+        return place, velocity
 
 
 def clusters_of(scan: RecordedScan, number: int, moving: Bool[np.ndarray, " n"]) -> list[Cluster]:
@@ -116,29 +108,23 @@ def chains_of(clusters: Sequence[Sequence[Cluster]]) -> list[Chain]:
         now = float(np.mean([cluster.seconds for cluster in found]))
         closed += [chain for chain in open_ if now - chain.clusters[-1].seconds > MAX_GAP_S]
         open_ = [chain for chain in open_ if now - chain.clusters[-1].seconds <= MAX_GAP_S]
-        taken = _assigned(open_, found)
+        costs, times = np.full((len(open_), len(found)), np.inf), np.array([cluster.seconds for cluster in found])
+        for row, chain in enumerate(open_):
+            place, velocity = chain.motion_at(-1)
+            since = times - chain.clusters[-1].seconds
+            expected = place + since[:, None] * velocity
+            apart = np.linalg.norm(np.stack([cluster.place for cluster in found]) - expected, axis=1)
+            gate = GATE + since * (MAX_SPEED if len(chain.clusters) == 1 else GATE_SPEED)
+            costs[row] = np.where(apart <= gate, apart / gate, np.inf)
+        taken: list[Chain | None] = [None] * len(found)
+        if open_:
+            rows, columns = linear_sum_assignment(np.where(np.isfinite(costs), costs, 1e3))
+            for row, column in zip(rows, columns, strict=True):
+                if np.isfinite(costs[row, column]):
+                    taken[column] = open_[row]
         for cluster, chain in zip(found, taken, strict=True):
             if chain is None:
                 open_.append(Chain([cluster]))
             else:
                 chain.clusters.append(cluster)
     return closed + open_
-
-
-def _assigned(chains: Sequence[Chain], found: Sequence[Cluster]) -> list[Chain | None]:
-    """For each cluster the chain that it continues, None for a new one."""
-    costs = np.full((len(chains), len(found)), np.inf)
-    for row, chain in enumerate(chains):
-        place, velocity = chain.motion_at_end()
-        since = np.array([cluster.seconds for cluster in found]) - chain.clusters[-1].seconds
-        expected = place + since[:, None] * velocity
-        apart = np.linalg.norm(np.stack([cluster.place for cluster in found]) - expected, axis=1)
-        gate = GATE + since * (MAX_SPEED if len(chain.clusters) == 1 else GATE_SPEED)
-        costs[row] = np.where(apart <= gate, apart / gate, np.inf)
-    taken: list[Chain | None] = [None] * len(found)
-    if chains:
-        rows, columns = linear_sum_assignment(np.where(np.isfinite(costs), costs, 1e3))
-        for row, column in zip(rows, columns, strict=True):
-            if np.isfinite(costs[row, column]):
-                taken[column] = chains[row]
-    return taken

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.spatial import cKDTree
 
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.lidar.objects.boxes import Discovered, fitted_box
-from drivesplat.lidar.objects.clusters import Chain, Cluster, chains_of, clusters_of
+from drivesplat.lidar.objects.clusters import Chain, chains_of, clusters_of
 from drivesplat.lidar.objects.ends import Ends
-from drivesplat.lidar.objects.merging import merged, united
+from drivesplat.lidar.objects.merging import after_gaps, of_parts, united
 from drivesplat.lidar.objects.seen_empty import seen_empty
 from drivesplat.lidar.objects.separation import separated
 from drivesplat.scene.object_class import ObjectClass
@@ -54,22 +54,18 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     moving = seen_empty(scans)
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
     around = Surroundings(scans, moving)
-    chains = [chain for chain in merged(_long(chains_of(clusters))) if is_object(chain) and around.confirm(chain)]
-    boxes = _without_overlaps([around.boxed(chain) for chain in chains], around)
-    boxes = _without_overlaps(_apart(boxes, around), around)
-    ends = Ends(scans)
-    return sorted((ends.followed(item) for _, item in boxes), key=lambda it: it.seconds[0])
-
-
-def _apart(boxes: Sequence[Boxed], around: "Surroundings") -> Sequence[Boxed]:
-    """Chains with their boxes, refined by turns with the returns that belong to each, until these stay."""
-    for _ in range(MAX_SEPARATIONS if boxes else 0):
+    long = [chain for chain in chains_of(clusters) if len(chain.clusters) >= MIN_SCANS]
+    whole = after_gaps(of_parts(long))
+    boxes = [around.boxed(chain) for chain in whole if is_object(chain) and around.confirm(chain)]
+    boxes = _without_overlaps(boxes, around)
+    for _ in range(MAX_SEPARATIONS if boxes else 0):  # boxes and the returns that belong to each, until these stay
         before = [_counts(chain) for chain, _ in boxes]
         chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= MIN_SCANS]
         if [_counts(chain) for chain in chains] == before:
             break
         boxes = [around.boxed(chain) for chain in chains]
-    return boxes
+    ends = Ends(scans)
+    return sorted((ends.followed(item) for _, item in _without_overlaps(boxes, around)), key=lambda it: it.seconds[0])
 
 
 def _counts(chain: Chain) -> list[tuple[int, int]]:
@@ -95,7 +91,10 @@ def overlap(a: Discovered, b: Discovered) -> bool:
     if last <= first:
         return False
     seconds = np.linspace(first, last, 10)
-    alike = _move_alike(a, b, seconds)
+    velocities = [item.path.velocities(seconds) for item in (a, b)]
+    speed = max(float(np.median(np.linalg.norm(own, axis=1))) for own in velocities)
+    differ_by = float(np.median(np.linalg.norm(velocities[0] - velocities[1], axis=1)))
+    alike = differ_by <= max(SAME_VELOCITY, SAME_SHARE * speed)
     for outer, inner in ((a, b), (b, a)):
         slack = np.zeros(2) if outer.object_class.is_human else np.array(SLACK)
         if alike and _share_inside(outer, inner, seconds, slack) > 0.5:
@@ -106,22 +105,11 @@ def overlap(a: Discovered, b: Discovered) -> bool:
     return False
 
 
-def _move_alike(a: Discovered, b: Discovered, seconds: np.ndarray) -> bool:
-    velocities = [item.path.velocities(seconds) for item in (a, b)]
-    speed = max(float(np.median(np.linalg.norm(own, axis=1))) for own in velocities)
-    apart = float(np.median(np.linalg.norm(velocities[0] - velocities[1], axis=1)))
-    return apart <= max(SAME_VELOCITY, SAME_SHARE * speed)
-
-
 def _share_inside(outer: Discovered, inner: Discovered, seconds: np.ndarray, slack: np.ndarray) -> float:
     """The fraction of the times at which the centre of a box lies in another one, enlarged by `slack` (2,) metres."""
     poses, places = outer.poses(seconds), inner.poses(seconds)[:, :3, 3]
     local = np.einsum("nji,nj->ni", poses[:, :3, :3], places - poses[:, :3, 3])
     return float((np.abs(local[:, :2]) < 0.5 * outer.size[:2] + slack).all(axis=1).mean())
-
-
-def _long(chains: Sequence[Chain]) -> list[Chain]:
-    return [chain for chain in chains if len(chain.clusters) >= MIN_SCANS]
 
 
 def is_object(chain: Chain) -> bool:
@@ -151,48 +139,45 @@ class Surroundings:
         elevations = np.sort(scans[0].scan.rays.beam_elevations)
         self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
         self._ground = ground_of(scans, moving)
-        self._blind = max(_blind_range(scan) for scan in scans)
+        # Nearer returns are not measured, as they are of the ego vehicle.
+        self._blind = max(float(s.scan.ranges[s.scan.returned & ~s.measured].max(initial=0.0)) for s in scans)
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
 
     def boxed(self, chain: Chain) -> Boxed:
-        """A chain with its box."""
-        return chain, fitted_box(chain, self._grounds(chain), self._blind)
-
-    def _grounds(self, chain: Chain) -> Float[np.ndarray, " k"]:
-        """The height of the ground below each cluster of a chain in metres: where it is unknown, between known ones, or
-        that of the lowest returns."""
+        """A chain with its box, on the ground: where its height is unknown, between known ones, or on the height of the
+        lowest returns."""
         heights = np.array([self._ground.height(cluster.place) for cluster in chain.clusters])
         known = np.isfinite(heights)
-        if not known.any():
-            return np.full(len(heights), min(cluster.lowest for cluster in chain.clusters))
-        return np.interp(chain.seconds, chain.seconds[known], heights[known])
+        if known.any():
+            grounds = np.interp(chain.seconds, chain.seconds[known], heights[known])
+        else:
+            grounds = np.full(len(heights), min(cluster.lowest for cluster in chain.clusters))
+        return chain, fitted_box(chain, grounds, self._blind)
 
     def confirm(self, chain: Chain) -> bool:
         """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
         move, as those of standing objects do not."""
         clearances = np.array([cluster.lowest - self._ground.height(cluster.place) for cluster in chain.clusters])
-        excess = clearances - [max(MAX_CLEARANCE, KERB + 2 * self._beams_apart(cluster)) for cluster in chain.clusters]
+        beams_apart = [
+            self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2])) for cluster in chain.clusters
+        ]
+        excess = clearances - [max(MAX_CLEARANCE, KERB + 2 * apart) for apart in beams_apart]
         if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
             return False
-        return bool(np.median([self._moving_share(cluster) for cluster in chain.clusters]) > MIN_MOVING)
-
-    def _beams_apart(self, cluster: Cluster) -> float:
-        """The vertical distance in metres of neighbouring beams at the place of a cluster."""
-        return self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2]))
-
-    def _moving_share(self, cluster: Cluster) -> float:
-        """The fraction of the returns in a cluster's extents, above the ground where it is known, that move."""
-        ground = self._ground.height(cluster.place)
-        floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
-        tree, heights = self._of_scan(cluster.scan)
-        low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
-        reach = 0.5 * float(np.linalg.norm(high[:2] - low[:2]))
-        near = np.array(tree.query_ball_point(cluster.place, reach), dtype=np.int64)
-        places, z = tree.data[near], heights[near]
-        inside = (places >= low[:2]).all(axis=1) & (places <= high[:2]).all(axis=1)
-        standing = int((inside & (z > floor) & (z <= high[2])).sum())
-        own = int((cluster.points[:, 2] > floor).sum())
-        return own / max(own + standing, 1)
+        moving_shares = []  # of the returns in a cluster's extents, above the ground where it is known
+        for cluster in chain.clusters:
+            ground = self._ground.height(cluster.place)
+            floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
+            tree, heights = self._of_scan(cluster.scan)
+            low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
+            reach = 0.5 * float(np.linalg.norm(high[:2] - low[:2]))
+            near = np.array(tree.query_ball_point(cluster.place, reach), dtype=np.int64)
+            places, z = tree.data[near], heights[near]
+            inside = (places >= low[:2]).all(axis=1) & (places <= high[:2]).all(axis=1)
+            standing = int((inside & (z > floor) & (z <= high[2])).sum())
+            own = int((cluster.points[:, 2] > floor).sum())
+            moving_shares.append(own / max(own + standing, 1))
+        return bool(np.median(moving_shares) > MIN_MOVING)
 
     def _of_scan(self, number: int) -> tuple[cKDTree, np.ndarray]:
         """The places of the returns of a scan that do not move, and their heights."""
@@ -202,18 +187,12 @@ class Surroundings:
         return self._standing[number]
 
 
-def _blind_range(scan: RecordedScan) -> float:
-    """The range in metres below which returns are not measured, as they are of the ego vehicle; 0 if there are none."""
-    return float(scan.scan.ranges[scan.scan.returned & ~scan.measured].max(initial=0.0))
-
-
 def ground_of(scans: Sequence[RecordedScan], moving: Sequence[Bool[np.ndarray, " _"]]) -> GroundMap:
     """The map of the ground by the measured returns of scans without those that are `moving`, an array for each
     scan."""
     chosen = np.unique(np.linspace(0, len(scans) - 1, GROUND_SCANS).round().astype(int))
-    return GroundMap(np.concatenate([_near_sensor(scans[k], moving[k]) for k in chosen]))
-
-
-def _near_sensor(scan: RecordedScan, moving: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m 3"]:
-    points = scan.points()[~moving]
-    return points[np.linalg.norm(points - scan.sensor_to_world[:3, 3], axis=1) < GROUND_REACH]
+    near = []
+    for k in chosen:
+        points = scans[k].points()[~moving[k]]
+        near.append(points[np.linalg.norm(points - scans[k].sensor_to_world[:3, 3], axis=1) < GROUND_REACH])
+    return GroundMap(np.concatenate(near))

@@ -21,11 +21,6 @@ MIN_SPEED = 2.5
 """Metres per second of objects that may fall apart: people who walk together are not one body."""
 
 
-def merged(chains: Sequence[Chain]) -> list[Chain]:
-    """The chains, those of one object as one."""
-    return after_gaps(of_parts(chains))
-
-
 def after_gaps(chains: Sequence[Chain]) -> list[Chain]:
     """Joins chains that go on where others ended, the best matches first."""
     left = list(chains)
@@ -47,7 +42,7 @@ def _gap_cost(before: Chain, after: Chain) -> float:
     gap = after.clusters[0].seconds - before.clusters[-1].seconds
     if not -MAX_COMMON_S < gap <= MAX_HIDDEN_S or min(len(before.clusters), len(after.clusters)) < 2:
         return 1.0
-    (end, leaving), (begin, arriving) = before.motion_at_end(), after.motion_at_begin()
+    (end, leaving), (begin, arriving) = before.motion_at(-1), after.motion_at(0)
     if np.linalg.norm(leaving - arriving) > SAME_VELOCITY:
         return 1.0
     expected = end + 0.5 * gap * (leaving + arriving)

@@ -36,10 +36,23 @@ def tracks_quality(
     sight. A discovered track is right where an annotated object that moves at some time is within NEAR for half of its
     own key frames. `track_ids` are those that `RecordedScan.objects` index.
     """
-    seen = movers_in_sight(scene, scans, track_ids)
+    seen: dict[str, list[tuple[int, Box]]] = {}  # boxes of annotated movers in sight, with the timestamps, by track
+    for scan in (scan for scan in scans if scan.is_key_frame):
+        numbers, counts = np.unique(scan.objects_met, return_counts=True)
+        returns = {track_ids[n]: int(c) for n, c in zip(numbers, counts, strict=True) if n >= 0}
+        for box in boxes_at(scene, scan.timestamp):
+            if box.moves and returns.get(box.track_id, 0) >= MIN_RETURNS:
+                seen.setdefault(box.track_id, []).append((scan.timestamp, box))
     matches = {track_id: _best(boxes, tracks, scene) for track_id, boxes in seen.items()}
     annotated = moving_tracks(scene)
-    right = {track.id: _is_right(track, annotated, scene.key_frame_interval) for track in tracks}
+    right = {}
+    for track in tracks:
+        near: dict[str, int] = {}
+        for timestamp, pose in zip(track.timestamps, track.object_to_world, strict=True):
+            for box in boxes_of(annotated, int(timestamp), scene.key_frame_interval):
+                if np.linalg.norm(box.object_to_world[:2, 3] - pose[:2, 3]) <= NEAR:
+                    near[box.track_id] = near.get(box.track_id, 0) + 1
+        right[track.id] = max(near.values(), default=0) >= HALF * len(track.timestamps)
     found = {}
     for kind, belongs in KINDS.items():
         movers = [track_id for track_id, boxes in seen.items() if belongs(boxes[0][1].object_class)]
@@ -59,20 +72,6 @@ def tracks_quality(
     return found
 
 
-def movers_in_sight(
-    scene: Scene, scans: Sequence[RecordedScan], track_ids: Sequence[str]
-) -> dict[str, list[tuple[int, Box]]]:
-    """The boxes of annotated objects at the key frames at which they move in sight, with the timestamps, by track."""
-    found: dict[str, list[tuple[int, Box]]] = {}
-    for scan in (scan for scan in scans if scan.is_key_frame):
-        numbers, counts = np.unique(scan.objects_met, return_counts=True)
-        returns = {track_ids[n]: int(c) for n, c in zip(numbers, counts, strict=True) if n >= 0}
-        for box in boxes_at(scene, scan.timestamp):
-            if box.moves and returns.get(box.track_id, 0) >= MIN_RETURNS:
-                found.setdefault(box.track_id, []).append((scan.timestamp, box))
-    return found
-
-
 def _best(boxes: Sequence[tuple[int, Box]], tracks: Sequence[Track], scene: Scene) -> Float[np.ndarray, "k 2"]:
     """The offsets along and across an annotated object of the track that is near it most often: those within NEAR."""
     best = np.empty((0, 2))
@@ -87,14 +86,3 @@ def _best(boxes: Sequence[tuple[int, Box]], tracks: Sequence[Track], scene: Scen
         if len(offsets) > len(best):
             best = np.array(offsets)
     return best
-
-
-def _is_right(track: Track, movers: Sequence[Track], interval: float) -> bool:
-    """Whether one of the annotated `movers` is near a track for half of its key frames. `interval`: the key-frame
-    interval in microseconds."""
-    near: dict[str, int] = {}
-    for timestamp, pose in zip(track.timestamps, track.object_to_world, strict=True):
-        for box in boxes_of(movers, int(timestamp), interval):
-            if np.linalg.norm(box.object_to_world[:2, 3] - pose[:2, 3]) <= NEAR:
-                near[box.track_id] = near.get(box.track_id, 0) + 1
-    return max(near.values(), default=0) >= HALF * len(track.timestamps)

@@ -42,7 +42,7 @@ class RangeGrid:
     @cached_property
     def elevations(self) -> Float[np.ndarray, " b"]:
         """The elevation of each beam in radians, ascending."""
-        return np.sort(self._of_beams)
+        return np.sort(self.scan.scan.rays.beam_elevations)
 
     @cached_property
     def ranges(self) -> Float[np.ndarray, "b a"]:
@@ -52,7 +52,7 @@ class RangeGrid:
         grid = np.full(known.shape, np.nan, dtype=np.float32)
         beams = np.broadcast_to(np.arange(len(known))[:, None], known.shape)
         grid[beams, self._columns(own.scan.rays.azimuths)] = known
-        return grid[np.argsort(self._of_beams, kind="stable")]
+        return grid[np.argsort(own.scan.rays.beam_elevations, kind="stable")]
 
     @cached_property
     def offsets_s(self) -> Float[np.ndarray, " a"]:
@@ -69,17 +69,18 @@ class RangeGrid:
         """The rotation from the sensor at its timestamp to the sensor at the time of each column."""
         return Rotation.from_rotvec(-self.offsets_s[:, None] * self.scan.angular).as_matrix()
 
-    @cached_property
-    def _of_beams(self) -> Float[np.ndarray, " b"]:
-        return self.scan.scan.rays.beam_elevations
-
     def _columns(self, azimuths: np.ndarray) -> np.ndarray:
         count = self.scan.scan.rays.shape[1]
         return np.floor((azimuths + np.pi) * (count / (2.0 * np.pi))).astype(np.int64) % count
 
     def seen(self, points: Float[np.ndarray, "n 3"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """Whether this scan saw each place in the world (metres) empty, and whether it saw it occupied."""
-        places, columns = self._in_sensor(points)
+        at_timestamp = places = apply(inverse(self.scan.sensor_to_world), points)
+        for _ in range(STEPS):  # in the sensor's frame at the time when it looks at them
+            columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
+            moved = at_timestamp - self.offsets_s[columns][:, None] * self.scan.linear
+            places = np.einsum("nij,nj->ni", self._turns[columns], moved)
+        columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
         ranges = np.maximum(np.linalg.norm(places, axis=1), 1e-6)
         elevations = np.arcsin(np.clip(places[:, 2] / ranges, -1.0, 1.0))
         above = np.searchsorted(self.elevations, elevations)
@@ -96,16 +97,6 @@ class RangeGrid:
                 beyond &= ~(around <= limit)  # True for NaN
                 near |= np.abs(around - ranges) < tolerance  # False for NaN
         return beyond & (known >= MIN_KNOWN), in_view & near
-
-    def _in_sensor(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points in the sensor's frame at the times when it looks at them, and their columns."""
-        at_timestamp = apply(inverse(self.scan.sensor_to_world), points)
-        places = at_timestamp
-        for _ in range(STEPS):
-            columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
-            moved = at_timestamp - self.offsets_s[columns][:, None] * self.scan.linear
-            places = np.einsum("nij,nj->ni", self._turns[columns], moved)
-        return places, self._columns(np.arctan2(places[:, 1], places[:, 0]))
 
 
 def seen_empty(scans: Sequence[RecordedScan]) -> list[Bool[np.ndarray, " n"]]:

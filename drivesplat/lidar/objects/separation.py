@@ -27,30 +27,24 @@ def separated(chains: Sequence[Chain], boxes: Sequence[Discovered]) -> list[Chai
         ((number, cluster) for number, chain in enumerate(chains) for cluster in chain.clusters),
         key=lambda it: it[1].scan,
     )
+    # For each cluster the distances of its returns from the box of its chain and from each other box of its time.
+    owners, seconds = np.array([number for number, _ in owned]), np.array([cluster.seconds for _, cluster in owned])
+    distances: list[dict[int, np.ndarray]] = [{} for _ in owned]
+    for number, box in enumerate(boxes):
+        in_time = (box.seconds[0] <= seconds) & (seconds <= box.seconds[-1])
+        there = np.flatnonzero(in_time | (owners == number))
+        for k, pose in zip(there, box.poses(seconds[there]), strict=True):
+            distances[k][number] = beyond(box, pose, owned[k][1].points)
     made = [Chain() for _ in chains]
-    distances = _distances(owned, boxes)
     for _, of_scan in groupby(zip(owned, distances, strict=True), key=lambda it: it[0][1].scan):
         for number, cluster in _of_scan(list(of_scan)):
             made[number].clusters.append(cluster)
     return made
 
 
-def _distances(owned: Sequence[tuple[int, Cluster]], boxes: Sequence[Discovered]) -> list[dict[int, np.ndarray]]:
-    """For each cluster, given with the number of its chain, the distances (n,) of its returns from the box of this
-    chain and from each other box of its time, by the number of the box."""
-    owners, seconds = np.array([number for number, _ in owned]), np.array([cluster.seconds for _, cluster in owned])
-    found: list[dict[int, np.ndarray]] = [{} for _ in owned]
-    for number, box in enumerate(boxes):
-        in_time = (box.seconds[0] <= seconds) & (seconds <= box.seconds[-1])
-        there = np.flatnonzero(in_time | (owners == number))
-        for k, pose in zip(there, box.poses(seconds[there]), strict=True):
-            found[k][number] = beyond(box, pose, owned[k][1].points)
-    return found
-
-
 def _of_scan(owned: Sequence[tuple[tuple[int, Cluster], Mapping[int, np.ndarray]]]) -> list[tuple[int, Cluster]]:
     """The clusters of one scan, each with the number of its chain, after returns have moved to nearer boxes; given with
-    their `_distances`."""
+    the distances of their returns from boxes, by the number of the box."""
     points: dict[int, list[np.ndarray]] = {}
     seconds = {number: cluster.seconds for (number, cluster), _ in owned}
     for (number, cluster), distances in owned:

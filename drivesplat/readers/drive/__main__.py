@@ -10,14 +10,15 @@ from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.io.standard_output import standard_output
 from drivesplat.preprocess.intrinsics import intrinsics_warnings
 from drivesplat.preprocess.undistort import distortion_fault, undistorted
-from drivesplat.readers.drive.check import column_sentences, examine, summary, what_to_see
+from drivesplat.readers.drive.check import examine, summary
 from drivesplat.readers.drive.format import Drive, grouped
 from drivesplat.readers.drive.needed_settings import needed_settings
 from drivesplat.readers.drive.nerfstudio import add_command
+from drivesplat.readers.drive.sweep_file import columns_sentence
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.drive_warnings import drive_warnings
 from drivesplat.readers.record_names import counted
-from drivesplat.scene.scene import Scene, read_scene
+from drivesplat.scene.scene import UNPOSED, Scene, read_scene
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,17 +30,17 @@ def main(arguments: list[str] | None = None) -> int:
     checking.add_argument("--picture", type=Path, help="where the picture is written; by default {folder}/check.png")
     checking.set_defaults(run=_check)
     schema = commands.add_parser("schema", help="print the JSON schema of drive.json")
-    schema.set_defaults(run=_schema)
+    schema.set_defaults(run=lambda _: print(json.dumps(Drive.model_json_schema(by_alias=True), indent=2)))
     writing = commands.add_parser("write", help="write an extracted scene as a drive folder")
     writing.add_argument("scene", type=Path, help="a scene.json, such as results/0061/scene.json")
     writing.add_argument("folder", type=Path)
     writing.add_argument("--licence", default="", help="who may use the recording, and for what")
-    writing.set_defaults(run=_write)
+    writing.set_defaults(run=lambda asked: print(write_drive(read_scene(asked.scene), asked.folder, asked.licence)))
     add_command(commands)
     asked = parser.parse_args(arguments)
     try:
         with standard_output():
-            return asked.run(asked)
+            return asked.run(asked) or 0
         return 0  # nobody reads the rest
     except DriveSplatError as error:
         print(f"drivesplat: {error}", file=sys.stderr)
@@ -49,56 +50,44 @@ def main(arguments: list[str] | None = None) -> int:
 def _check(asked: argparse.Namespace) -> int:
     picture = asked.picture or asked.folder / "check.png"
     found = examine(asked.folder, picture)
-    faults = found.faults or _distortion_faults(found.scene)
+    scene = found.scene
+    cameras = scene.cameras if scene else ()
+    faults = found.faults or [fault for camera in cameras if (fault := distortion_fault(camera))]
     for line in grouped(faults):
         print(line)
     if found.no_picture:
         print(found.no_picture)
-    elif found.scene is not None:
-        print(": ".join(filter(None, (f"picture: {picture}", what_to_see(found.scene)))))
-    if faults or found.scene is None:
+    elif scene is not None:
+        boxes = scene.tracks and scene.poses != UNPOSED
+        seen = ["returns must lie on surfaces, also those of other times"] if scene.frames and scene.sweeps else []
+        seen += ["boxes around objects" if seen else "boxes must lie around objects"] if boxes else []
+        print(": ".join([f"picture: {picture}", *([", and ".join(seen)] if seen else [])]))
+    if faults or scene is None:
         print(counted(len(faults), "fault"))
         return 1
-    for sentence in (*drive_warnings(found.scene), *camera_warnings(found.scene)):
+    for sentence in (*drive_warnings(scene), *camera_warnings(scene)):
         print(f"warning: {sentence}")
-    for sentence in column_sentences(found.scene):
-        print(sentence)
-    print(summary(found.scene))
-    print(f"settings to copy:\n\n{needed_settings(found.scene, asked.folder)}", end="")
+    for lidar in scene.lidars:
+        path = Path(next(sweep.path for sweep in scene.sweeps if sweep.lidar == lidar.name))
+        print(f"LiDAR {lidar.name}: {path.name} {columns_sentence(path)}")
+    print(summary(scene))
+    print(f"settings to copy:\n\n{needed_settings(scene, asked.folder)}", end="")
     return 0
-
-
-def _distortion_faults(scene: Scene | None) -> list[str]:
-    return [fault for camera in (scene.cameras if scene else ()) if (fault := distortion_fault(camera))]
 
 
 def camera_warnings(scene: Scene) -> list[str]:
     """`intrinsics_warnings`, and sentences about cameras whose images contradict their intrinsics, by a trial with some
     images (`drivesplat.poses.lens`)."""
-    return [*intrinsics_warnings(scene), *_image_warnings(scene)]
-
-
-def _image_warnings(scene: Scene) -> list[str]:
     try:
         from drivesplat.poses.lens import lens_warnings, with_tested_images  # imports pycolmap
+
+        with tempfile.TemporaryDirectory(prefix="drivesplat-undistorted-") as folder:
+            found = lens_warnings(undistorted(with_tested_images(scene), Path(folder)))
     except ImportError as error:
-        return [f"intrinsics are not compared with images: pycolmap or pyceres cannot be imported ({error})"]
-    tested = with_tested_images(scene)
-    with tempfile.TemporaryDirectory(prefix="drivesplat-undistorted-") as folder:
-        try:
-            return lens_warnings(undistorted(tested, Path(folder)))
-        except DatasetError as error:
-            return [f"intrinsics are not compared with images: {error}"]
-
-
-def _schema(_: argparse.Namespace) -> int:
-    print(json.dumps(Drive.model_json_schema(by_alias=True), indent=2))
-    return 0
-
-
-def _write(asked: argparse.Namespace) -> int:
-    print(write_drive(read_scene(asked.scene), asked.folder, asked.licence))
-    return 0
+        found = [f"intrinsics are not compared with images: pycolmap or pyceres cannot be imported ({error})"]
+    except DatasetError as error:
+        found = [f"intrinsics are not compared with images: {error}"]
+    return [*intrinsics_warnings(scene), *found]
 
 
 if __name__ == "__main__":

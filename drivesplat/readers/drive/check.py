@@ -1,7 +1,7 @@
 """The check of a drive folder: every fault in a sentence, and a picture with LiDAR and boxes in images."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +13,6 @@ from PIL import Image, ImageDraw, ImageFont
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, Drive, structure_of
 from drivesplat.readers.drive.reader import scene_of
-from drivesplat.readers.drive.sweep_file import columns_sentence
 from drivesplat.readers.image_file import image_fault
 from drivesplat.readers.record_names import counted
 from drivesplat.readers.sweeps import read_returns, sweep_fault
@@ -72,8 +71,13 @@ def examine(folder: Path, picture: Path | None) -> Examined:
     with ThreadPoolExecutor() as pool:
         of_sweeps = list(pool.map(sweep_fault, scene.sweeps))
         of_images = list(pool.map(image_fault, scene.frames))
-    images = ((frame.token, fault, frame.image_path) for frame, fault in zip(scene.frames, of_images, strict=True))
-    faults = [*_image_faults(images), *filter(None, of_sweeps)]
+    alike: dict[str, list[str]] = {}  # a fault that several images have is named once, with a count
+    for frame, fault in zip(scene.frames, of_images, strict=True):
+        if fault:
+            alike.setdefault(fault.replace(frame.image_path, ""), []).append(f"frame {frame.token}: {fault}")
+    for first, *others in alike.values():
+        faults.append(first + (f" ({counted(len(others), 'other image')} the same)" if others else ""))
+    faults += filter(None, of_sweeps)
     no_picture = None
     if picture is not None:
         sound = [sweep for sweep, fault in zip(scene.sweeps, of_sweeps, strict=True) if not fault]
@@ -106,38 +110,19 @@ def summary(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-def column_sentences(scene: Scene) -> list[str]:
-    """What is read from the first sweep of each LiDAR, which has no fault."""
-    firsts = [next(sweep for sweep in scene.sweeps if sweep.lidar == lidar.name) for lidar in scene.lidars]
-    return [f"LiDAR {sweep.lidar}: {Path(sweep.path).name} {columns_sentence(Path(sweep.path))}" for sweep in firsts]
-
-
-def what_to_see(scene: Scene) -> str:
-    """What the picture of a scene must show, as the end of a sentence; empty where it shows images alone."""
-    seen = ["returns must lie on surfaces, also those of other times"] if scene.frames and scene.sweeps else []
-    boxes = ["boxes around objects"] if scene.tracks and scene.poses != UNPOSED else []
-    return ", and ".join([*seen, *boxes]) if seen else "".join(f"{words[:5]} must lie {words[6:]}" for words in boxes)
-
-
-def _image_faults(images: Iterable[tuple[str, str | None, str]]) -> Iterator[str]:
-    """The faults of images, given with token, fault and path; one that several have is named once, with a count."""
-    alike: dict[str, list[str]] = {}
-    for token, fault, path in images:
-        if fault:
-            alike.setdefault(fault.replace(path, ""), []).append(f"frame {token}: {fault}")
-    for first, *others in alike.values():
-        yield first + (f" ({counted(len(others), 'other image')} the same)" if others else "")
-
-
 def write_picture(scene: Scene, sweeps: Sequence[Sweep], path: Path) -> str | None:
-    """Writes a key frame of every camera, in a grid, or without images the middle sweep. `sweeps` are those without
-    faults. Returns a sentence if the file cannot be written."""
+    """Writes a key frame of every camera, in a grid, or without images the middle sweep. The key frame is nearest to a
+    sweep in time, within NEAREST_US, and then to the middle. `sweeps` are those without faults. Returns a sentence if
+    the file cannot be written."""
     cameras = [camera.name for camera in scene.cameras if scene.key_frames(camera.name)]
     columns = max(1, math.ceil(math.sqrt(len(cameras))))
     width = WIDTH if columns == 1 else MAX_WIDTH // columns
-    tiles = []
+    tiles, sweep_times = [], np.array([sweep.timestamp for sweep in sweeps])
     for camera in cameras:
-        frame = _shown_frame(scene, sweeps, camera)
+        frames = sorted((scene.frames[i] for i in scene.key_frames(camera)), key=lambda frame: frame.timestamp)
+        gaps = [int(np.abs(sweep_times - f.timestamp).min()) // NEAREST_US if sweeps else 0 for f in frames]
+        ranks = [(gap, abs(i - len(frames) // 2)) for i, gap in enumerate(gaps)]
+        frame = frames[ranks.index(min(ranks))]
         offsets = ((0,), OTHER_TIMES)[: 2 if scene.sweeps else 1]
         tiles.append(_stacked([[_drawn(scene, sweeps, frame, times, width)] for times in offsets]))
     if not scene.frames and scene.sweeps:
@@ -149,15 +134,6 @@ def write_picture(scene: Scene, sweeps: Sequence[Sweep], path: Path) -> str | No
     except OSError as error:
         return f"{path.name} cannot be written there ({error.strerror or error}); --picture names another place"
     return None
-
-
-def _shown_frame(scene: Scene, sweeps: Sequence[Sweep], camera: str) -> Frame:
-    """The key frame of a camera that is nearest to a sweep in time, within NEAREST_US, and then to the middle."""
-    frames = sorted((scene.frames[i] for i in scene.key_frames(camera)), key=lambda frame: frame.timestamp)
-    times = np.array([sweep.timestamp for sweep in sweeps])
-    gaps = [int(np.abs(times - frame.timestamp).min()) // NEAREST_US if len(times) else 0 for frame in frames]
-    middle = len(frames) // 2
-    return frames[min(range(len(frames)), key=lambda i: (gaps[i], abs(i - middle)))]
 
 
 def _stacked(rows: Sequence[Sequence[Image.Image]]) -> Image.Image:
@@ -180,7 +156,11 @@ def _drawn(scene: Scene, sweeps: Sequence[Sweep], frame: Frame, offsets: Sequenc
     draw, seconds = ImageDraw.Draw(image), []
     for offset in offsets if sweeps else ():
         sweep = min(sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp - offset))
-        _draw_returns(draw, apply(sweep.sensor_to_world, read_returns(sweep).points), frame, size)
+        points = apply(sweep.sensor_to_world, read_returns(sweep).points)
+        pixels, depth = project(points, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
+        inside = (depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+        for (x, y), share in zip(pixels[inside], np.clip(depth[inside] / MAX_DEPTH, 0.0, 1.0), strict=True):
+            draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_color(share))
         seconds.append(f"{(sweep.timestamp - frame.timestamp) * 1e-6:+.2f} s")
     for hull in hulls_in(scene, frame, size):
         draw.polygon([tuple(corner) for corner in hull.polygon], outline=(255, 90, 0), width=2)
@@ -193,14 +173,6 @@ def _drawn(scene: Scene, sweeps: Sequence[Sweep], frame: Frame, offsets: Sequenc
         draw.rectangle((8 + 60 * step, 26, 20 + 60 * step, 38), fill=_color(share))
         draw.text((24 + 60 * step, 26), f"{share * MAX_DEPTH:.0f} m", **outlined)
     return image
-
-
-def _draw_returns(draw: ImageDraw.ImageDraw, points: np.ndarray, frame: Frame, size: tuple[int, int]) -> None:
-    pixels, depth = project(points, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
-    inside = (depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
-    shares = np.clip(depth[inside] / MAX_DEPTH, 0.0, 1.0)
-    for (x, y), share in zip(pixels[inside], shares, strict=True):
-        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_color(share))
 
 
 def _color(share: float) -> tuple[int, int, int]:

@@ -102,18 +102,7 @@ def write_folder(
     missing = [path for path in images.values() if not path.is_file()]
     if missing:
         raise DatasetError(f"{len(missing)} of {len(images)} images are missing (first: {missing[0]})")
-    _check_record(folder / FILE, record)
-    for name, source in images.items():
-        link_or_copy(source, folder / name)
-    for name, columns in sweeps:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(folder / name, **columns)
-    write_json(folder / FILE, record)
-    return folder / FILE
-
-
-def _check_record(path: Path, record: Mapping[str, Any]) -> None:
-    """Raises DatasetError, naming the file that is to hold it, if a record has faults. Leaves no file."""
+    path = folder / FILE
     try:
         write_json(path, record)
     except ValueError as error:
@@ -121,7 +110,14 @@ def _check_record(path: Path, record: Mapping[str, Any]) -> None:
     faults, drive = structure_of(path)
     if drive is not None:
         faults = [f"{path}: {fault}" for fault in faults_of(drive)]
-    path.unlink()
+    path.unlink()  # it is the last file of a whole folder
     if faults:
         more = f" ({len(faults) - 1} more faults)" if len(faults) > 1 else ""
         raise DatasetError(f"{faults[0]}{more}")
+    for name, source in images.items():
+        link_or_copy(source, folder / name)
+    for name, columns in sweeps:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(folder / name, **columns)
+    write_json(path, record)
+    return path

@@ -14,7 +14,7 @@ from drivesplat.readers.checks import (
     order_faults,
     path_faults,
 )
-from drivesplat.readers.drive.format import Distortion, Drive, Pose, TimedPose
+from drivesplat.readers.drive.format import Drive, Pose, TimedPose
 from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
 from drivesplat.readers.record_names import shown
@@ -34,14 +34,16 @@ MAX_FROM_PATH = 500.0
 
 def faults_of(drive: Drive) -> list[str]:
     """The faults of a drive; if times have another unit than microseconds, only those, which cause others."""
+    key_frames = drive.key_frames
+    none = "key_frames: there is none; leave the key out to use all images of the first camera"
     return list(_unit_faults(drive)) or [
-        *_camera_faults(drive),
-        *_lidar_faults(drive),
+        *_sensor_faults(drive),
         *_timed_faults("ego_poses", drive.ego_poses),
         *_place_faults(drive),
         *_recording_faults(drive),
         *_track_faults(drive),
-        *_key_frame_faults(drive),
+        *([none] if key_frames is not None and not key_frames else []),
+        *order_faults(key_frames or (), lambda i: f"key_frames[{i}]"),
     ]
 
 
@@ -70,7 +72,7 @@ def is_unposed(drive: Drive) -> bool:
     return not drive.ego_poses and not any(given) and not any(sweep.lidar_to_world for sweep in drive.sweeps)
 
 
-def _camera_faults(drive: Drive) -> Iterator[str]:
+def _sensor_faults(drive: Drive) -> Iterator[str]:
     mounts = ((name, camera.sensor_to_ego) for name, camera in drive.cameras.items())
     yield from _pose_faults("cameras", mounts, MAX_MOUNT)
     for name, camera in drive.cameras.items():
@@ -80,13 +82,14 @@ def _camera_faults(drive: Drive) -> Iterator[str]:
         except DatasetError as error:
             yield str(error)
             continue
-        wrong = list(_distortion_faults(camera.distortion))
-        if not wrong and camera.distortion.model != "none":
-            wrong = list(filter(None, [lens_fault(camera.sensor(name))]))
-        yield from (f"{where}: {fault}" for fault in wrong)
-
-
-def _lidar_faults(drive: Drive) -> Iterator[str]:
+        model, count = camera.distortion.model, len(camera.distortion.coefficients)
+        expected = COEFFICIENTS.get(model)
+        if expected is None and not count:
+            yield f"{where}: distortion {model} has no coefficients; it takes one for each power, from the first on"
+        elif expected is not None and count not in expected:
+            yield f"{where}: distortion {model} has {count} coefficients; it takes {' or '.join(map(str, expected))}"
+        elif model != "none" and (fault := lens_fault(camera.sensor(name))):
+            yield f"{where}: {fault}"
     yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()), MAX_MOUNT)
     for name, lidar in drive.lidars.items():
         steepest = max(map(abs, lidar.beam_elevations or ()), default=0.0)
@@ -97,14 +100,6 @@ def _lidar_faults(drive: Drive) -> Iterator[str]:
             )
         if not lidar.motion_compensated and not drive.ego_poses and not is_unposed(drive):
             yield f"lidars.{name}: motion_compensated is false, but there are no ego_poses for motion compensation"
-
-
-def _distortion_faults(distortion: Distortion) -> Iterator[str]:
-    expected, count = COEFFICIENTS.get(distortion.model), len(distortion.coefficients)
-    if expected is None and not count:
-        yield f"distortion {distortion.model} has no coefficients; it takes one for each power, from the first on"
-    elif expected is not None and count not in expected:
-        yield f"distortion {distortion.model} has {count} coefficients; it takes {' or '.join(map(str, expected))}"
 
 
 def _pose_faults(
@@ -219,11 +214,7 @@ def _track_faults(drive: Drive) -> Iterator[str]:
         except DatasetError as error:
             yield str(error)
         yield from _timed_faults(f"{where}: poses", track.poses)
-    yield from _elsewhere_faults(drive)
-
-
-def _elsewhere_faults(drive: Drive) -> Iterator[str]:
-    """The fault of tracks none of which is there during the drive, or near its path."""
+    # None of them may be there during the drive, or near its path.
     times = [one.timestamp for one in (*drive.frames, *drive.sweeps)]
     if not drive.tracks or not times:
         return
@@ -246,12 +237,3 @@ def _elsewhere_faults(drive: Drive) -> Iterator[str]:
                 f"tracks: {count} track{'s' if count > 1 else ''}, none begins within {nearest:.0f} m of the vehicle's "
                 "path: their poses must be in the world of ego_poses"
             )
-
-
-def _key_frame_faults(drive: Drive) -> Iterator[str]:
-    times = drive.key_frames
-    if times is None:
-        return
-    if not times:
-        yield "key_frames: there is none; leave the key out to use all images of the first camera"
-    yield from order_faults(times, lambda i: f"key_frames[{i}]")

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from drivesplat.errors import DatasetError
 from drivesplat.io.regular_file import regular_file
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.scene.sensors import Camera, DistortionModel
+from drivesplat.scene.sensors import Camera, DistortionModel, Lidar
 
 FILE = "drive.json"
 MAX_ALIKE = 3
@@ -105,6 +105,10 @@ class DriveLidar(DriveRecord):
     motion_compensated: bool = True
     """Whether all points of a sweep are where they would have been seen at its timestamp. false: each is in the
     sensor's frame at its own `time`, and the reader moves it by ego_poses."""
+
+    def sensor(self, name: str) -> Lidar:
+        """The LiDAR as scenes have it."""
+        return Lidar(name, None if self.beam_elevations is None else np.array(self.beam_elevations), self.azimuth_steps)
 
 
 class DriveFrame(DriveRecord):

@@ -63,7 +63,22 @@ def outline(root: Path, version: str, scene: str) -> Outline | None:
     """What a drive folder holds; None where its drive.json has faults, which `read` names."""
     file = scene_folder(root, scene) / FILE
     try:
-        return _outline(_content(file, file.stat().st_mtime_ns), file.parent)
+        drive = _content(file, file.stat().st_mtime_ns)
+        frames, sweeps = drive.get("frames") or [], drive.get("sweeps") or []
+        images = Counter(frame["camera"] for frame in frames)
+        first_sweeps = {sweep["lidar"]: file.parent / sweep["file"] for sweep in reversed(sweeps)}
+        unknown = [
+            name
+            for name, first in first_sweeps.items()
+            if drive["lidars"][name].get("beam_elevations") is None and not _has_rings(first)
+        ]
+        cameras = drive.get("cameras") or {}
+        return Outline(
+            cameras={name: RecordedCamera(of["width"], of["height"], images[name]) for name, of in cameras.items()},
+            key_frames=sorted(_key_frames(drive, frames, sweeps)),
+            sweeps=len(sweeps),
+            without_beams=unknown,
+        )
     except (AttributeError, KeyError, OSError, RecursionError, TypeError, ValueError):
         return None
 
@@ -72,24 +87,6 @@ def outline(root: Path, version: str, scene: str) -> Outline | None:
 def _content(file: Path, _: int) -> Any:
     """The content of a file with a modification time."""
     return json.loads(file.read_text(encoding="utf-8"))
-
-
-def _outline(drive: Any, folder: Path) -> Outline:
-    frames, sweeps = drive.get("frames") or [], drive.get("sweeps") or []
-    images = Counter(frame["camera"] for frame in frames)
-    first_sweeps = {sweep["lidar"]: folder / sweep["file"] for sweep in reversed(sweeps)}
-    unknown = [
-        name
-        for name, file in first_sweeps.items()
-        if drive["lidars"][name].get("beam_elevations") is None and not _has_rings(file)
-    ]
-    cameras = drive.get("cameras") or {}
-    return Outline(
-        cameras={name: RecordedCamera(of["width"], of["height"], images[name]) for name, of in cameras.items()},
-        key_frames=sorted(_key_frames(drive, frames, sweeps)),
-        sweeps=len(sweeps),
-        without_beams=unknown,
-    )
 
 
 def _key_frames(drive: Any, frames: list[Any], sweeps: list[Any]) -> list[int]:

@@ -27,11 +27,17 @@ MIN_TRAINING = 2
 def needed_settings(scene: Scene, folder: Path) -> str:
     """The settings of a drive in `folder` as YAML, to be laid over config.yaml: the data set, its cameras, and what
     differs from the defaults for it. The scene is called after the folder, `drive` where that cannot name one."""
+    name = folder.absolute().name
+    try:
+        require_name(name, "scene")
+    except ValueError:
+        name = "drive"
     cameras = [camera.name for camera in scene.cameras if scene.key_frames(camera.name)]
+    ahead = {frame.camera: round(float(frame.camera_to_ego[0, 2]), 1) for frame in scene.frames}
     settings: dict[str, Any] = {
-        "datasets": {"mine": {"reader": "drive", "dataroot": str(folder.absolute()), "scenes": [scene_name(folder)]}},
+        "datasets": {"mine": {"reader": "drive", "dataroot": str(folder.absolute()), "scenes": [name]}},
         "cameras": cameras,
-        "eval_camera": _camera_ahead(scene, cameras) if cameras else None,
+        "eval_camera": max(cameras, key=ahead.__getitem__) if cameras else None,
     }
     if not scene.sweeps:
         settings["lidar_seed"] = {"on_missing": "warn"}
@@ -41,34 +47,15 @@ def needed_settings(scene: Scene, folder: Path) -> str:
         frame = scene.frames[scene.middle_key_frame(settings["eval_camera"])]
         if frame.width > MAX_WIDTH:
             settings["images"] = {"width": MAX_WIDTH}
-        if holdout := _holdout(scene, settings["eval_camera"]):
-            settings["holdout"] = holdout
+        for changes in HOLDOUTS:
+            holdout = HoldoutSettings(**changes)
+            chosen = (scene.frames[i] for i in training_images(scene, holdout))
+            trained = {frame.sample_index for frame in chosen if frame.camera == settings["eval_camera"]}
+            held_out = np.concatenate(list(held_out_key_frames(len(scene.key_frame_timestamps), holdout).values()))
+            if len(trained) >= MIN_TRAINING and len(held_out):
+                break
+        else:
+            changes = {"every_nth": 0, "last_block": 0}
+        if changes:
+            settings["holdout"] = changes
     return yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
-
-
-def scene_name(folder: Path) -> str:
-    """The name of the scene in a drive folder."""
-    try:
-        require_name(folder.absolute().name, "scene")
-    except ValueError:
-        return "drive"
-    return folder.absolute().name
-
-
-def _camera_ahead(scene: Scene, cameras: list[str]) -> str:
-    """The camera that looks ahead most."""
-    ahead = {frame.camera: float(frame.camera_to_ego[0, 2]) for frame in scene.frames if frame.camera in cameras}
-    return max(cameras, key=lambda camera: round(ahead[camera], 1))
-
-
-def _holdout(scene: Scene, camera: str) -> dict[str, Any]:
-    """What differs from the default hold-out; empty where that leaves enough key frames to train on."""
-    for changes in HOLDOUTS:
-        holdout = HoldoutSettings(**changes)
-        trained = {
-            scene.frames[i].sample_index for i in training_images(scene, holdout) if scene.frames[i].camera == camera
-        }
-        held_out = np.concatenate(list(held_out_key_frames(len(scene.key_frame_timestamps), holdout).values()))
-        if len(trained) >= MIN_TRAINING and len(held_out):
-            return changes
-    return {"every_nth": 0, "last_block": 0}

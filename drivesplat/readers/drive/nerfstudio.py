@@ -77,7 +77,16 @@ def convert(path: Path, folder: Path, scale: Scale, licence: str = "") -> tuple[
         "version": 1,
         "description": "from a transforms.json of nerfstudio",
         "licence": licence,
-        "cameras": {name: _camera(of_camera[0].lens, mounts[name]) for name, of_camera in cameras.items()},
+        "cameras": {
+            name: {
+                "width": lens.width,
+                "height": lens.height,
+                "K": [[lens.focal[0], 0.0, lens.centre[0]], [0.0, lens.focal[1], lens.centre[1]], [0.0, 0.0, 1.0]],
+                "sensor_to_ego": pose_record(mounts[name]),
+                "distortion": {"model": lens.model, "coefficients": list(lens.coefficients)},
+            }
+            for name, lens in ((name, of_camera[0].lens) for name, of_camera in cameras.items())
+        },
         "frames": [
             {
                 "camera": name,
@@ -197,16 +206,6 @@ def mounted(cameras: dict[str, list[TransformsFrame]], ego_camera: str, height: 
             nearest = min(shots, key=lambda shot: int(np.abs(times - shot.time).min()))
             mounts[name] = inverse(pose_at(times, ego, nearest.time)) @ nearest.camera_to_world
     return mounts
-
-
-def _camera(lens: TransformsLens, mount: np.ndarray) -> dict[str, Any]:
-    return {
-        "width": lens.width,
-        "height": lens.height,
-        "K": [[lens.focal[0], 0.0, lens.centre[0]], [0.0, lens.focal[1], lens.centre[1]], [0.0, 0.0, 1.0]],
-        "sensor_to_ego": pose_record(mount),
-        "distortion": {"model": lens.model, "coefficients": list(lens.coefficients)},
-    }
 
 
 def add_command(commands: Any) -> None:

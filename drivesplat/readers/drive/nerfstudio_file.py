@@ -81,7 +81,7 @@ def shots_of(
     """The images of the content of a transforms.json at `path`, with a unit of their times, or with the rate of images
     that have no times. Raises DatasetError naming a frame whose values cannot be, or whose image is missing."""
     frames, folder, found = values["frames"], path.parent, []
-    times = _times(values, path, seconds_per_time) if hz is None else _even_times(values, path, hz)
+    times = _times(values, path, seconds_per_time, hz)
     for number, (frame, time) in enumerate(zip(frames, times, strict=True)):
         record = f"{path}: frames[{number}]"
         image = folder / _file(frame, record)
@@ -98,9 +98,24 @@ def shots_of(
     return found
 
 
-def _times(values: Mapping[str, Any], path: Path, seconds_per_time: float | None) -> list[int]:
-    """The times of frames that have them. Raises DatasetError where some have none."""
-    key = time_key(values)
+def _times(values: Mapping[str, Any], path: Path, seconds_per_time: float | None, hz: float | None) -> list[int]:
+    """The times of frames in microseconds, as stated in all of them; or with a rate `hz` of files without times, from
+    0: the images of each camera, or folder, in the order of the numbers in their names."""
+    key = next((key for key in TIME_KEYS if all(key in frame for frame in values["frames"])), None)
+    records = {f"{path}: frames[{number}]": frame for number, frame in enumerate(values["frames"])}
+    if hz is not None:
+        if key is not None:
+            raise DatasetError(f"{path}: its frames have a {key}; leave out --hz, and state --seconds-per-time")
+        cameras: dict[tuple[str | None, str], list[tuple[list[Any], int]]] = {}
+        for number, (record, frame) in enumerate(records.items()):
+            file = _file(frame, record)
+            order = [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
+            cameras.setdefault((_camera_name(frame, record), str(file.parent)), []).append((order, number))
+        times = [0] * len(records)
+        for of_camera in cameras.values():
+            for position, (_, number) in enumerate(sorted(of_camera)):
+                times[number] = round(position * 1e6 / hz)
+        return times
     if key is None:
         lacking = next(i for i, frame in enumerate(values["frames"]) if TIME_KEYS[0] not in frame)
         raise DatasetError(
@@ -112,34 +127,19 @@ def _times(values: Mapping[str, Any], path: Path, seconds_per_time: float | None
             "a transforms.json does not say it, so state --seconds-per-time: the seconds of a unit of timestamp or "
             "time (1e-6 if microseconds, 1 if seconds, the drive's length if it goes from 0 to 1)"
         )
-    return [
-        _microseconds(frame[key], seconds_per_time, key, f"{path}: frames[{number}]")
-        for number, frame in enumerate(values["frames"])
-    ]
-
-
-def _even_times(values: Mapping[str, Any], path: Path, hz: float) -> list[int]:
-    """Times at a constant rate, from 0: the images of each camera, or folder, in the order of the numbers in their
-    names."""
-    key = time_key(values)
-    if key is not None:
-        raise DatasetError(f"{path}: its frames have a {key}; leave out --hz, and state --seconds-per-time")
-    cameras: dict[tuple[str | None, str], list[tuple[list[Any], int]]] = {}
-    for number, frame in enumerate(values["frames"]):
-        record = f"{path}: frames[{number}]"
-        file = _file(frame, record)
-        order = [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
-        cameras.setdefault((_camera_name(frame, record), str(file.parent)), []).append((order, number))
-    times = [0] * len(values["frames"])
-    for of_camera in cameras.values():
-        for position, (_, number) in enumerate(sorted(of_camera)):
-            times[number] = round(position * 1e6 / hz)
+    times = []
+    for record, frame in records.items():
+        value = frame[key]
+        if not is_number(value) or not abs(value) < 1e300:
+            raise DatasetError(f"{record}: its {key} is {shown(value)}; it must be a finite number")
+        time = value * (seconds_per_time * 1e6)
+        if not 0 <= time <= MAX_TIMESTAMP:
+            raise DatasetError(
+                f"{record}: its {key} is {shown(value)}, which is {time:g} microseconds; times must be from 0 to "
+                f"{MAX_TIMESTAMP:g}, so check --seconds-per-time"
+            )
+        times.append(round(time))
     return times
-
-
-def time_key(values: Mapping[str, Any]) -> str | None:
-    """The key that holds the times of frames; None where some have none."""
-    return next((key for key in TIME_KEYS if all(key in frame for frame in values["frames"])), None)
 
 
 def applied_transform(values: Mapping[str, Any], path: Path) -> np.ndarray:
@@ -182,18 +182,6 @@ def clean_name(name: str) -> str:
     return re.sub(r"[^\w-]+", "_", name)[:100]
 
 
-def _microseconds(value: Any, seconds_per_time: float, key: str, record: str) -> int:
-    if not is_number(value) or not abs(value) < 1e300:
-        raise DatasetError(f"{record}: its {key} is {shown(value)}; it must be a finite number")
-    time = value * (seconds_per_time * 1e6)
-    if not 0 <= time <= MAX_TIMESTAMP:
-        raise DatasetError(
-            f"{record}: its {key} is {shown(value)}, which is {time:g} microseconds; times must be from 0 to "
-            f"{MAX_TIMESTAMP:g}, so check --seconds-per-time"
-        )
-    return round(time)
-
-
 def _lens(values: Mapping[str, Any], frame: Mapping[str, Any], image: Path, record: str) -> TransformsLens:
     """The intrinsics of a frame, whose image must have the size that they are for."""
     fl_x, fl_y, cx, cy = (_number(values, frame, key, record) for key in ("fl_x", "fl_y", "cx", "cy"))
@@ -211,17 +199,12 @@ def _lens(values: Mapping[str, Any], frame: Mapping[str, Any], image: Path, reco
             f"{record}: image {image} is {size[0]}x{size[1]}, its w and h say {stated[0]}x{stated[1]}; intrinsics must "
             "be those of the images"
         )
-    model, coefficients = _distortion(values, frame, record)
-    return TransformsLens(*size, (fl_x, fl_y), (cx - 0.5, cy - 0.5), model, coefficients)
-
-
-def _distortion(values: Mapping[str, Any], frame: Mapping[str, Any], record: str) -> tuple[str, tuple[float, ...]]:
-    """The model and the coefficients in OpenCV's order."""
     named = values.get("camera_model", frame.get("camera_model", PERSPECTIVE[0]))
     holder = values if any(key in values for key in DISTORTION) else frame
     k1, k2, k3, k4, p1, p2 = (_number(holder, {}, key, record, 0.0) for key in DISTORTION)
+    pinhole = *size, (fl_x, fl_y), (cx - 0.5, cy - 0.5)
     if named == FISHEYE:
-        return "fisheye", (k1, k2, k3, k4)
+        return TransformsLens(*pinhole, "fisheye", (k1, k2, k3, k4))
     if named not in PERSPECTIVE:
         known = ", ".join((*PERSPECTIVE, FISHEYE))
         raise DatasetError(f"{record}: its camera_model is {shown(named)}; a drive folder takes {known}")
@@ -229,7 +212,8 @@ def _distortion(values: Mapping[str, Any], frame: Mapping[str, Any], record: str
         raise DatasetError(
             f"{record}: its k4 is {k4:g}; nerfstudio's k4 is no coefficient of OpenCV's model: undistort the images"
         )
-    return ("opencv", (k1, k2, p1, p2, k3)) if any((k1, k2, p1, p2, k3)) else ("none", ())
+    distortion = (k1, k2, p1, p2, k3)
+    return TransformsLens(*pinhole, *(("opencv", distortion) if any(distortion) else ("none", ())))
 
 
 def _number(

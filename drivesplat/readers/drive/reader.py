@@ -13,10 +13,10 @@ from drivesplat.readers.drive.format import FILE, Drive, DriveFrame, DriveTrack,
 from drivesplat.readers.drive.layout import scene_folder
 from drivesplat.readers.drive.poses import EgoPath, matrix_of, reach_us
 from drivesplat.readers.drive.sweep_file import beyond_poses
+from drivesplat.readers.outline import frames_beyond, unknown_camera
 from drivesplat.scene.lens import central_intrinsics
 from drivesplat.scene.rigid import interpolate, inverse, rigid
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track, place_of
-from drivesplat.scene.sensors import Lidar
 from drivesplat.settings.extract import SceneSource
 
 log = logging.getLogger(__name__)
@@ -56,11 +56,8 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
     """The scene of a drive without faults; paths of files begin with `folder`. A drive of LiDAR alone has no frames,
     whatever the cameras of `source`; in one without poses the ego vehicle's pose is the identity at all times."""
     cameras = source.cameras if drive.frames else ()
-    unknown = [camera for camera in cameras if camera not in drive.cameras]
-    if unknown:
-        raise DatasetError(
-            f"scene {source.scene}: the drive has no camera {unknown[0]!r}; there are: {', '.join(drive.cameras)}"
-        )
+    if fault := unknown_camera(source.scene, drive.cameras, cameras):
+        raise DatasetError(fault)
     times, ego = key_frame_times(drive, source), EgoPath(drive)
     reading = _DriveReading(drive, folder, times, ego, origin_shift(drive, ego, int(times[0])))
     usual = usual_interval(drive.tracks)
@@ -81,7 +78,7 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
         key_frame_hz=nominal_rate(times),
         key_frame_range=list(source.frames) if source.frames else None,
         cameras=tuple(drive.cameras[name].sensor(name) for name in cameras),
-        lidars=tuple(_lidar(drive, name) for name in dict.fromkeys(sweep.lidar for sweep in sweeps)),
+        lidars=tuple(drive.lidars[name].sensor(name) for name in dict.fromkeys(sweep.lidar for sweep in sweeps)),
     )
 
 
@@ -123,10 +120,8 @@ def key_frame_times(drive: Drive, source: SceneSource) -> np.ndarray:
         first = next(lidar for lidar in drive.lidars if any(sweep.lidar == lidar for sweep in drive.sweeps))
         times = tuple(sorted(sweep.timestamp for sweep in drive.sweeps if sweep.lidar == first))
     found = np.array(times, dtype=np.int64)
-    if source.frames and source.frames[1] > len(found):
-        raise DatasetError(
-            f"scene {source.scene}: the frame range {source.frames} ends beyond its {len(found)} key frames"
-        )
+    if fault := frames_beyond(source.scene, len(found), source.frames):
+        raise DatasetError(fault)
     return found[slice(*(source.frames or (None, None)))]
 
 
@@ -273,9 +268,3 @@ class _DriveReading:
         shifted = pose.copy()
         shifted[:3, 3] -= self.shift
         return shifted
-
-
-def _lidar(drive: Drive, name: str) -> Lidar:
-    lidar = drive.lidars[name]
-    elevations = None if lidar.beam_elevations is None else np.array(lidar.beam_elevations)
-    return Lidar(name, elevations, lidar.azimuth_steps)

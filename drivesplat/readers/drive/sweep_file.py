@@ -29,29 +29,26 @@ BYTE = 255.0
 """The intensity that is 1 where intensities are those of other programs and beyond 1."""
 
 
-def read_file(path: Path) -> LidarReturns:
-    """The returns with finite coordinates, of a file without a fault."""
-    return _returns_of(_columns(path))
-
-
-def file_fault(path: Path) -> str | None:
-    """The fault of an existing file, or None. `drivesplat.readers.sweeps` checks the returns, as for all readers."""
-    found = read_checked(path)
-    return found if isinstance(found, str) else None
-
-
-def read_checked(path: Path) -> LidarReturns | str:
-    """The returns with finite coordinates of an existing file, or its fault: reads the file once."""
+def read_file(path: Path) -> LidarReturns | str:
+    """The returns with finite coordinates of an existing file, or its fault. `drivesplat.readers.sweeps` checks the
+    returns, as for all readers."""
     if path.suffix.lower() not in SUFFIXES:
         return f"is no sweep that can be read: sweeps are {', '.join(SUFFIXES)} files (docs/own_data.md)"
     try:
         columns = _columns(path)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, PlyHeaderParseError, PlyElementParseError) as error:
         return f"is corrupt ({' '.join(str(error).split())[:200]})"
-    return _columns_fault(columns) or _returns_of(columns)
-
-
-def _returns_of(columns: Mapping[str, np.ndarray]) -> LidarReturns:
+    lengths = {len(values) for values in columns.values()}
+    if len(lengths) != 1:
+        return f"is corrupt (its columns have {', '.join(map(str, sorted(lengths)))} rows)"
+    if not lengths.pop():
+        return "is empty"
+    intensity = columns.get("intensity")
+    if intensity is not None and ((intensity < 0) | (intensity > 1)).any():
+        return f"has intensities up to {float(np.nanmax(intensity)):.3g}; divide them, so that they lie in [0, 1]"
+    ring = columns.get("ring")
+    if ring is not None and not ((ring >= -1) & (ring < MAX_RINGS)).all():
+        return f"has rings from {np.nanmin(ring):g} to {np.nanmax(ring):g}; they are indices of beams, from 0 on"
     points = np.stack([columns[name] for name in AXES], axis=1).astype(np.float64)
     finite = np.isfinite(points).all(axis=1)
     optional: dict[str, Any] = {name: columns[name][finite] for name in OPTIONAL if name in columns}
@@ -64,21 +61,6 @@ def _returns_of(columns: Mapping[str, np.ndarray]) -> LidarReturns:
     )
 
 
-def _columns_fault(columns: Mapping[str, np.ndarray]) -> str | None:
-    lengths = {len(values) for values in columns.values()}
-    if len(lengths) != 1:
-        return f"is corrupt (its columns have {', '.join(map(str, sorted(lengths)))} rows)"
-    if not lengths.pop():
-        return "is empty"
-    intensity = columns.get("intensity")
-    if intensity is not None and ((intensity < 0) | (intensity > 1)).any():
-        return f"has intensities up to {float(np.nanmax(intensity)):.3g}; divide them, so that they lie in [0, 1]"
-    ring = columns.get("ring")
-    if ring is not None and not ((ring >= -1) & (ring < MAX_RINGS)).all():
-        return f"has rings from {np.nanmin(ring):g} to {np.nanmax(ring):g}; they are indices of beams, from 0 on"
-    return None
-
-
 def beyond_poses(sweep: Sweep, reach: int) -> str | None:
     """Why a sweep at the end of the ego poses cannot be motion-compensated, although its points are within `reach`
     (microseconds) of its timestamp; None for all others. Reads the files of those near an end alone."""
@@ -87,7 +69,7 @@ def beyond_poses(sweep: Sweep, reach: int) -> str | None:
     path = Path(sweep.path)
     if (known[0] <= -reach and known[1] >= reach) or not path.is_file():
         return None
-    returns = read_checked(path)
+    returns = read_file(path)
     if isinstance(returns, str) or returns.offsets_s is None:
         return None
     if not (np.abs(returns.offsets_s) <= reach * 1e-6 + TOLERANCE_S).all():

@@ -13,7 +13,7 @@ from drivesplat.readers.drive.format import FILE, Drive
 from drivesplat.readers.files import link_or_copy
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track
-from drivesplat.scene.sensors import Camera, Lidar
+from drivesplat.scene.sensors import Camera
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,11 @@ def write_drive(scene: Scene, folder: Path, licence: str = "") -> Path:
         raise DatasetError(
             f"scene {scene.name} has no poses; write scene_refined.json, where they are estimated from the images"
         )
-    frames = [(frame, _image_name(frame)) for frame in scene.frames if Path(frame.image_path).is_file()]
+    frames = [
+        (frame, f"images/{frame.camera}/{frame.timestamp}{Path(frame.image_path).suffix}")
+        for frame in scene.frames
+        if Path(frame.image_path).is_file()
+    ]
     if not frames and scene.frames:
         raise DatasetError(
             f"scene {scene.name}: none of its {len(scene.frames)} images is there "
@@ -54,7 +58,11 @@ def write_drive(scene: Scene, folder: Path, licence: str = "") -> Path:
     for frame, name in frames:
         link_or_copy(Path(frame.image_path), folder / name)
     for sweep, name in sweeps:
-        _write_sweep(sweep, folder / name)
+        returns = read_returns(sweep)
+        columns = dict(zip("xyz", returns.points.astype(np.float32).T, strict=True))
+        columns |= {name: values for field, name in OPTIONAL.items() if (values := getattr(returns, field)) is not None}
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(folder / name, **columns)
     path = folder / FILE
     _write_checked(path, drive_record(scene, frames, sweeps, licence))
     return path
@@ -89,7 +97,14 @@ def drive_record(
         "licence": licence or scene.licence,
         "origin": scene.origin.tolist(),
         "cameras": {camera.name: _camera(camera, written) for camera in scene.cameras},
-        "lidars": {lidar.name: _lidar(lidar) for lidar in scene.lidars},
+        "lidars": {
+            lidar.name: {
+                "sensor_to_ego": pose_record(np.eye(4)),
+                "beam_elevations": None if lidar.beam_elevations is None else lidar.beam_elevations.tolist(),
+                "azimuth_steps": lidar.azimuth_steps,
+            }
+            for lidar in scene.lidars
+        },
         "key_frames": scene.key_frame_timestamps.tolist(),
         "frames": [
             {
@@ -133,15 +148,6 @@ def _camera(camera: Camera, frames: Iterable[tuple[Frame, str]]) -> dict[str, An
     }
 
 
-def _lidar(lidar: Lidar) -> dict[str, Any]:
-    elevations = None if lidar.beam_elevations is None else lidar.beam_elevations.tolist()
-    return {
-        "sensor_to_ego": pose_record(np.eye(4)),
-        "beam_elevations": elevations,
-        "azimuth_steps": lidar.azimuth_steps,
-    }
-
-
 def _track(track: Track) -> dict[str, Any]:
     annotations = zip(track.timestamps.tolist(), track.object_to_world, track.visibility.tolist(), strict=True)
     return {
@@ -153,15 +159,3 @@ def _track(track: Track) -> dict[str, Any]:
             {"timestamp": time, **pose_record(pose), "visibility": VISIBLE[level]} for time, pose, level in annotations
         ],
     }
-
-
-def _write_sweep(sweep: Sweep, path: Path) -> None:
-    returns = read_returns(sweep)
-    columns = dict(zip("xyz", returns.points.astype(np.float32).T, strict=True))
-    found = {name: getattr(returns, field) for field, name in OPTIONAL.items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, **columns, **{name: values for name, values in found.items() if values is not None})
-
-
-def _image_name(frame: Frame) -> str:
-    return f"images/{frame.camera}/{frame.timestamp}{Path(frame.image_path).suffix}"

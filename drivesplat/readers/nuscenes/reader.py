@@ -30,6 +30,7 @@ from drivesplat.readers.drive_checks import chain, require_microseconds
 from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.readers.nuscenes.row_checks import check_rows
 from drivesplat.readers.nuscenes.scene_tables import PREFIX, damaged, read_scene_tables, scene_file, write_scene_tables
+from drivesplat.readers.outline import frames_beyond
 from drivesplat.readers.record_names import named
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
@@ -59,13 +60,16 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
     version, name, cameras, frames = source.version, source.scene, source.cameras, source.frames
     tables = _load(root, source, scene_tables)
     record = tables.scene[0]
-    samples = _samples(tables, record)
+    tokens = chain(record["first_sample_token"], lambda token: _get(tables, "sample", token)["next"], "sample")
+    samples = [_get(tables, "sample", token) for token in tokens]
     require_microseconds([s["timestamp"] for s in samples], f"scene {name}")
-    if frames and frames[1] > len(samples):
-        raise DatasetError(f"scene {name}: the frame range {frames} ends beyond its {len(samples)} key frames")
+    if fault := frames_beyond(name, len(samples), frames):
+        raise DatasetError(fault)
     samples = samples[slice(*(frames or (None, None)))]
     times = require_increasing([s["timestamp"] for s in samples], [s["token"] for s in samples], "sample")
-    origin = _origin(tables, samples[0], cameras)
+    hz = 1e6 / float(np.median(np.diff(times))) if len(times) > 1 else KEY_FRAME_HZ
+    channel = LIDAR if LIDAR in samples[0]["data"] or not cameras else cameras[0]
+    origin = _ego_pose(tables, _key_data(tables, samples[0], channel))[:3, 3].copy()
     scene = Scene(
         name=name,
         dataset="",
@@ -77,15 +81,20 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
         sweeps=(),
         tracks=(),
         poses=READER,
-        key_frame_hz=_key_frame_hz(times),
+        key_frame_hz=float(round(hz)) or hz,  # nuScenes' is 2 Hz within a tenth; synthetic worlds have others
         key_frame_range=list(frames) if frames else None,
     )
     images = [f for camera in cameras for f in _frames(tables, root, samples, camera, source.sweeps, scene)]
-    sweeps = tuple(_sweeps(tables, root, samples, source.lidar_sweeps, scene))
+    sweeps = []
+    if any(LIDAR in sample["data"] for sample in samples):
+        for data, index, _, sensor_to_world, _ in _recordings(tables, samples, LIDAR, source.lidar_sweeps, scene):
+            path = str(root / checked_path(data.get("filename"), named("sample_data", data["token"])))
+            time, is_key_frame = data["timestamp"], data["is_key_frame"]
+            sweeps.append(Sweep(path, time, sensor_to_world, is_key_frame, index, data["token"], LIDAR, READER))
     return dataclasses.replace(
         scene,
         frames=tuple(images),
-        sweeps=sweeps,
+        sweeps=tuple(sweeps),
         tracks=tuple(_tracks(tables, samples, origin)),
         cameras=tuple({frame.camera: _camera(tables, frame) for frame in images}.values()),
         lidars=(_lidar(tables, sweeps[0], version),) if sweeps else (),
@@ -120,12 +129,6 @@ def _calibration(tables: Any, sample_data: str) -> dict:
     return _get(tables, "calibrated_sensor", _get(tables, "sample_data", sample_data)["calibrated_sensor_token"])
 
 
-def _key_frame_hz(times: np.ndarray) -> float:
-    """The nominal rate of key frames: nuScenes' is 2 Hz within a tenth; synthetic worlds have others."""
-    hz = 1e6 / float(np.median(np.diff(times))) if len(times) > 1 else KEY_FRAME_HZ
-    return float(round(hz)) or hz
-
-
 def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
     """nuscenes-devkit's view of the tables, reduced to one scene."""
     from nuscenes.nuscenes import NuScenes
@@ -153,11 +156,6 @@ def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
             raise damaged(root, source.version, error) from error
 
 
-def _samples(tables: Any, scene: dict) -> list[dict]:
-    tokens = chain(scene["first_sample_token"], lambda token: _get(tables, "sample", token)["next"], "sample")
-    return [_get(tables, "sample", token) for token in tokens]
-
-
 def _get(tables: Any, table: str, token: str) -> dict:
     try:
         return tables.get(table, token)
@@ -168,11 +166,6 @@ def _get(tables: Any, table: str, token: str) -> dict:
 def _ego_pose(tables: Any, data: dict) -> np.ndarray:
     pose = _get(tables, "ego_pose", data["ego_pose_token"])
     return checked_pose(pose.get("translation"), pose.get("rotation"), named("ego_pose", pose["token"]))
-
-
-def _origin(tables: Any, sample: dict, cameras: tuple[str, ...]) -> np.ndarray:
-    channel = LIDAR if LIDAR in sample["data"] or not cameras else cameras[0]
-    return _ego_pose(tables, _key_data(tables, sample, channel))[:3, 3].copy()
 
 
 def _key_data(tables: Any, sample: dict, channel: str) -> dict:
@@ -220,24 +213,18 @@ def _recordings(
     for data in _records(tables, samples, channel, sweeps):
         at, of_sample = data["timestamp"], data["sample_token"]
         index = index_of_sample[of_sample] if data["is_key_frame"] else scene.nearest_key_frame(at)
-        _require_near_its_sample(data, int(scene.key_frame_timestamps[index]), scene.key_frame_interval)
+        apart = abs(at - int(scene.key_frame_timestamps[index]))
+        if data["is_key_frame"] and apart > max(1e6, scene.key_frame_interval):
+            raise DatasetError(
+                f"{named('sample_data', data['token'])}: its timestamp is {apart * 1e-6:g} s from that of its sample; "
+                "both must be microseconds of one clock"
+            )
         sensor = _get(tables, "calibrated_sensor", data["calibrated_sensor_token"])
         ego_to_world = _ego_pose(tables, data)
         ego_to_world[:3, 3] -= scene.origin
         mount, turn = sensor.get("translation"), sensor.get("rotation")
         sensor_to_ego = checked_pose(mount, turn, named("calibrated_sensor", sensor["token"]), MAX_MOUNT)
         yield data, index, ego_to_world, ego_to_world @ sensor_to_ego, sensor
-
-
-def _require_near_its_sample(data: dict, key_frame_us: int, interval: float) -> None:
-    """Raises DatasetError for a recording of a key frame that is farther than a second, and the interval between key
-    frames, from the time of its sample."""
-    apart = abs(data["timestamp"] - key_frame_us)
-    if data["is_key_frame"] and apart > max(1e6, interval):
-        raise DatasetError(
-            f"{named('sample_data', data['token'])}: its timestamp is {apart * 1e-6:g} s from that of its sample; "
-            "both must be microseconds of one clock"
-        )
 
 
 def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: bool, scene: Scene) -> Iterator[Frame]:
@@ -259,15 +246,6 @@ def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: b
         )
 
 
-def _sweeps(tables: Any, root: Path, samples: list[dict], sweeps: bool, scene: Scene) -> Iterator[Sweep]:
-    if not any(LIDAR in sample["data"] for sample in samples):
-        return
-    for data, index, _, sensor_to_world, _ in _recordings(tables, samples, LIDAR, sweeps, scene):
-        path = str(root / checked_path(data.get("filename"), named("sample_data", data["token"])))
-        time, is_key_frame = data["timestamp"], data["is_key_frame"]
-        yield Sweep(path, time, sensor_to_world, is_key_frame, index, data["token"], LIDAR, READER)
-
-
 def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Track]:
     """One track per instance, its annotations in time order."""
     by_instance: dict[str, list[tuple[int, int, dict]]] = {}
@@ -280,6 +258,7 @@ def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Tr
         names = [f"{named('sample_annotation', a['token'])} (instance {instance})" for a in annotations]
         checked = list(zip(annotations, names, strict=True))
         width, length, height = np.median([checked_box_size(a.get("size"), name) for a, name in checked], axis=0)
+        levels = [annotation.get("visibility_token", "") for annotation in annotations]
         poses = [checked_pose(a.get("translation"), a.get("rotation"), name) for a, name in checked]
         yield Track(
             id=instance,
@@ -289,10 +268,5 @@ def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Tr
             timestamps=np.array([time for _, time, _ in entries], dtype=np.int64),
             sample_indices=np.array([i for i, _, _ in entries], dtype=np.int64),
             object_to_world=np.stack([rigid(pose[:3, :3], pose[:3, 3] - origin) for pose in poses]),
-            visibility=np.array([_visibility(a) for a in annotations], dtype=np.int64),
+            visibility=np.array([int(v) if v in ("1", "2", "3", "4") else 0 for v in levels], dtype=np.int64),
         )
-
-
-def _visibility(annotation: dict) -> int:
-    token = annotation.get("visibility_token", "")
-    return int(token) if token in ("1", "2", "3", "4") else 0

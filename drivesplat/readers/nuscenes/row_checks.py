@@ -82,8 +82,12 @@ def check_rows(tables: Rows) -> None:
     samples are no chain."""
     for table, columns in _COLUMNS.items():
         rows = tables[table]
-        if "timestamp" in columns:
-            _round_timestamps(rows)
+        # Fractions, as Lyft's tables have them, become the nearest microsecond, half a one down. Timestamps are
+        # microseconds if they are after 1973: seconds and milliseconds are below.
+        for row in rows if "timestamp" in columns else ():
+            time = row.get("timestamp")
+            if type(time) is float and MIN_FRACTIONAL <= time <= MAX_TIMESTAMP:
+                row["timestamp"] = math.ceil(time - 0.5)
         for column, kind in {"token": _TOKEN, **columns}.items():
             _check_column(table, rows, column, kind)
         if table in _OPTIONAL:
@@ -99,17 +103,20 @@ def check_rows(tables: Rows) -> None:
     for log in tables["log"]:
         if all(log["token"] not in row["log_tokens"] for row in tables["map"]):
             raise DatasetError(f"{named('log', log['token'])}: no row of the table map refers to it")
-    _check_samples(tables)
+    following = {row["token"]: row["next"] for row in tables["sample"]}
+
+    def next_of(token: str) -> str:
+        if following[token] and following[token] not in following:
+            raise _missing("sample", following[token], named("sample", token))
+        return following[token]
+
+    linked = set(chain(tables["scene"][0]["first_sample_token"], next_of, "sample"))
+    for token in following:
+        if token not in linked:
+            raise DatasetError(
+                f"{named('sample', token)}: it is in the scene, but the chain of samples does not lead to it"
+            )
     _check_key_frames(tables)
-
-
-def _round_timestamps(rows: list[dict[str, Any]]) -> None:
-    """Replaces timestamps with fractions, as Lyft's tables have them, by the nearest microsecond, half a one down. They
-    are microseconds if they are after 1973: seconds and milliseconds are below."""
-    for row in rows:
-        time = row.get("timestamp")
-        if type(time) is float and MIN_FRACTIONAL <= time <= MAX_TIMESTAMP:
-            row["timestamp"] = math.ceil(time - 0.5)
 
 
 def _check_column(table: str, rows: list[dict[str, Any]], column: str, kind: _Kind) -> None:
@@ -127,22 +134,6 @@ def _missing(table: str, token: str, by: str) -> DatasetError:
     return DatasetError(f"{named(table, token)} is referred to by {by}, but not in the tables")
 
 
-def _check_samples(tables: Rows) -> None:
-    following = {row["token"]: row["next"] for row in tables["sample"]}
-
-    def next_of(token: str) -> str:
-        if following[token] and following[token] not in following:
-            raise _missing("sample", following[token], named("sample", token))
-        return following[token]
-
-    linked = set(chain(tables["scene"][0]["first_sample_token"], next_of, "sample"))
-    for row in tables["sample"]:
-        if row["token"] not in linked:
-            raise DatasetError(
-                f"{named('sample', row['token'])}: it is in the scene, but the chain of samples does not lead to it"
-            )
-
-
 def _check_key_frames(tables: Rows) -> None:
     """Raises DatasetError where two recordings of a sensor are key frames of one sample, or one instance has two boxes
     in a sample: either would be used at random."""
@@ -152,24 +143,13 @@ def _check_key_frames(tables: Rows) -> None:
         for row in tables["sample_data"]
         if row["is_key_frame"]
     ]
-    twice = _first_repeated(recordings)
-    if twice:
-        raise DatasetError(
-            f"{named('sample_data', twice[2])}: its sample {twice[0]} has another recording of its sensor"
-        )
     boxes = [(row["sample_token"], row["instance_token"], row["token"]) for row in tables["sample_annotation"]]
-    twice = _first_repeated(boxes)
-    if twice:
-        raise DatasetError(
-            f"{named('sample_annotation', twice[2])}: instance {twice[1]} has another box in sample {twice[0]}"
-        )
-
-
-def _first_repeated(entries: list[tuple[str, str, str]]) -> tuple[str, str, str] | None:
-    """The first entry whose first two values an earlier one has."""
-    seen: set[tuple[str, str]] = set()
-    for entry in entries:
-        if entry[:2] in seen:
-            return entry
-        seen.add(entry[:2])
-    return None
+    for table, entries, what in (
+        ("sample_data", recordings, "its sample {0} has another recording of its sensor"),
+        ("sample_annotation", boxes, "instance {1} has another box in sample {0}"),
+    ):
+        seen: set[tuple[str, str]] = set()
+        for sample, other, token in entries:
+            if (sample, other) in seen:
+                raise DatasetError(f"{named(table, token)}: {what.format(sample, other)}")
+            seen.add((sample, other))

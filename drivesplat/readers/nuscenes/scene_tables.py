@@ -64,8 +64,10 @@ def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) 
         "root": str(root.absolute()),
         "tables": {name: [stat.st_size, stat.st_mtime_ns] for name, stat in files},
     }
-    if all(scene_file(folder, scene).is_file() for scene in scenes) and _made_from(folder) == made_from:
-        return []
+    with suppress(OSError, ValueError):
+        known = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+        if known == made_from and all(scene_file(folder, scene).is_file() for scene in scenes):
+            return []
     size = sum(stat.st_size for _, stat in files)
     if size > LARGE:
         print(f"drivesplat: reading the tables of nuScenes {version} once ({size / 1e9:.1f} GB)", file=sys.stderr)
@@ -77,12 +79,6 @@ def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) 
 def scene_file(folder: Path, scene: str) -> Path:
     """The path of a scene's file of rows."""
     return folder / f"{scene}.jsonl"
-
-
-def _made_from(folder: Path) -> Any:
-    with suppress(OSError, ValueError):
-        return json.loads((folder / INDEX).read_text(encoding="utf-8"))
-    return None
 
 
 def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) -> list[Path]:

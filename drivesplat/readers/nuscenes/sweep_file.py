@@ -22,31 +22,17 @@ FIRING_S = 46.08e-6
 """Seconds between the firings of a beam."""
 
 
-def read_file(path: Path) -> LidarReturns:
-    """The returns with finite coordinates, of a file without a fault."""
+def read_file(path: Path) -> LidarReturns | str:
+    """The returns with finite coordinates of an existing file, or its fault."""
+    size = path.stat().st_size
+    if size == 0 or size % (4 * _COLUMNS):
+        return f"is corrupt ({size} bytes are no whole number of returns)"
     returns = np.fromfile(path, dtype=np.float32).reshape(-1, _COLUMNS)
     finite = np.isfinite(returns[:, :3]).all(axis=1)
     with np.errstate(invalid="ignore", over="ignore"):  # random bytes; `sweeps.read_returns` refuses them
         rings = np.nan_to_num(returns[:, 4], nan=-1.0).clip(-1.0, _MAX_RING).astype(np.int64)
-        offsets_s, returns = firing_times(rings), returns[finite]
-        return LidarReturns(
-            returns[:, :3].astype(np.float64), returns[:, 3] / 255.0, rings[finite],
-            None if offsets_s is None else offsets_s[finite],
-        )  # fmt: skip
-
-
-def firing_times(rings: np.ndarray) -> np.ndarray | None:
-    """Seconds (n,) after the sweep's timestamp of points whose `rings` (n,) come firing by firing; None for another
-    order."""
-    firings, rest = divmod(len(rings), BEAMS)
-    if rest or firings < 2 or (rings.reshape(firings, BEAMS) != np.arange(BEAMS)).any():
-        return None
-    return np.repeat(FIRING_S * np.arange(1 - firings, 1, dtype=np.float64), BEAMS)
-
-
-def file_fault(path: Path) -> str | None:
-    """The fault of an existing file, or None."""
-    size = path.stat().st_size
-    if size == 0 or size % (4 * _COLUMNS):
-        return f"is corrupt ({size} bytes are no whole number of returns)"
-    return None
+        firings, rest = divmod(len(rings), BEAMS)
+        offsets_s, returns = None, returns[finite]
+        if not rest and firings >= 2 and (rings.reshape(firings, BEAMS) == np.arange(BEAMS)).all():
+            offsets_s = np.repeat(FIRING_S * np.arange(1 - firings, 1, dtype=np.float64), BEAMS)[finite]
+        return LidarReturns(returns[:, :3].astype(np.float64), returns[:, 3] / 255.0, rings[finite], offsets_s)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -62,13 +61,15 @@ def write_nuscenes(scene: Scene, labels: Labels, root: Path, version: str, log: 
     images.
     """
     tables = _SceneTables(scene, labels, log)
-    for index, time in enumerate(scene.key_frame_timestamps.tolist()):
-        tables.add_sample(index, time)
     mounts: dict[str, np.ndarray] = {}
     for frame in scene.frames:
         if frame.camera not in mounts:
-            mounts[frame.camera] = frame.camera_to_ego
-            tables.add_camera(frame, mounts[frame.camera])
+            mounts[frame.camera], sensor = frame.camera_to_ego, token("sensor", frame.camera)
+            tables.add("sensor", sensor, channel=frame.camera, modality="camera")
+            tables.add(
+                "calibrated_sensor", token(scene.name, "calibrated", frame.camera), sensor_token=sensor,
+                camera_intrinsic=frame.intrinsics.tolist(), **pose_columns(mounts[frame.camera]),
+            )  # fmt: skip
         name = tables.add_image(frame, frame.camera_to_world @ inverse(mounts[frame.camera]))
         link_or_copy(Path(frame.image_path), root / name)
     for track in scene.tracks:
@@ -78,7 +79,7 @@ def write_nuscenes(scene: Scene, labels: Labels, root: Path, version: str, log: 
 
 
 class _SceneTables(TableRows):
-    """The tables of one scene. Poses of the scene become global ones."""
+    """The tables of one scene, with its key frames. Poses of the scene become global ones."""
 
     def __init__(self, scene: Scene, labels: Labels, log: dict[str, str]):
         super().__init__(token(scene.name, "log"), log, (MOVING_VEHICLE, MOVING_PERSON, WITH_RIDER))
@@ -89,22 +90,11 @@ class _SceneTables(TableRows):
             first_sample_token=self._sample(0), last_sample_token=self._sample(count - 1), name=f"scene-{scene.name}",
             description=scene.description,
         )  # fmt: skip
-
-    def add_sample(self, index: int, time: int) -> None:
-        """Adds a key frame."""
-        self.add_linked(
-            "sample", (), self._sample(index), timestamp=time, scene_token=token(self._scene.name),
-            beyond_training=self._beyond_training(time),
-        )  # fmt: skip
-
-    def add_camera(self, frame: Frame, mount: np.ndarray) -> None:
-        """Adds the camera of an image, with its pose (4, 4) on the vehicle."""
-        sensor = token("sensor", frame.camera)
-        self.add("sensor", sensor, channel=frame.camera, modality="camera")
-        self.add(
-            "calibrated_sensor", token(self._scene.name, "calibrated", frame.camera), sensor_token=sensor,
-            camera_intrinsic=frame.intrinsics.tolist(), **pose_columns(mount),
-        )  # fmt: skip
+        for index, time in enumerate(scene.key_frame_timestamps.tolist()):
+            self.add_linked(
+                "sample", (), self._sample(index), timestamp=time, scene_token=token(scene.name),
+                beyond_training=self._beyond_training(time),
+            )  # fmt: skip
 
     def add_image(self, frame: Frame, ego_to_world: np.ndarray) -> str:
         """Adds an image with its ego pose (4, 4); returns the path of its file below the dataset's root."""
@@ -112,7 +102,7 @@ class _SceneTables(TableRows):
         name, suffix = token(scene, camera, time), Path(frame.image_path).suffix
         folder = "samples" if frame.is_key_frame else "sweeps"
         path = f"{folder}/{camera}/{scene}__{camera}__{time}{suffix}"
-        self.add("ego_pose", name, timestamp=time, **self._global(ego_to_world))
+        self.add("ego_pose", name, timestamp=time, **pose_columns(self._origin @ ego_to_world))
         self.add_linked(
             "sample_data", (camera,), name, sample_token=self._sample(frame.sample_index), ego_pose_token=name,
             calibrated_sensor_token=token(scene, "calibrated", camera), timestamp=time, fileformat=suffix[1:],
@@ -130,7 +120,7 @@ class _SceneTables(TableRows):
                 (name, "annotation", track.id, index), token(name, "instance", track.id), category, track.size,
                 sample_token=self._sample(index), visibility_token=str(int(track.visibility[i])),
                 attribute_tokens=_attributes(box), num_lidar_pts=self._labels.lidar_points[track.id][i],
-                shown_by=self._labels.shown_by[track.id], **self._global(track.object_to_world[i]),
+                shown_by=self._labels.shown_by[track.id], **pose_columns(self._origin @ track.object_to_world[i]),
             )  # fmt: skip
 
     def add_image_boxes(self) -> None:
@@ -160,9 +150,6 @@ class _SceneTables(TableRows):
 
     def _sample(self, index: int) -> str:
         return token(self._scene.name, "sample", index)
-
-    def _global(self, pose: np.ndarray) -> dict[str, Any]:
-        return pose_columns(self._origin @ pose)
 
 
 def _attributes(box: Box | None) -> list[str]:

@@ -41,12 +41,9 @@ SINGLE = 1e-6
 def pose_of(values: Any, record: str, bound: float = MAX_COORDINATE) -> np.ndarray:
     """The transform (4, 4) of 16 numbers, row-major, with a translation of at most `bound` metres. Raises DatasetError
     naming `record` if it is not rigid."""
-    matrix = np.array(values, dtype=object).reshape(4, 4).tolist() if _has(values, 16) else values
+    is_row = isinstance(values, list | tuple | np.ndarray) and len(values) == 16
+    matrix = np.array(values, dtype=object).reshape(4, 4).tolist() if is_row else values
     return checked_transform(matrix, record, bound)
-
-
-def _has(values: Any, count: int) -> bool:
-    return isinstance(values, list | tuple | np.ndarray) and len(values) == count
 
 
 def camera_mount(camera: CameraRecord) -> np.ndarray:
@@ -68,22 +65,19 @@ def camera_of(camera: CameraRecord, images: Iterable[ImageRecord]) -> Camera:
         camera.intrinsic, 9, MAX_INTRINSIC, record, "intrinsic", "f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3"
     )
     k = [[f_u, 0.0, c_u - HALF_PIXEL], [0.0, f_v, c_v - HALF_PIXEL], [0.0, 0.0, 1.0]]
-    readout = 0.0 if camera.direction == GLOBAL_SHUTTER else _readout(images)
-    seconds, direction = checked_readout(readout, READOUT_DIRECTIONS.get(camera.direction), record)
-    return Camera(
-        CAMERAS[camera.number], width, height, checked_intrinsics(k, record, (width, height)), np.array(distortion),
-        seconds, direction, "opencv" if np.any(distortion) else "none",
-    )  # fmt: skip
-
-
-def _readout(images: Iterable[ImageRecord]) -> float | None:
-    """The median readout time in seconds; None where no image states it."""
     times = [
         image.readout_done - image.trigger - image.shutter
         for image in images
         if all(map(is_number, (image.trigger, image.shutter, image.readout_done))) and image.trigger > 0
     ]
-    return float(np.median(times)) if times else None
+    readout = float(np.median(times)) if times else None
+    if camera.direction == GLOBAL_SHUTTER:
+        readout = 0.0
+    seconds, direction = checked_readout(readout, READOUT_DIRECTIONS.get(camera.direction), record)
+    return Camera(
+        CAMERAS[camera.number], width, height, checked_intrinsics(k, record, (width, height)), np.array(distortion),
+        seconds, direction, "opencv" if np.any(distortion) else "none",
+    )  # fmt: skip
 
 
 def readout_middle(image: ImageRecord) -> float:

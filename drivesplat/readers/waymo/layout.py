@@ -5,7 +5,6 @@ segment, segment-{segment}_with_camera_labels.tfrecord, or {segment}.tfrecord. A
 or the beginning of it where no other segment begins so.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,7 +56,16 @@ def segment_files(root: Path, version: str, scene: str) -> SegmentFiles:
     """
     versions = [version] if version in (V1, V2) else [V1, V2]
     segments = {name: _segments(root, name) for name in versions}
-    name = _matching(scene, {segment for found in segments.values() for segment in found}, root)
+    known = sorted({segment for found in segments.values() for segment in found})
+    found = [scene] if scene in known else [name for name in known if name.startswith(scene)]
+    if len(found) != 1:
+        wrong = "begins the names of several segments" if found else "is not there"
+        shown = ", ".join((found or known)[:MAX_NAMED])
+        more = len(found or known) - MAX_NAMED
+        raise DatasetError(
+            f"scene {scene} {wrong}; in {root} there are: {shown or 'none'}{f' and {more} more' if more > 0 else ''}"
+        )
+    name = found[0]
     holding = [version for version in versions if name in segments[version]]
     if len(holding) > 1:
         raise DatasetError(
@@ -84,16 +92,3 @@ def _segments(root: Path, version: str) -> dict[str, Path]:
     if version == V2:
         return {file.stem: file for component in COMPONENTS for file in root.glob(f"{component}/*.parquet")}
     return {file.stem.removeprefix(PREFIX).removesuffix(SUFFIX): file for file in root.glob("*.tfrecord")}
-
-
-def _matching(scene: str, names: Iterable[str], root: Path) -> str:
-    known = sorted(names)
-    found = [scene] if scene in known else [name for name in known if name.startswith(scene)]
-    if len(found) == 1:
-        return found[0]
-    wrong = "begins the names of several segments" if found else "is not there"
-    shown = ", ".join((found or known)[:MAX_NAMED])
-    more = len(found or known) - MAX_NAMED
-    raise DatasetError(
-        f"scene {scene} {wrong}; in {root} there are: {shown or 'none'}{f' and {more} more' if more > 0 else ''}"
-    )

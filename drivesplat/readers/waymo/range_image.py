@@ -42,20 +42,9 @@ def elevations(inclinations: np.ndarray, lowest: float, highest: float, rows: in
     return inclinations[::-1]
 
 
-def azimuths(columns: int, extrinsic: np.ndarray) -> np.ndarray:
-    """The azimuth (columns,) of each column in the laser's frame."""
-    return column_azimuth((np.arange(columns) + 0.5) / columns, extrinsic)
-
-
 def column_azimuth(fraction: Any, extrinsic: np.ndarray) -> Any:
     """The azimuth in the laser's frame after a fraction of the columns, an array or one."""
     return np.pi * (1.0 - 2.0 * fraction) - np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
-
-
-def directions(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Unit vectors (..., 3) in the laser's frame."""
-    level = np.cos(elevation)
-    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def points_of(
@@ -65,7 +54,9 @@ def points_of(
     laser to vehicle; `pixel_poses` (n, 6): roll, pitch, yaw, x, y, z of the vehicle at each ray, `frame_pose` (4, 4)
     that of the frame."""
     hit = np.isfinite(rays.range)
-    points = directions(rays.azimuth[hit], rays.elevation[hit]) * rays.range[hit, None]
+    azimuth, elevation, level = rays.azimuth[hit], rays.elevation[hit], np.cos(rays.elevation[hit])
+    ways = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    points = ways * rays.range[hit, None]
     if pixel_poses is None or frame_pose is None:
         return points
     with np.errstate(invalid="ignore", over="ignore"):  # damaged poses; `sweep_file` leaves their points out

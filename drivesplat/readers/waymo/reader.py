@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,11 +24,12 @@ from drivesplat.readers.checks import (
 )
 from drivesplat.readers.drive.reader import nominal_rate
 from drivesplat.readers.drive_checks import require_microseconds
+from drivesplat.readers.outline import frames_beyond
 from drivesplat.readers.record_names import named, shown
 from drivesplat.readers.waymo import v1, v2
 from drivesplat.readers.waymo.calibration import camera_mount, camera_of, laser_mount, lidar_of, pose_of, readout_middle
 from drivesplat.readers.waymo.layout import segment_files
-from drivesplat.readers.waymo.names import CAMERAS, LASERS, V1
+from drivesplat.readers.waymo.names import CAMERAS, LASERS, V1, V2
 from drivesplat.readers.waymo.segment import BoxRecord, ImageRecord, Segment, frame_name
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import rigid
@@ -48,6 +48,8 @@ CLASSES = {
 """Name and class by `Label.Type`. Waymo has one class for all vehicles, so that no pixel belongs to the region `car`.
 Signs never move: OTHER_MOVABLE is what the protocol treats as static. Other types are of an unknown class, the same."""
 UNKNOWN = ("unknown", ObjectClass.OTHER_MOVABLE)
+FORMATS = {V1: v1, V2: v2}
+"""The modules that read the files of each version."""
 MAX_APART_US = 1_000_000
 """Maximum time in microseconds between a frame and its images."""
 
@@ -61,12 +63,7 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
     Raises DatasetError naming the first fault.
     """
     files = segment_files(root, source.version, source.scene)
-    return scene_of(format_of(files.version).read_segment(files), source)
-
-
-def format_of(version: str) -> ModuleType:
-    """The module that reads a version's files."""
-    return v1 if version == V1 else v2
+    return scene_of(FORMATS[files.version].read_segment(files), source)
 
 
 def scene_of(segment: Segment, source: SceneSource) -> Scene:
@@ -75,7 +72,13 @@ def scene_of(segment: Segment, source: SceneSource) -> Scene:
     unknown = [camera for camera in source.cameras if camera not in numbers]
     if unknown:
         raise DatasetError(f"scene {source.scene}: there is no camera {unknown[0]!r}; there are: {', '.join(numbers)}")
-    times = _key_frame_times(segment, source)
+    every = sorted(checked_timestamp(time, frame_name(time)) for time in segment.frames)
+    if not every:
+        raise DatasetError(f"scene {source.scene}: segment {segment.name} has no frames; download it again")
+    require_microseconds(every, f"scene {source.scene}")
+    if fault := frames_beyond(source.scene, len(every), source.frames):
+        raise DatasetError(fault)
+    times = np.array(every[slice(*(source.frames or (None, None)))], dtype=np.int64)
     poses = [pose_of(segment.frames[int(time)], frame_name(int(time))) for time in times]
     reading = _SegmentReading(segment, times, poses, poses[0][:3, 3].copy())
     cameras = [numbers[camera] for camera in source.cameras]
@@ -99,19 +102,6 @@ def scene_of(segment: Segment, source: SceneSource) -> Scene:
     )
 
 
-def _key_frame_times(segment: Segment, source: SceneSource) -> np.ndarray:
-    """The timestamps (n,) of the frames that `source` selects."""
-    every = sorted(checked_timestamp(time, frame_name(time)) for time in segment.frames)
-    if not every:
-        raise DatasetError(f"scene {source.scene}: segment {segment.name} has no frames; download it again")
-    require_microseconds(every, f"scene {source.scene}")
-    if source.frames and source.frames[1] > len(every):
-        raise DatasetError(
-            f"scene {source.scene}: the frame range {source.frames} ends beyond its {len(every)} key frames"
-        )
-    return np.array(every[slice(*(source.frames or (None, None)))], dtype=np.int64)
-
-
 @dataclass(frozen=True)
 class _SegmentReading:
     """A segment with its key frames, the vehicle's poses there, and the origin that is subtracted."""
@@ -130,7 +120,15 @@ class _SegmentReading:
         """The images of a camera."""
         name, mount = CAMERAS[number], camera_mount(self.segment.camera(number))
         camera = self.camera(number)
-        images = self._images_by_frame(number)
+        images: dict[int, ImageRecord] = {}
+        for image in self.segment.images:
+            if image.camera == number:
+                record = f"image {name} of {frame_name(image.frame)}"
+                if image.frame not in self.segment.frames:
+                    raise DatasetError(f"{record}: the segment has no such frame")
+                if image.frame in images:
+                    raise DatasetError(f"{record}: the segment has it twice")
+                images[image.frame] = image
         times = [self._time(images.get(int(key)), int(key)) for key in self.key_times]
         require_increasing(times, [f"{name}/{time}" for time in times], "image")
         for index, (key, time) in enumerate(zip(self.key_times.tolist(), times, strict=True)):
@@ -152,18 +150,6 @@ class _SegmentReading:
                 token=f"{name}/{key}",
                 readout_middle_s=0.0 if image is None else readout_middle(image),
             )
-
-    def _images_by_frame(self, number: int) -> dict[int, ImageRecord]:
-        found: dict[int, ImageRecord] = {}
-        for image in self.segment.images:
-            if image.camera == number:
-                record = f"image {CAMERAS[number]} of {frame_name(image.frame)}"
-                if image.frame not in self.segment.frames:
-                    raise DatasetError(f"{record}: the segment has no such frame")
-                if image.frame in found:
-                    raise DatasetError(f"{record}: the segment has it twice")
-                found[image.frame] = image
-        return found
 
     def _time(self, image: ImageRecord | None, key: int) -> int:
         """An image's time in microseconds; that of its frame where there is none."""
@@ -203,35 +189,29 @@ class _SegmentReading:
             of_object[box.frame] = box
         for id_, of_object in boxes.items():
             found = [(index_of[time], of_object[time]) for time in sorted(of_object) if time in index_of]
-            if found:
-                yield self._track(id_, [index for index, _ in found], [box for _, box in found])
-
-    def _track(self, id_: str, indices: list[int], boxes: list[BoxRecord]) -> Track:
-        category, kind = CLASSES.get(boxes[0].type, UNKNOWN)
-        sizes = [checked_box_size(box.size, _box(box)) for box in boxes]
-        poses = [self._box_pose(box, self.ego_poses[index]) for index, box in zip(indices, boxes, strict=True)]
-        return Track(
-            id=id_,
-            object_class=kind,
-            category=category,
-            size=np.median(sizes, axis=0),
-            timestamps=self.key_times[indices],
-            sample_indices=np.array(indices, dtype=np.int64),
-            object_to_world=np.stack(poses),
-            visibility=np.zeros(len(boxes), dtype=np.int64),
-        )
-
-    def _box_pose(self, box: BoxRecord, ego_pose: np.ndarray) -> np.ndarray:
-        center = checked_numbers(box.center, 3, MAX_COORDINATE, _box(box), "centre", "metres")
-        heading = checked_numbers([box.heading], 1, 100.0, _box(box), "heading", "radians")
-        turn = Rotation.from_euler("z", heading[0]).as_matrix()
-        return self._shifted(ego_pose) @ rigid(turn, center)
+            if not found:
+                continue
+            sizes, poses = [], []
+            for index, box in found:
+                record = f"{named('box', box.id)} in {frame_name(box.frame)}"
+                sizes.append(checked_box_size(box.size, record))
+                center = checked_numbers(box.center, 3, MAX_COORDINATE, record, "centre", "metres")
+                heading = checked_numbers([box.heading], 1, 100.0, record, "heading", "radians")
+                turn = Rotation.from_euler("z", heading[0]).as_matrix()
+                poses.append(self._shifted(self.ego_poses[index]) @ rigid(turn, center))
+            indices, (category, kind) = [index for index, _ in found], CLASSES.get(found[0][1].type, UNKNOWN)
+            yield Track(
+                id=id_,
+                object_class=kind,
+                category=category,
+                size=np.median(sizes, axis=0),
+                timestamps=self.key_times[indices],
+                sample_indices=np.array(indices, dtype=np.int64),
+                object_to_world=np.stack(poses),
+                visibility=np.zeros(len(found), dtype=np.int64),
+            )
 
     def _shifted(self, pose: np.ndarray) -> np.ndarray:
         shifted = pose.copy()
         shifted[:3, 3] -= self.origin
         return shifted
-
-
-def _box(box: BoxRecord) -> str:
-    return f"{named('box', box.id)} in {frame_name(box.frame)}"

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.io.storage import atomic_write
-from drivesplat.readers.drive.sweep_file import file_fault, read_checked, read_file
+from drivesplat.readers.drive.sweep_file import read_file
 from drivesplat.readers.waymo.range_image import LaserRays
 from drivesplat.scene.scan import Scan, ScanRays, wrapped
 from drivesplat.scene.sensors import Spin
 
-__all__ = ["file_fault", "read_checked", "read_file", "read_rays", "read_scan", "write_file"]
+__all__ = ["rays_of", "read_file", "read_scan", "write_file"]
 
 
 def write_file(
@@ -22,13 +22,6 @@ def write_file(
     Raises ResultError naming the file where it cannot be written."""
     with atomic_write(path) as file:
         np.savez(file, azimuth=azimuth, elevation=elevation, range=ranges.astype(np.float32), **returns)
-
-
-def read_rays(path: Path) -> LaserRays:
-    """All rays of a sweep, row by row."""
-    with np.load(path, allow_pickle=False) as arrays:
-        ranges = arrays["range"].astype(np.float64)
-        return rays_of(arrays["azimuth"], arrays["elevation"], ranges)
 
 
 def read_scan(path: Path, spin: Spin | None) -> Scan:

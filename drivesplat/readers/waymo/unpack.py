@@ -20,13 +20,13 @@ from drivesplat.readers.drive_checks import MAX_RANGE
 from drivesplat.readers.waymo.calibration import laser_elevations, laser_mount, pose_of
 from drivesplat.readers.waymo.layout import segment_files
 from drivesplat.readers.waymo.names import CAMERAS, LASERS, MAX_CLASS, SKY_CLASS, UNDEFINED_CLASS
-from drivesplat.readers.waymo.range_image import azimuths, points_of
-from drivesplat.readers.waymo.reader import format_of
-from drivesplat.readers.waymo.segment import ChosenRecordings, ImageFile, PanopticLabel, RangeImage, sweep_name
+from drivesplat.readers.waymo.range_image import column_azimuth, points_of
+from drivesplat.readers.waymo.reader import FORMATS
+from drivesplat.readers.waymo.segment import ChosenRecordings, PanopticLabel, RangeImage, sweep_name
 from drivesplat.readers.waymo.sweep_file import rays_of, write_file
 from drivesplat.scene.images import DECODING_ERRORS, write_png
 from drivesplat.scene.masks import UNLABELLED
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.extract import SceneSource
 
 FOLDERS = ("images", "classes", "sweeps")
@@ -45,7 +45,14 @@ def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene
     images = {frame.token: folder / frame.image_path for frame in scene.frames}
     sweeps = {sweep.token: folder / sweep.path for sweep in scene.sweeps}
     classes: dict[str, str] = {}
-    for recording in format_of(files.version).read_recordings(files, _wanted(scene)):
+    cameras = {name: number for number, name in CAMERAS.items()}
+    lasers = {name: number for number, name in LASERS.items()}
+    times = scene.key_frame_timestamps.tolist()
+    wanted = ChosenRecordings(
+        frozenset((times[frame.sample_index], cameras[frame.camera]) for frame in scene.frames),
+        frozenset((times[sweep.sample_index], lasers[sweep.lidar]) for sweep in scene.sweeps),
+    )
+    for recording in FORMATS[files.version].read_recordings(files, wanted):
         if isinstance(recording, RangeImage):
             _write_sweep(recording, sweeps[f"{LASERS[recording.laser.number]}/{recording.frame}"])
             continue
@@ -55,11 +62,15 @@ def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene
             _write_classes(recording, path)
             classes[token] = str(path)
         elif recording.content:
-            _write_image(recording, images[token])
-    if source.on_missing == "stop":
-        for frame in scene.frames:
-            if not images[frame.token].is_file():
-                raise _no_image(frame)
+            with atomic_write(images[token]) as file:
+                file.write(recording.content)
+    for frame in scene.frames if source.on_missing == "stop" else ():
+        if not images[frame.token].is_file():
+            camera, time = frame.token.split("/")
+            raise DatasetError(
+                f"key frame {frame.sample_index}: frame {time} has no image of camera {camera}; download the segment "
+                "again, or set extract.on_missing: warn to go on without it"
+            )
     return dataclasses.replace(
         scene,
         sky_class=SKY_CLASS if classes else None,
@@ -69,21 +80,6 @@ def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene
         ),
         sweeps=tuple(dataclasses.replace(sweep, path=str(sweeps[sweep.token])) for sweep in scene.sweeps),
     )
-
-
-def _wanted(scene: Scene) -> ChosenRecordings:
-    cameras = {name: number for number, name in CAMERAS.items()}
-    lasers = {name: number for number, name in LASERS.items()}
-    times = scene.key_frame_timestamps.tolist()
-    return ChosenRecordings(
-        frozenset((times[frame.sample_index], cameras[frame.camera]) for frame in scene.frames),
-        frozenset((times[sweep.sample_index], lasers[sweep.lidar]) for sweep in scene.sweeps),
-    )
-
-
-def _write_image(image: ImageFile, path: Path) -> None:
-    with atomic_write(path) as file:
-        file.write(image.content)
 
 
 def _write_classes(label: PanopticLabel, path: Path) -> None:
@@ -102,14 +98,6 @@ def _write_classes(label: PanopticLabel, path: Path) -> None:
     write_png(path, np.where(classes == UNDEFINED_CLASS, UNLABELLED, classes).astype(np.uint8))
 
 
-def _no_image(frame: Frame) -> DatasetError:
-    camera, time = frame.token.split("/")
-    return DatasetError(
-        f"key frame {frame.sample_index}: frame {time} has no image of camera {camera}; download the segment again, or "
-        "set extract.on_missing: warn to go on without it"
-    )
-
-
 def _write_sweep(image: RangeImage, path: Path) -> None:
     """Writes a range image as rays, and as returns in the laser's frame at the pose of the frame. Waymo's ranges of
     dropped returns are not positive."""
@@ -120,17 +108,15 @@ def _write_sweep(image: RangeImage, path: Path) -> None:
             f"{sweep}: its range image is {rows}x{columns}, and the poses of its pixels are "
             f"{image.poses.shape[0]}x{image.poses.shape[1]}; both must be of one segment"
         )
-    azimuth, elevation = azimuths(columns, mount), laser_elevations(image.laser, rows)
+    azimuth = column_azimuth((np.arange(columns) + 0.5) / columns, mount)
+    elevation = laser_elevations(image.laser, rows)
     ranges = image.values[..., 0].astype(np.float64)
     ranges[~((ranges > 0) & (ranges <= MAX_RANGE))] = np.nan
     rays = rays_of(azimuth, elevation, ranges)
     hit = np.isfinite(rays.range)
     poses = None if image.poses is None else image.poses.reshape(-1, 6)
     x, y, z = points_of(rays, mount, poses, pose_of(image.frame_pose, sweep)).T.astype(np.float32)
-    intensity, ring = _intensity(image.values[..., 1].ravel()[hit]), rays.row[hit].astype(np.int16)
+    # Waymo's intensities have no unit and no upper bound; most are below 1.
+    values = np.nan_to_num(image.values[..., 1].ravel()[hit].astype(np.float64), nan=0.0)
+    intensity, ring = np.tanh(values.clip(0.0)).astype(np.float32), rays.row[hit].astype(np.int16)
     write_file(path, azimuth, elevation, ranges, x=x, y=y, z=z, intensity=intensity, ring=ring)
-
-
-def _intensity(values: np.ndarray) -> np.ndarray:
-    """Intensities in [0, 1]. Waymo's have no unit and no upper bound; most are below 1."""
-    return np.tanh(np.nan_to_num(values.astype(np.float64), nan=0.0).clip(0.0)).astype(np.float32)

@@ -31,6 +31,7 @@ from drivesplat.readers.waymo.segment import (
     sweep_name,
 )
 
+TRUNCATED, ALTERED = "is truncated; download the file again", "differs; download the file again"
 _HEADER, _FOOTER = struct.Struct("<QI"), struct.Struct("<I")
 
 
@@ -44,8 +45,16 @@ def read_segment(files: SegmentFiles) -> Segment:
         segment.frames[time] = list(frame.pose.transform)
         if len(segment.frames) == 1:
             _add_calibrations(segment, frame.context)
-        segment.images += [_image(time, image) for image in frame.images]
-        segment.boxes += [_box(time, label) for label in frame.laser_labels]
+        for image in frame.images:
+            record = ImageRecord(
+                time, image.name, list(image.pose.transform), image.pose_timestamp, image.shutter,
+                image.camera_trigger_time, image.camera_readout_done_time,
+            )  # fmt: skip
+            segment.images.append(record)
+        for label in frame.laser_labels:
+            box, id_ = label.box, label.id.decode(errors="replace")
+            center, size = [box.center_x, box.center_y, box.center_z], [box.length, box.width, box.height]
+            segment.boxes.append(BoxRecord(time, id_, label.type, center, size, box.heading))
         for laser in frame.lasers:
             if laser.ri_return1.range_image_compressed:
                 segment.sweeps.append((time, laser.name))
@@ -116,20 +125,6 @@ def _add_calibrations(segment: Segment, context: Any) -> None:
         )  # fmt: skip
 
 
-def _image(time: int, image: Any) -> ImageRecord:
-    pose = list(image.pose.transform)
-    return ImageRecord(
-        time, image.name, pose, image.pose_timestamp, image.shutter, image.camera_trigger_time,
-        image.camera_readout_done_time,
-    )  # fmt: skip
-
-
-def _box(time: int, label: Any) -> BoxRecord:
-    box = label.box
-    center, size = [box.center_x, box.center_y, box.center_z], [box.length, box.width, box.height]
-    return BoxRecord(time, label.id.decode(errors="replace"), label.type, center, size, box.heading)
-
-
 def _returns(laser: Any, time: int) -> np.ndarray:
     return _matrix(laser.ri_return1.range_image_compressed, 4, sweep_name(laser.name, time))
 
@@ -159,17 +154,17 @@ def tfrecords(path: Path) -> Iterator[bytes]:
             record = f"record {number} of {path}"
             header = file.read(_HEADER.size)
             if len(header) < _HEADER.size:
-                raise _truncated(record)
+                raise DatasetError(f"{record} {TRUNCATED}")
             length, checksum = _HEADER.unpack(header)
             if masked_crc(header[:8]) != checksum:
-                raise _altered(record, "length")
+                raise DatasetError(f"{record}: the checksum (CRC-32C) of its length {ALTERED}")
             if length > size - file.tell() - _FOOTER.size:
-                raise _truncated(record)
+                raise DatasetError(f"{record} {TRUNCATED}")
             data, footer = file.read(length), file.read(_FOOTER.size)
             if len(data) < length or len(footer) < _FOOTER.size:
-                raise _truncated(record)
+                raise DatasetError(f"{record} {TRUNCATED}")
             if masked_crc(data) != _FOOTER.unpack(footer)[0]:
-                raise _altered(record, "data")
+                raise DatasetError(f"{record}: the checksum (CRC-32C) of its data {ALTERED}")
             yield data
             number += 1
 
@@ -178,11 +173,3 @@ def masked_crc(data: bytes) -> int:
     """The masked CRC-32C of a record's part."""
     crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
-
-
-def _truncated(record: str) -> DatasetError:
-    return DatasetError(f"{record} is truncated; download the file again")
-
-
-def _altered(record: str, part: str) -> DatasetError:
-    return DatasetError(f"{record}: the checksum (CRC-32C) of its {part} differs; download the file again")

@@ -5,11 +5,11 @@ sensors and timestamps may be texts, and floats of single precision.
 """
 
 from collections.abc import Iterator
-from itertools import chain
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.waymo.layout import SegmentFiles
@@ -33,6 +33,8 @@ from drivesplat.readers.waymo.segment import (
 TIME, CAMERA, LASER, OBJECT = (
     f"key.{name}" for name in ("frame_timestamp_micros", "camera_name", "laser_name", "laser_object_id")
 )
+NUMBERS = (TIME, CAMERA, LASER, ".type", ".rolling_shutter_direction")
+"""Ends of names of columns that hold whole numbers."""
 INTRINSIC = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 RANGES, POSES = "[LiDARComponent].range_image_return1", "[LiDARPoseComponent].range_image_return1"
 IMAGE = "[CameraImageComponent].image"
@@ -44,11 +46,24 @@ Key = tuple[int, int]
 
 def read_segment(files: SegmentFiles) -> Segment:
     """The segment of these files, without its images and the values of its range images."""
-    read = _Rows(files)
-    segment = _frames_and_lasers(files, read)
-    segment.cameras = {camera.number: camera for camera in _cameras(read)}
-    segment.images = list(_images(read))
-    segment.boxes = list(_boxes(read))
+    read = partial(_rows, files)
+    segment = _frames_and_lasers(files)
+    at = "[CameraCalibrationComponent]."
+    others = [f"{at}{name}" for name in ("extrinsic.transform", "width", "height", "rolling_shutter_direction")]
+    for row in read("camera_calibration", CAMERA, *(f"{at}intrinsic.{name}" for name in INTRINSIC), *others):
+        intrinsic = [row[f"{at}intrinsic.{name}"] for name in INTRINSIC]
+        segment.cameras[row[CAMERA]] = CameraRecord(row[CAMERA], intrinsic, *(row[name] for name in others))
+    at, times = "[CameraImageComponent].", ("shutter", "camera_trigger_time", "camera_readout_done_time")
+    columns = [f"{at}{name}" for name in ("pose.transform", "pose_timestamp")]
+    columns += [f"{at}rolling_shutter_params.{name}" for name in times]
+    for row in read("camera_image", TIME, CAMERA, *columns):
+        segment.images.append(ImageRecord(row[TIME], row[CAMERA], *(row[name] for name in columns)))
+    at = "[LiDARBoxComponent]."
+    center, size = ([f"{at}box.{part}.{axis}" for axis in "xyz"] for part in ("center", "size"))
+    kind, heading = f"{at}type", f"{at}box.heading"
+    for row in read("lidar_box", TIME, OBJECT, *center, *size, heading, kind):
+        values = ([row[name] for name in names] for names in (center, size))
+        segment.boxes.append(BoxRecord(row[TIME], row[OBJECT], row[kind], *values, row[heading]))
     for row in read("lidar", TIME, LASER, f"{RANGES}.shape"):
         shape = row[f"{RANGES}.shape"]
         if shape:
@@ -60,91 +75,40 @@ def read_segment(files: SegmentFiles) -> Segment:
 
 def read_recordings(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[ImageFile | PanopticLabel | RangeImage]:
     """The wanted images, with their labels, and range images, one at a time."""
-    return chain(_image_files(files, wanted), _labels(files, wanted), _range_images(files, wanted))
-
-
-def _frames_and_lasers(files: SegmentFiles, read: "_Rows") -> Segment:
-    segment = Segment(files.name, files.version)
-    pose = "[VehiclePoseComponent].world_from_vehicle.transform"
-    for row in read("vehicle_pose", TIME, pose):
-        if row[TIME] in segment.frames:
-            raise DatasetError(f"{frame_name(row[TIME])}: {files.files['vehicle_pose']} has it twice")
-        segment.frames[row[TIME]] = row[pose]
-    segment.lasers = {laser.number: laser for laser in _lasers(read)}
-    return segment
-
-
-class _Rows:
-    """Rows of the components of a segment, with whole numbers in the columns of keys."""
-
-    def __init__(self, files: SegmentFiles):
-        self._files = files
-
-    def __call__(self, component: str, *columns: str) -> Iterator[dict[str, Any]]:
-        path = self._files.files[component]
-        numbers = [column for column in columns if column in (TIME, CAMERA, LASER)]
-        for row in rows(path, columns, self._files.name):
-            yield row | {column: whole(row[column], path, column) for column in numbers}
-
-    def number(self, component: str, value: Any, column: str) -> int:
-        """A whole number of another column."""
-        return whole(value, self._files.files[component], column)
-
-
-def _cameras(read: _Rows) -> Iterator[CameraRecord]:
-    at = "[CameraCalibrationComponent]."
-    others = [f"{at}{name}" for name in ("extrinsic.transform", "width", "height", "rolling_shutter_direction")]
-    for row in read("camera_calibration", CAMERA, *(f"{at}intrinsic.{name}" for name in INTRINSIC), *others):
-        extrinsic, width, height, direction = (row[name] for name in others)
-        intrinsic = [row[f"{at}intrinsic.{name}"] for name in INTRINSIC]
-        turn = read.number("camera_calibration", direction, others[3])
-        yield CameraRecord(row[CAMERA], intrinsic, extrinsic, width, height, turn)
-
-
-def _lasers(read: _Rows) -> Iterator[LaserRecord]:
-    at = "[LiDARCalibrationComponent]."
-    columns = [f"{at}beam_inclination.{name}" for name in ("values", "min", "max")] + [f"{at}extrinsic.transform"]
-    for row in read("lidar_calibration", LASER, *columns):
-        inclinations, lowest, highest, extrinsic = (row[name] for name in columns)
-        yield LaserRecord(row[LASER], inclinations or [], lowest, highest, extrinsic)
-
-
-def _images(read: _Rows) -> Iterator[ImageRecord]:
-    at = "[CameraImageComponent]."
-    times = ("shutter", "camera_trigger_time", "camera_readout_done_time")
-    columns = [f"{at}{name}" for name in ("pose.transform", "pose_timestamp")]
-    columns += [f"{at}rolling_shutter_params.{name}" for name in times]
-    for row in read("camera_image", TIME, CAMERA, *columns):
-        yield ImageRecord(row[TIME], row[CAMERA], *(row[name] for name in columns))
-
-
-def _boxes(read: _Rows) -> Iterator[BoxRecord]:
-    at = "[LiDARBoxComponent]."
-    center, size = ([f"{at}box.{part}.{axis}" for axis in "xyz"] for part in ("center", "size"))
-    kind, heading = f"{at}type", f"{at}box.heading"
-    for row in read("lidar_box", TIME, OBJECT, *center, *size, heading, kind):
-        yield BoxRecord(
-            row[TIME], row[OBJECT], read.number("lidar_box", row[kind], kind), [row[name] for name in center],
-            [row[name] for name in size], row[heading],
-        )  # fmt: skip
-
-
-def _image_files(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[ImageFile]:
     path = files.files["camera_image"]
     for row in rows(path, [TIME, CAMERA, IMAGE], files.name, LARGE_ROWS):
         time, camera = whole(row[TIME], path, TIME), whole(row[CAMERA], path, CAMERA)
         if (time, camera) in wanted.images:
             yield ImageFile(time, camera, row[IMAGE] if isinstance(row[IMAGE], bytes) else b"")
+    if SEGMENTATION in files.files:
+        path, divisor = files.files[SEGMENTATION], f"{LABEL}_divisor"
+        for row in rows(path, [TIME, CAMERA, LABEL, divisor], files.name, LARGE_ROWS):
+            time, camera = whole(row[TIME], path, TIME), whole(row[CAMERA], path, CAMERA)
+            if (time, camera) in wanted.images and isinstance(row[LABEL], bytes):
+                yield PanopticLabel(time, camera, row[LABEL], whole(row[divisor], path, divisor))
+    yield from _range_images(files, wanted)
 
 
-def _labels(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[PanopticLabel]:
-    if SEGMENTATION not in files.files:
-        return
-    path, divisor = files.files[SEGMENTATION], f"{LABEL}_divisor"
-    for row in rows(path, [TIME, CAMERA, LABEL, divisor], files.name, LARGE_ROWS):
-        time, camera = whole(row[TIME], path, TIME), whole(row[CAMERA], path, CAMERA)
-        if (time, camera) in wanted.images and isinstance(row[LABEL], bytes):
-            yield PanopticLabel(time, camera, row[LABEL], whole(row[divisor], path, divisor))
+def _frames_and_lasers(files: SegmentFiles) -> Segment:
+    segment = Segment(files.name, files.version)
+    pose = "[VehiclePoseComponent].world_from_vehicle.transform"
+    for row in _rows(files, "vehicle_pose", TIME, pose):
+        if row[TIME] in segment.frames:
+            raise DatasetError(f"{frame_name(row[TIME])}: {files.files['vehicle_pose']} has it twice")
+        segment.frames[row[TIME]] = row[pose]
+    at = "[LiDARCalibrationComponent]."
+    columns = [f"{at}beam_inclination.{name}" for name in ("values", "min", "max")] + [f"{at}extrinsic.transform"]
+    for row in _rows(files, "lidar_calibration", LASER, *columns):
+        inclinations, lowest, highest, extrinsic = (row[name] for name in columns)
+        segment.lasers[row[LASER]] = LaserRecord(row[LASER], inclinations or [], lowest, highest, extrinsic)
+    return segment
+
+
+def _rows(files: SegmentFiles, component: str, *columns: str) -> Iterator[dict[str, Any]]:
+    """Rows of a component of a segment, with whole numbers in the columns NUMBERS."""
+    path, numbers = files.files[component], [column for column in columns if column.endswith(NUMBERS)]
+    for row in rows(path, columns, files.name):
+        yield row | {column: whole(row[column], path, column) for column in numbers}
 
 
 def _range_images(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[RangeImage]:
@@ -152,7 +116,7 @@ def _range_images(files: SegmentFiles, wanted: ChosenRecordings) -> Iterator[Ran
     have another order, poses wait for their range images."""
     if not wanted.sweeps:
         return
-    segment = _frames_and_lasers(files, _Rows(files))
+    segment = _frames_and_lasers(files)
     poses, waiting = _matrices(files, "lidar_pose", POSES, 6, wanted), dict[Key, np.ndarray]()
     for key, values in _matrices(files, "lidar", RANGES, 4, wanted):
         if key[1] == TOP:
@@ -177,14 +141,7 @@ def _matrices(
         for i in range(len(batch)):
             key = whole(times[i].as_py(), path, TIME), whole(lasers[i].as_py(), path, LASER)
             if key in wanted.sweeps:
-                yield key, cells(_floats(values[i]), shapes[i].as_py() or (), channels, sweep_name(key[1], key[0]))
-
-
-def _floats(value: pa.Scalar) -> np.ndarray:
-    """The numbers of a list; none where it is no list of numbers."""
-    inside = getattr(value, "values", None)
-    try:
-        with np.errstate(over="ignore"):
-            return np.zeros(0) if inside is None else inside.to_numpy(zero_copy_only=False).astype(np.float32)
-    except (TypeError, ValueError):
-        return np.zeros(0)
+                inside, numbers = getattr(values[i], "values", None), np.zeros(0)
+                with np.errstate(over="ignore"), suppress(TypeError, ValueError):  # it may be no list of numbers
+                    numbers = numbers if inside is None else inside.to_numpy(zero_copy_only=False).astype(np.float32)
+                yield key, cells(numbers, shapes[i].as_py() or (), channels, sweep_name(key[1], key[0]))

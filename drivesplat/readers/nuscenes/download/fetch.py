@@ -110,39 +110,38 @@ def _complete(source: NuscenesMiniSettings, part: Path) -> None:
 
 
 def _connect(source: NuscenesMiniSettings, part: Path) -> None:
-    """One connection: appends to `part` what the server sends. Raises DatasetError if its file has another size."""
-    validator = _stored_validator(source, part)
+    """One connection: appends to `part` what the server sends. Raises DatasetError if its file has another size,
+    ValueError if its range does not begin as requested, or belongs to another file."""
+    validator = None
+    with suppress(OSError, ValueError, AttributeError):
+        validator = json.loads(_record_of(part).read_text(encoding="utf-8")).get(source.url)
     start, size = size_of(part) if validator else 0, source.size_bytes
     headers = {"User-Agent": "drivesplat", **({"Range": f"bytes={start}-", "If-Range": validator} if start else {})}
     request = urllib.request.Request(source.url, headers=headers)
-    with open_url(request, source.timeout_s) as response:
+    opener = urllib.request.build_opener(_HttpHandler, _HttpsHandler)
+    with opener.open(request, timeout=source.timeout_s) as response:
         try:
-            start, total = _range_of(response, start, validator)
+            if response.status == 206:
+                found = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers.get("Content-Range", "").strip())
+                if not found or int(found[1]) != start or _validator(response.headers) not in (None, validator):
+                    raise ValueError("the server sent other bytes than requested")
+                total = int(found[2])
+            elif response.status == 200:
+                length = response.headers.get("Content-Length")
+                start, total = 0, None if length is None else int(length)
+            else:
+                raise ValueError(f"the server answered {response.status}")
         except ValueError:
             _discard(part)
             raise
         if total in (None, size) and _receive(source, response, part, start) <= size:
             return
     _discard(part)
-    found = f"more than {size:,}" if total in (None, size) else f"{total:,}"
+    sent = f"more than {size:,}" if total in (None, size) else f"{total:,}"
     raise DatasetError(
-        f"{source.url}: the server's file has {found} bytes, nuscenes_mini.size_bytes says {size:,}; "
+        f"{source.url}: the server's file has {sent} bytes, nuscenes_mini.size_bytes says {size:,}; "
         "nothing of it is kept"
     )
-
-
-def _range_of(response: http.client.HTTPResponse, start: int, validator: str | None) -> tuple[int, int | None]:
-    """The offset of the first byte that the server sends, and the size of its file (None if not announced). Raises
-    ValueError if the range does not begin at `start`, as requested, or belongs to another file."""
-    if response.status == 206:
-        found = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers.get("Content-Range", "").strip())
-        if not found or int(found[1]) != start or _validator(response.headers) not in (None, validator):
-            raise ValueError("the server sent other bytes than requested")
-        return start, int(found[2])
-    if response.status != 200:
-        raise ValueError(f"the server answered {response.status}")
-    length = response.headers.get("Content-Length")
-    return 0, None if length is None else int(length)
 
 
 def _receive(source: NuscenesMiniSettings, response: http.client.HTTPResponse, part: Path, start: int) -> int:
@@ -173,14 +172,6 @@ def _validator(headers: Message) -> str | None:
     """A header that changes with the file: a strong ETag, else Last-Modified (RFC 9110, 8.8)."""
     tag = headers.get("ETag")
     return tag if tag and not tag.startswith("W/") else headers.get("Last-Modified")
-
-
-def _stored_validator(source: NuscenesMiniSettings, part: Path) -> str | None:
-    """The validator of the file whose first bytes are in `part`; None if the download cannot be resumed."""
-    try:
-        return json.loads(_record_of(part).read_text(encoding="utf-8")).get(source.url)
-    except (OSError, ValueError, AttributeError):
-        return None
 
 
 def _record_of(part: Path) -> Path:
@@ -234,8 +225,3 @@ class _HttpHandler(urllib.request.HTTPHandler):
 class _HttpsHandler(urllib.request.HTTPSHandler):
     def https_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
         return self.do_open(_HttpsConnection, request)
-
-
-def open_url(request: urllib.request.Request, timeout: float) -> http.client.HTTPResponse:
-    """As `urllib.request.urlopen`, but raises TimeoutError where the headers take longer than `timeout` seconds."""
-    return urllib.request.build_opener(_HttpHandler, _HttpsHandler).open(request, timeout=timeout)

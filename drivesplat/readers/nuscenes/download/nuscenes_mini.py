@@ -35,7 +35,11 @@ def download(job: DownloadJob) -> None:
         with locked_file(folder / "lock"):
             if not is_present(job):  # another run may have finished first
                 _fill(job, folder)
-            _clear(folder, job.nuscenes_mini.keep_archive)
+            if job.nuscenes_mini.keep_archive and (folder / ARCHIVE).is_file():
+                announce(f"the archive is kept: {folder / ARCHIVE}")
+                (folder / "lock").unlink()
+            else:
+                shutil.rmtree(folder, ignore_errors=True)  # another run may have removed it already
     except LockHeldError:
         raise DatasetError(f"another run is downloading into {folder}; wait for it") from None
     except OSError as error:
@@ -69,11 +73,3 @@ def _fill(job: DownloadJob, folder: Path) -> None:
         raise DatasetError(f"{source.url}: {error}; it has been removed") from error
     os.sync()
     unpacked.rename(dataroot(job))  # replaces an empty folder, and nothing else
-
-
-def _clear(folder: Path, keep_archive: bool) -> None:
-    if keep_archive and (folder / ARCHIVE).is_file():
-        announce(f"the archive is kept: {folder / ARCHIVE}")
-        (folder / "lock").unlink()
-    else:
-        shutil.rmtree(folder, ignore_errors=True)  # another run may have removed it already

@@ -99,21 +99,16 @@ def _inspect(archive: Path, limits: NuscenesMiniSettings, required: list[str]) -
                 why = f"unpacks to more than {limits.max_unpacked_gb:g} GB (nuscenes_mini.max_unpacked_gb)"
             if why:
                 raise BadArchiveError(f"{archive.name} is refused: it {why}")
-        _require_end(stream)
+        # gzip verifies its checksum at the end; `tarfile` takes a broken header for the end of an archive.
+        padding = stream.read(MAX_READ)
+        if padding.strip(b"\0"):
+            raise tarfile.ReadError("a broken header")
+        if len(padding) == MAX_READ:
+            raise tarfile.ReadError("there is no end to it")
     absent = [name for name in required if name not in names]
     if absent:
         raise BadArchiveError(f"{archive.name} is refused: it is no such dataset, {', '.join(absent[:3])} is missing")
     return size
-
-
-def _require_end(stream: _Stream) -> None:
-    """Reads to the end, where gzip verifies its checksum. Raises ReadError if more than padding follows: `tarfile`
-    takes a broken header for the end of an archive."""
-    padding = stream.read(MAX_READ)
-    if padding.strip(b"\0"):
-        raise tarfile.ReadError("a broken header")
-    if len(padding) == MAX_READ:
-        raise tarfile.ReadError("there is no end to it")
 
 
 def _objection(member: tarfile.TarInfo) -> str | None:
