@@ -7,7 +7,6 @@ import numpy as np
 from drivesplat.errors import ConfigError
 from drivesplat.world.optics.raycast import NO_HIT, StreetRays
 from drivesplat.world.recorder import Recorder, Viewpoint
-from drivesplat.world.street.objects import StreetObject
 
 CHECK_S = 0.1
 """Interval of the checks in seconds."""
@@ -36,7 +35,13 @@ def first_contact(recorder: Recorder, edit: str, name: str) -> tuple[float, str]
     placed = next((item for item in objects if item.name == name), None)
     if placed is None:  # a later step has removed it
         return None
-    starts, ends = _lines_through(placed)
+    # lines through the vehicle's box, in its frame: its edges and diagonals at several heights
+    length, width, height = placed.size
+    corners = np.array([(x, y) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]) * [length / 2, width / 2]
+    pairs = [*pairwise([*corners, corners[0]]), (corners[0], corners[2]), (corners[1], corners[3])]
+    heights = np.linspace(CLEARANCE, 0.95 * height, 4)
+    starts = np.array([(*start, z) for start, _ in pairs for z in heights])
+    ends = np.array([(*end, z) for _, end in pairs for z in heights])
     times = np.arange(0.0, recorder.world.seconds, CHECK_S)
     poses = np.repeat(placed.poses(times), len(starts), axis=0)
     start, toward = np.tile(starts, (len(times), 1)), np.tile(ends - starts, (len(times), 1))
@@ -49,15 +54,3 @@ def first_contact(recorder: Recorder, edit: str, name: str) -> tuple[float, str]
     if len(inside) == 0:
         return None
     return float(rays.seconds[inside[0]]), objects[int(hits.object[inside[0]])].name
-
-
-def _lines_through(item: StreetObject) -> tuple[np.ndarray, np.ndarray]:
-    """Start and end points (n, 3) of lines through the box of an object, in its frame: its edges and diagonals at
-    several heights."""
-    length, width, height = item.size
-    corners = np.array([(x, y) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]) * [length / 2, width / 2]
-    pairs = [*pairwise([*corners, corners[0]]), (corners[0], corners[2]), (corners[1], corners[3])]
-    heights = np.linspace(CLEARANCE, 0.95 * height, 4)
-    starts = [(*start, z) for start, _ in pairs for z in heights]
-    ends = [(*end, z) for _, end in pairs for z in heights]
-    return np.array(starts), np.array(ends)

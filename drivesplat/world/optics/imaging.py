@@ -74,19 +74,16 @@ def render(snapshot: StreetSnapshot, light: Light, camera: WorldCamera, samples:
     over `samples` rays."""
     picture, radiance, edges = _through_centers(snapshot, light, camera)
     rows, columns = np.nonzero(edges)
+    # offsets in pixels from a pixel's centre, which is the first; the others spread evenly over it
+    spread = (0.5 + R2_STEPS * np.arange(samples)[:, None]) % 1.0 - 0.5
     for block in _blocks(len(rows) if samples > 1 else 0, samples - 1):
         y, x = (np.repeat(at[block], samples - 1) for at in (rows, columns))
-        offsets = np.tile(sample_offsets(samples)[1:], (len(rows[block]), 1))
+        offsets = np.tile(spread[1:], (len(rows[block]), 1))
         rays = camera.rays(x + offsets[:, 0], y + offsets[:, 1], y)
         found, _ = _radiance(snapshot, light, camera, rays, snapshot.cast(rays))
         total = found.reshape(-1, samples - 1, 3).sum(axis=1) + radiance[rows[block], columns[block]]
         radiance[rows[block], columns[block]] = total / samples
     return replace(picture, radiance=radiance * camera.gains)
-
-
-def sample_offsets(samples: int) -> np.ndarray:
-    """Offsets (samples, 2) in pixels from a pixel's centre, which is the first; the others spread evenly over it."""
-    return (0.5 + R2_STEPS * np.arange(samples)[:, None]) % 1.0 - 0.5
 
 
 def geometry(snapshot: StreetSnapshot, camera: WorldCamera) -> StreetImage:

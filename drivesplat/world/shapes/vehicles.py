@@ -119,29 +119,9 @@ def ego_rear() -> ColoredMesh:
 def _passenger_car(size: Numbers, color: Color, profile: CarProfile) -> ColoredMesh:
     length, width, height = size
     half, front = width / 2, length / 2
-    belt, nose = profile.belt * height, profile.nose * height
-    body = _body(length, half - 0.05, height, color, profile)
-    parts = [
-        *body,
-        *_cabin(length, half - 0.06, height, color, profile),
-        *_ends(length, half - 0.06, height),
-        *lights(body[0], front, (0.4 * half, 0.71 * half), (nose - 0.16, nose - 0.075)),
-        *lights(body[0], -front, (0.5 * half, 0.84 * half), (0.46 * height, 0.54 * height)),
-        *plates(front, 0.28 * height),
-        *axles([x * length for x in profile.axles], half - 0.055, profile.radius),
-        *wing_mirrors((profile.screen - 0.07) * length, half, belt - 0.02, 0.16, color),
-    ]
-    for x in (0.08, -0.13):
-        for side in (-1, 1):
-            low, high = sorted((side * (half - 0.08), side * (half - 0.03)))
-            parts.append(box((x * length - 0.1, low, belt - 0.14), (x * length + 0.1, high, belt - 0.11),
-                             Material.METAL, METAL))  # fmt: skip
-    return assembled(parts)
-
-
-def _body(length: float, y: float, height: float, color: Color, profile: CarProfile) -> list[ColoredMesh]:
-    """The part below the windows: sides that bulge at half their height, and the bonnet."""
-    belt, nose, deck, front = profile.belt * height, profile.nose * height, profile.deck * height, length / 2
+    belt, nose, deck = profile.belt * height, profile.nose * height, profile.deck * height
+    y = half - 0.05
+    # below the windows: sides that bulge at half their height, and the bonnet
     sides = [
         (-front + 0.02, 0.3 * height, 0.88 * y), (-front + 0.01, 0.5 * height, 0.9 * y),
         (-front + 0.05, deck, 0.84 * y),
@@ -152,7 +132,34 @@ def _body(length: float, y: float, height: float, color: Color, profile: CarProf
         (-0.42 * length, 0.14 * height, 0.92 * y), (0.42 * length, 0.14 * height, 0.92 * y), (0.0, 0.4 * height, y),
     ]  # fmt: skip
     sill = box((-0.2 * length, -0.97 * y, 0.13 * height), (0.2 * length, 0.97 * y, 0.2 * height), Material.PLAIN, BLACK)
-    return [symmetric_hull(sides, Material.PAINT, color), sill]
+    body = symmetric_hull(sides, Material.PAINT, color)
+    y = half - 0.06
+    bumpers = [
+        hull([(x + dx, side * w * y, z * height) for dx, w in ((0.0, 0.72), (-np.sign(x) * 0.26, 0.92))
+              for z in (0.16, 0.26) for side in (-1, 1)], Material.PLAIN, BLACK)
+        for x in (-front, front)
+    ]  # fmt: skip
+    grille = box((front - 0.1, -0.3 * y, 0.29 * height), (front - 0.002, 0.3 * y, 0.36 * height), Material.PLAIN, BLACK)
+    badge = box((front - 0.1, -0.05, 0.38 * height), (front + 0.0, 0.05, 0.42 * height), Material.METAL, METAL)
+    parts = [
+        body,
+        sill,
+        *_cabin(length, y, height, color, profile),
+        *bumpers,
+        grille,
+        badge,
+        *lights(body, front, (0.4 * half, 0.71 * half), (nose - 0.16, nose - 0.075)),
+        *lights(body, -front, (0.5 * half, 0.84 * half), (0.46 * height, 0.54 * height)),
+        *plates(front, 0.28 * height),
+        *axles([x * length for x in profile.axles], half - 0.055, profile.radius),
+        *wing_mirrors((profile.screen - 0.07) * length, half, belt - 0.02, 0.16, color),
+    ]
+    for x in (0.08, -0.13):
+        for side in (-1, 1):
+            low, high = sorted((side * (half - 0.08), side * (half - 0.03)))
+            parts.append(box((x * length - 0.1, low, belt - 0.14), (x * length + 0.1, high, belt - 0.11),
+                             Material.METAL, METAL))  # fmt: skip
+    return assembled(parts)
 
 
 def _cabin(length: float, y: float, height: float, color: Color, profile: CarProfile) -> list[ColoredMesh]:
@@ -172,16 +179,3 @@ def _cabin(length: float, y: float, height: float, color: Color, profile: CarPro
     for face in both_sides(side):
         windows += [glass(face, span, (0.12, 0.93)) for span in zip(edges[::2], edges[1::2], strict=True)]
     return [symmetric_hull(frame, Material.PAINT, color), symmetric_hull(roof, Material.PAINT, color), *windows]
-
-
-def _ends(length: float, y: float, height: float) -> list[ColoredMesh]:
-    """Bumpers, the grille, fog lights' recesses."""
-    front = length / 2
-    bumpers = [
-        hull([(x + dx, side * w * y, z * height) for dx, w in ((0.0, 0.72), (-np.sign(x) * 0.26, 0.92))
-              for z in (0.16, 0.26) for side in (-1, 1)], Material.PLAIN, BLACK)
-        for x in (-front, front)
-    ]  # fmt: skip
-    grille = box((front - 0.1, -0.3 * y, 0.29 * height), (front - 0.002, 0.3 * y, 0.36 * height), Material.PLAIN, BLACK)
-    badge = box((front - 0.1, -0.05, 0.38 * height), (front + 0.0, 0.05, 0.42 * height), Material.METAL, METAL)
-    return [*bumpers, grille, badge]

@@ -41,17 +41,13 @@ def trees(road: ReferenceLine, random: np.random.Generator) -> list[ColoredMesh]
                 found.append(road.place(tree, *place))
             between = s + TREE_SPACING / 2
             if side > 0 or abs(between - SHELTER) > 4.0:
-                found.append(road.place(_between_trees(side, random), between, side * 8.9))
+                kind = random.integers(4)
+                if kind < 2:
+                    item = scenery.advertising_column(random) if kind == 0 else plants.planter(random)
+                else:
+                    item = scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
+                found.append(road.place(item, between, side * 8.9))
     return found
-
-
-def _between_trees(side: int, random: np.random.Generator) -> ColoredMesh:
-    kind = random.integers(4)
-    if kind == 0:
-        return scenery.advertising_column(random)
-    if kind == 1:
-        return plants.planter(random)
-    return scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
 
 
 def furniture(road: ReferenceLine, lamps: np.ndarray, random: np.random.Generator) -> list[ColoredMesh]:
