@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, get_args
 
 from drivesplat.errors import ConfigError, DriveSplatError
@@ -36,7 +36,7 @@ class Inputs:
         self.config = config
         self._prefix = prefix
         self._roots: dict[str, str] = {}
-        self._folders: dict[str, Path] = {}
+        self._indexed: set[str] = set()
 
     def tables(self, wildcards: Any) -> list[str]:
         """The tables that scene.json is made from; none where `scene_tables` gives the rows that it needs."""
@@ -51,11 +51,22 @@ class Inputs:
 
     def scene_tables(self, wildcards: Any) -> list[str]:
         """The file of a scene's own rows of a recorded dataset's tables, where its reader splits them into scenes.
-        Planning keeps it up to date, so that touched tables rerun nothing."""
+        Planning keeps it up to date, once, so that touched tables rerun nothing."""
         name = self.config.dataset_of(wildcards.scene)
         dataset = self.config.datasets[name]
         tables = None if dataset.world else index(dataset.reader)
-        return [str(tables.scene_file(self._scene_tables(name, tables), wildcards.scene))] if tables else []
+        if tables is None:
+            return []
+        folder = Path(self.config.results_dir) / ".tables" / name
+        if name not in self._indexed:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise unwritable_results(self.config, error) from error
+            for file in tables.index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder):
+                record_output(file, "extract", {}, {})
+            self._indexed.add(name)
+        return [str(tables.scene_file(folder, wildcards.scene))]
 
     def root(self, wildcards: Any) -> str:
         """The root of a scene's dataset as results name it: that of a recorded one is a link in the results folder,
@@ -83,19 +94,6 @@ class Inputs:
             found = dataset.world_root if dataset.world else find_root(dataset.dataroot, dataset.version)
             self._roots[name] = str(found)
         return self._roots[name]
-
-    def _scene_tables(self, name: str, tables: ModuleType) -> Path:
-        """The folder with the rows of each scene of a recorded dataset, brought up to date once."""
-        if name not in self._folders:
-            dataset, folder = self.config.datasets[name], Path(self.config.results_dir) / ".tables" / name
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise unwritable_results(self.config, error) from error
-            for file in tables.index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder):
-                record_output(file, "extract", {}, {})
-            self._folders[name] = folder
-        return self._folders[name]
 
     def refuse_unknown_cameras(self, name: str, cameras: Sequence[str]) -> None:
         """Raises ConfigError, with the cameras that a dataset has, if `cameras` names another one."""
@@ -182,15 +180,6 @@ class Inputs:
         """The function of wildcards that gives the result `name` for the tracks of a job."""
         return lambda wildcards: self._of(self.tracks(wildcards), wildcards, name)
 
-    def images_of_tracks(self, name: str) -> Callable[[Any], list[str]]:
-        """As `of_tracks`, of a result that is made from images: none without cameras."""
-
-        def result(wildcards: Any) -> list[str]:
-            there = has_cameras(self.config, wildcards.scene)
-            return [self._of(self.tracks(wildcards), wildcards, name)] if there else []
-
-        return result
-
     def first_parser(self, wildcards: Any) -> str:
         """The training record of the first method: cameras and splits are the same for all tracks."""
         return self._of(next(iter(self.config.methods.values())).tracks, wildcards, "parser.npz")
@@ -224,13 +213,14 @@ class Inputs:
             except OSError as error:
                 raise ConfigError(f"lidar_seed.points_file {path}: {error}; name a PLY file of points") from None
 
-    def of_images(self, name: str) -> Callable[[Any], list[str]]:
-        """The function of wildcards that gives a scene's result `name`, which is made from images and depends on no
-        tracks: none without cameras."""
+    def of_images(self, name: str, of_tracks: bool = False) -> Callable[[Any], list[str]]:
+        """The function of wildcards that gives a scene's result `name`, which is made from images: none without
+        cameras. With `of_tracks` it depends on the tracks of a job."""
 
         def result(wildcards: Any) -> list[str]:
-            there = has_cameras(self.config, wildcards.scene)
-            return [f"{self.config.results_dir}/{wildcards.scene}/{name}"] if there else []
+            if not has_cameras(self.config, wildcards.scene):
+                return []
+            return [self._of(self.tracks(wildcards) if of_tracks else "annotated", wildcards, name)]
 
         return result
 

@@ -94,7 +94,9 @@ class Job:
     def check_inputs(self, dataset: Iterable[str] = ()) -> None:
         """Compares the inputs with what their rules wrote, and the dataset's files of the kinds `dataset` ('images',
         'sweeps') with what `extract` read. Raises ResultError naming an altered file and the rule that rebuilds it."""
-        results = self._scene_folder()
+        scene, parents = getattr(self.wildcards, "scene", None), Path(next(iter(self.output), "")).parents
+        # in the folder of the scene's results every file has a record; None for a rule without a scene
+        results = next((folder for folder in reversed(parents) if scene and folder.name == scene), None)
 
         def digest(path: str) -> str:
             return checked_digest(path, warn=results is not None and results in Path(path).parents)
@@ -106,11 +108,6 @@ class Job:
             record = self.input.scene if hasattr(self.input, "scene") else self.input.parser
             folder = Path(record).parent
             check_dataset(folder.parent if folder.name in OTHER_TRACKS else folder, dataset)
-
-    def _scene_folder(self) -> Path | None:
-        """The folder of the scene's results, in which every file has a record; None for a rule without a scene."""
-        scene, parents = getattr(self.wildcards, "scene", None), Path(next(iter(self.output), "")).parents
-        return next((folder for folder in reversed(parents) if scene and folder.name == scene), None)
 
     def record_dataset(self, **files: Iterable[str | Path]) -> None:
         """Computes the digests of the dataset's `files` by kind, for the record beside the outputs."""
@@ -142,9 +139,9 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
     gc.enable()
     log_path = Path(snakemake.log[0])
     _log_into(log_path)
-    threading_hook, threading.excepthook = threading.excepthook, _log_thread
-    current = Job(snakemake)
-    log = logging.getLogger(__name__)
+    current, log, threading_hook = Job(snakemake), logging.getLogger(__name__), threading.excepthook
+    # the caller that waits for a thread reports its failure to the user
+    threading.excepthook = lambda failed: log.info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)
     log.info("%s begins", current.name)
     try:
         code = running_code(snakemake)
@@ -190,8 +187,3 @@ def _log_into(path: Path) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
     logging.captureWarnings(True)
     logging.raiseExceptions = False  # where the disk has no room for a log, what the job was to write says so, once
-
-
-def _log_thread(failed: threading.ExceptHookArgs) -> None:
-    """Logs the failure of a thread; the caller that waits for it reports it to the user."""
-    logging.getLogger(__name__).info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)

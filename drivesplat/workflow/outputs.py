@@ -146,11 +146,12 @@ class Outputs(Inputs):
             Path(scene, TRACK_FOLDERS[own]) for scene in self._with_cameras(self.config.batch_scenes) for own in known
         )
         tracks = [f"{self.config.results_dir}/{place}/tracks.png" for place in places]
-        return [*tracks, *self.of_methods(self._look_names, cameras=False)]
 
-    def _look_names(self, scene: str, method: str) -> list[str]:
-        of_images = LOOKS if has_cameras(self.config, scene) else ()
-        return [*of_images, *(LIDAR_LOOKS if self.renders_lidar(scene, method) else ())]
+        def names(scene: str, method: str) -> list[str]:
+            of_images = LOOKS if has_cameras(self.config, scene) else ()
+            return [*of_images, *(LIDAR_LOOKS if self.renders_lidar(scene, method) else ())]
+
+        return [*tracks, *self.of_methods(names, cameras=False)]
 
     def exports(self, _: Any = None) -> list[str]:
         """The exported files of the batch's scenes and methods, in the formats of the settings."""

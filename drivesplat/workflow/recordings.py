@@ -41,7 +41,10 @@ class Recordings:
     def outline(self, scene: str) -> Outline | None:
         """The outline of a scene's recording; None where its reader gives none."""
         if scene not in self._outlines:
-            self._outlines[scene] = self._read(scene)
+            dataset = self._config.datasets[self._config.dataset_of(scene)]
+            read = None if dataset.world else getattr(layout(dataset.reader), "outline", None)
+            root = Path(self._plan.root(SimpleNamespace(scene=scene))) if read else None
+            self._outlines[scene] = read(root, dataset.version, scene) if read else None
         return self._outlines[scene]
 
     def refuse_unfit(self, jobs: Iterable[Any]) -> None:
@@ -132,11 +135,6 @@ class Recordings:
 
     def _results(self, scene: str) -> Path:
         return Path(self._config.results_dir, scene)
-
-    def _read(self, scene: str) -> Outline | None:
-        dataset = self._config.datasets[self._config.dataset_of(scene)]
-        read = None if dataset.world else getattr(layout(dataset.reader), "outline", None)
-        return read(Path(self._plan.root(SimpleNamespace(scene=scene))), dataset.version, scene) if read else None
 
 
 def _extracted(file: Path) -> Outline | None:

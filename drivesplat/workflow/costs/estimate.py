@@ -184,29 +184,21 @@ def in_one_line(found: Estimate) -> str:
     """'27 jobs, about 12 min on 4 cores (from 22 measured jobs; 3 not measured yet), about 0.4 GB of disk (…)'."""
     if not found.jobs:
         return "nothing is to be run"
-    return f"{found.jobs} job{'s' * (found.jobs > 1)}, {_time(found)}, {_disk(found)}"
-
-
-def _time(found: Estimate) -> str:
     cores, gpus = found.machine.cores, found.machine.gpus
     where = f"{cores} core{'s' * (cores > 1)}" + (f" and {gpus} GPUs" if gpus > 1 else "")
     rest = found.jobs - found.known
     rough = f"{NOT_MEASURED}, by other machines very roughly {spelled(found.rough_seconds)}"
-    if not found.known:
-        return f"time {rough} on {where}"
-    missing = f"; {rest} {rough} in all" if rest else ""
-    basis = f"from {found.measured} measured job{'s' * (found.measured > 1)}{missing}"
-    return f"about {spelled(found.seconds)} on {where} ({basis})"
-
-
-def _disk(found: Estimate) -> str:
+    basis = f"from {found.measured} measured job{'s' * (found.measured > 1)}"
+    basis += f"; {rest} {rough} in all" if rest else ""
+    time = f"about {spelled(found.seconds)} on {where} ({basis})" if found.known else f"time {rough} on {where}"
     free = f"{found.free_disk / 1e9:.1f} GB free"
-    if found.unknown_disk == found.jobs:
-        return f"disk {NOT_MEASURED} ({free})"
     missing = f"; {found.unknown_disk} jobs {NOT_MEASURED}" if found.unknown_disk else ""
     warning = "; that is more than there is" if found.disk > found.free_disk else ""
     size = f"{found.disk / 1e9:.1f} GB" if found.disk >= 1e9 else f"{found.disk / 1e6:.0f} MB"
-    return f"about {size} of disk ({free}{missing}){warning}"
+    disk = f"about {size} of disk ({free}{missing}){warning}"
+    if found.unknown_disk == found.jobs:
+        disk = f"disk {NOT_MEASURED} ({free})"
+    return f"{found.jobs} job{'s' * (found.jobs > 1)}, {time}, {disk}"
 
 
 def in_full(found: Estimate) -> str:

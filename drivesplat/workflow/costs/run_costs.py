@@ -42,10 +42,10 @@ class RunCosts:
         self._jobs: dict[JobId, Any] = {}
         self._ended: threading.Event | None = None
 
-    def report_settings_without_effect(self) -> None:
+    def report_at_planning(self) -> None:
         """Prints each setting that an override replaces for the scenes and methods of the targets, methods that
-        scenes without cameras leave out, and edits whose tracks no method has. Called at planning, so that
-        `snakemake -n` and a run with nothing to do print them, too."""
+        scenes without cameras leave out, and edits whose tracks no method has: `snakemake -n` and a run with nothing
+        to do print them, too. Removes records on which Snakemake would fail, and prints which."""
         wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
         if wanted or COSTS not in self._targets:
             places = self._plan.scenes_and_methods(wanted)
@@ -53,9 +53,6 @@ class RunCosts:
             absent = [*methods_left_out(self._plan.config, scenes), *edits_left_out(self._plan.config, scenes)]
             for sentence in (*without_effect(self._plan.config, places), *absent):
                 _say(sentence)
-
-    def report_foreign_records(self) -> None:
-        """Removes records on which Snakemake would fail, and prints which."""
         sentence = drop_foreign_records()
         if sentence:
             _say(sentence)

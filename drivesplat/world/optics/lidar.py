@@ -88,7 +88,10 @@ def scan(
     lidar: WorldLidarSettings, wet: float, random: np.random.Generator,
 ) -> StreetScan:  # fmt: skip
     """One revolution. `seconds` (m,) are the times of the pattern's moments, `sensor_to_street` (m, 4, 4) the poses."""
-    found = [_cast(snapshot, pattern, sensor_to_street, seconds, wet, *offset) for offset in _beam_offsets(lidar)]
+    # upward and sideward angles (radians) of the rays that stand for one beam; the first is its axis
+    half = lidar.divergence_mrad / 2000.0
+    offsets = [(0.0, 0.0), *(((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half)) if half else ())]
+    found = [_cast(snapshot, pattern, sensor_to_street, seconds, wet, *offset) for offset in offsets]
     distance, power, objects = (np.stack(values) for values in zip(*found, strict=True))
     # the range, reflected fraction and object of each beam's axis, or of its strongest echo where other rays hit a
     # surface nearer or farther; and the range of that echo, the mean of its rays
@@ -124,12 +127,6 @@ def returns(
     points = np.einsum("nij,nj->ni", to_timestamp[step, :3, :3], local) + to_timestamp[step, :3, 3]
     intensity = (255.0 * scan.intensity[ring, step]).round()
     return np.column_stack([points, intensity, ring]).astype(np.float32)
-
-
-def _beam_offsets(lidar: WorldLidarSettings) -> list[tuple[float, float]]:
-    """Upward and sideward angles (radians) of the rays that stand for one beam; the first is its axis."""
-    half = lidar.divergence_mrad / 2000.0
-    return [(0.0, 0.0), *(((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half)) if half else ())]
 
 
 def _cast(

@@ -37,10 +37,6 @@ class StreetRays:
     def __len__(self) -> int:
         return len(self.directions)
 
-    def starts(self) -> np.ndarray:
-        """Origins (n, 3)."""
-        return self.origins[self.moment]
-
 
 @dataclass(frozen=True)
 class RayHits:
@@ -175,7 +171,7 @@ class StreetSnapshot:
         )  # fmt: skip
         if self.caster._static is not None:
             static = self.caster._static
-            _keep_nearer(hits, static, static.intersect(rays.starts(), rays.directions), np.arange(count))
+            _keep_nearer(hits, static, static.intersect(rays.origins[rays.moment], rays.directions), np.arange(count))
         for piece, poses, chosen in self._near(rays.directions, rays.moment, rays.origins, per_ray=False):
             start, at = rays.origins[rays.moment[chosen]], rays.moment[chosen]
             origins, toward = _in_frame(poses[:, :3, :3], poses[:, :3, 3], at, start, rays.directions[chosen])
@@ -215,7 +211,8 @@ class StreetSnapshot:
 
 def _bounding_sphere(mesh: ColoredMesh) -> Sphere:
     """A sphere around a mesh, with room for rounding."""
-    center, radius = mesh.bounding_sphere
+    center = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(mesh.vertices - center, axis=1).max())
     return Sphere(center, 1.001 * radius + 1e-3)
 
 

@@ -16,7 +16,7 @@ from drivesplat.trajectories.motion import Motion
 from drivesplat.world.shapes.body import RigidBody
 from drivesplat.world.street.objects import EGO_PARTS, StreetObject
 from drivesplat.world.street.paths import GivenPath
-from drivesplat.world.street.street import Street, street_with
+from drivesplat.world.street.street import Street
 from drivesplat.world.tokens import instance_token
 
 MOTION_HZ = 20.0
@@ -70,7 +70,8 @@ def edited(street: Street, scene: str, edit: Edit, name: str, seconds: float, fi
     ego_poses = moved if steps else street.ego.poses
     kept = [item for item in street.objects if item not in editable.values()]
     carried = [replace(item, path=GivenPath(ego_poses)) if item.name in EGO_PARTS else item for item in kept]
-    return Variation(street_with(street, (*carried, *objects)), ego_poses)
+    objects = sorted((*carried, *objects), key=lambda item: item.moves)
+    return Variation(replace(street, objects=tuple(objects)), ego_poses)
 
 
 def _object_of(actor: EditedActor, originals: Mapping[str, StreetObject], film_start: float) -> StreetObject:

@@ -1,6 +1,6 @@
 """The street: scenery and objects, placed at random from a seed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -67,8 +67,3 @@ def road_of(world: WorldSettings) -> ReferenceLine:
     angle = np.radians(world.bend_deg)
     radius = np.copysign(BEND_RADIUS, angle) if angle else np.inf
     return ReferenceLine(BEND_START, BEND_RADIUS * abs(angle), radius, world.grade, *RISE)
-
-
-def street_with(street: Street, objects: tuple[StreetObject, ...]) -> Street:
-    """The street with other objects."""
-    return replace(street, objects=tuple(sorted(objects, key=lambda item: item.moves)))
