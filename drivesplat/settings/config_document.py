@@ -123,19 +123,14 @@ def _comment(field: FieldInfo, pad: str) -> str:
     return "".join(f"{pad}# {line}\n" for line in lines).replace(NO_BREAK, " ")
 
 
-def _only_lacks(present: Sequence[str], generated: Sequence[str]) -> bool:
-    """Whether `present` has all its lines in `generated`, in order: nothing of it is lost when new settings come in."""
-    rest = iter(generated)
-    return all(line in rest for line in present)
-
-
 def main(arguments: Sequence[str], folder: Path = ROOT) -> int:
     """Writes the files into `folder`; returns the exit status, 1 where config.yaml has lines of its own and stays."""
     parser = argparse.ArgumentParser("python -m drivesplat.settings.config_document", description=__doc__)
     parser.add_argument("--force", action="store_true", help="overwrite config.yaml even if it differs")
     force, path, text = parser.parse_args(arguments).force, folder / "config.yaml", config_yaml()
     present = path.read_text(encoding="utf-8") if path.exists() else text
-    if present != text and not force and not _only_lacks(present.splitlines(), text.splitlines()):
+    rest = iter(text.splitlines())  # a file that only lacks lines loses nothing when new settings come in
+    if present != text and not force and not all(line in rest for line in present.splitlines()):
         lines = (value.splitlines(keepends=True) for value in (present, text))
         sys.stdout.writelines(difflib.unified_diff(*lines, "config.yaml", "config.yaml as generated"))
         print(
