@@ -23,8 +23,7 @@ from drivesplat.world.optics.rig import RigSensor, image_height, key_frame_time,
 from drivesplat.world.output.tables import NuScenesTables
 from drivesplat.world.output.truth import (
     key_frames_of,
-    planned_scans,
-    planned_views,
+    planned,
     write_frame,
     write_scan,
     write_truth,
@@ -88,7 +87,8 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
         for time_us, is_key, index in trigger_times(sensor, world):
             row = tables.add_data(sensor, index, time_us, is_key, recorder.ego_to_global(time_us * 1e-6), size)
             files.append(SensorFile(sensor, time_us, is_key, index, *row))
-    views, scans = planned_views(recorder), planned_scans(recorder)
+    plans = planned(recorder)
+    views, scans = ([plan for plan in plans if plan.sensor.is_camera == cameras] for cameras in (True, False))
     images = sum(file.sensor.is_camera for file in files)
     require_space(root, world_bytes(world, images, len(files) - images, len(views), len(scans)))
     with ProcessPoolExecutor(workers, context, _start_worker, (root, recorder)) as pool:

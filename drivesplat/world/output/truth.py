@@ -33,46 +33,26 @@ CLEARANCE = 0.3
 
 @dataclass(frozen=True)
 class TruthPlan:
-    """A view to write: its camera and viewpoint, and the folder below truth/."""
+    """A view, or scans, to write: the camera or LiDAR, its viewpoint, and the folder below truth/."""
 
     sensor: RigSensor
     viewpoint: Viewpoint
     folder: str
 
 
-@dataclass(frozen=True)
-class ScanPlan:
-    """LiDAR scans to write: their viewpoint, and the folder below truth/."""
-
-    viewpoint: Viewpoint
-    folder: str
-
-
-def planned_views(recorder: Recorder) -> list[TruthPlan]:
-    """The views of each camera with truth: recorded, lateral, without the leading vehicle, edited."""
-    plans, settings, viewpoints = [], recorder.world.truth, _viewpoints(recorder)
-    for sensor in SENSORS:
-        if sensor.channel in settings.cameras:
-            plans += [TruthPlan(sensor, view, f"{sensor.channel}/{name}") for name, view in viewpoints.items()]
-    return plans
-
-
-def planned_scans(recorder: Recorder) -> list[ScanPlan]:
-    """The scans of the LiDAR: recorded, lateral, without the leading vehicle, edited; none unless the settings ask for
-    them."""
-    if not recorder.world.truth.lidar:
-        return []
-    return [ScanPlan(view, f"lidar/{name}") for name, view in _viewpoints(recorder).items()]
-
-
-def _viewpoints(recorder: Recorder) -> dict[str, Viewpoint]:
-    """The viewpoints of truth, by the names of their folders."""
-    offsets = dict.fromkeys(offset for offset in recorder.world.truth.lateral_m if offset)
+def planned(recorder: Recorder) -> list[TruthPlan]:
+    """The views of each camera with truth, and the scans of the LiDAR if the settings ask for them: recorded, lateral,
+    without the leading vehicle, edited."""
+    truth = recorder.world.truth
+    offsets = dict.fromkeys(offset for offset in truth.lateral_m if offset)
     viewpoints = {"recorded": Viewpoint()}
     viewpoints |= {f"{'left' if m > 0 else 'right'}_{abs(m):g}m": Viewpoint(left=m) for m in offsets}
     if recorder.street.leading:
         viewpoints["without_leading"] = Viewpoint(without=recorder.street.leading)
-    return viewpoints | {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+    viewpoints |= {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+    folders = {sensor: sensor.channel for sensor in SENSORS if sensor.channel in truth.cameras}
+    folders |= {LIDAR: "lidar"} if truth.lidar else {}
+    return [TruthPlan(at, view, f"{top}/{name}") for at, top in folders.items() for name, view in viewpoints.items()]
 
 
 def key_frames_of(recorder: Recorder, plan: TruthPlan) -> list[int]:
@@ -125,20 +105,20 @@ def _numbers_of_objects(recorder: Recorder, view: Viewpoint) -> np.ndarray:
     return np.array([0, *(numbers.get(recorder.instance(item.name), 0) for item in objects)], dtype=np.uint8)
 
 
-def write_scan(root: Path, recorder: Recorder, plan: ScanPlan, index: int) -> TruthScan:
+def write_scan(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> TruthScan:
     """Casts and writes the LiDAR scan of key frame `index`."""
+    view = plan.viewpoint
     time_us = key_frame_time(recorder.world, index) + LIDAR.delay_us
-    found = recorder.scan(LIDAR, time_us, plan.viewpoint)
+    found = recorder.scan(LIDAR, time_us, view)
     name = f"{plan.folder}/{index:04}.npz"
     with atomic_write((root / TRUTH_FILE).parent / name) as file:
         np.savez_compressed(
             file,
             range=found.range.astype(np.float32),
             intensity=found.intensity.astype(np.float32),
-            instance=_numbers_of_objects(recorder, plan.viewpoint)[found.object + 1],
+            instance=_numbers_of_objects(recorder, view)[found.object + 1],
             returned=found.returned,
         )
-    view = plan.viewpoint
     without = recorder.instance(view.without) if view.without else None
     pose = STREET_TO_GLOBAL @ recorder.ego_to_street(np.array([time_us * 1e-6]), view)[0] @ LIDAR.sensor_to_ego
     sweep = token(recorder.scene, LIDAR.channel, time_us)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import trimesh
@@ -72,9 +73,8 @@ def pane(
     return hull([point + sign * normal for point in points for sign in (-1, 1)], material, color)
 
 
-def glass(corners: Sequence[Numbers], along: tuple[float, float], up: tuple[float, float]) -> ColoredMesh:
-    """A window on a flat face; see `pane`."""
-    return pane(corners, along, up, Material.GLASS, WINDSCREEN)
+glass = partial(pane, material=Material.GLASS, color=WINDSCREEN)
+"""A window on a flat face."""
 
 
 def both_sides(corners: Sequence[Numbers]) -> list[list[tuple[float, float, float]]]:

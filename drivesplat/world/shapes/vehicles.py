@@ -4,6 +4,7 @@ Vehicles fill a box of length, width and height `size` centred at x = y = 0; the
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -52,16 +53,6 @@ HATCHBACK = CarProfile(0.28, 0.1, -0.36, -0.47, 0.5, 0.6, 0.56, (EGO_OVERHANG / 
 ESTATE = CarProfile(
     0.22, 0.07, -0.42, -0.485, 0.55, 0.6, 0.56, (-0.3, 0.3), 0.35, pillars=(0.03, 0.24, 0.27, 0.58, 0.61, 0.97)
 )
-
-
-def car(size: Numbers, color: Color) -> ColoredMesh:
-    """A saloon."""
-    return _passenger_car(size, color, SALOON)
-
-
-def hatchback(size: Numbers, color: Color) -> ColoredMesh:
-    """A small car with a steep tail."""
-    return _passenger_car(size, color, HATCHBACK)
 
 
 def estate(size: Numbers, color: Color) -> ColoredMesh:
@@ -160,6 +151,11 @@ def _passenger_car(size: Numbers, color: Color, profile: CarProfile) -> ColoredM
             parts.append(box((x * length - 0.1, low, belt - 0.14), (x * length + 0.1, high, belt - 0.11),
                              Material.METAL, METAL))  # fmt: skip
     return assembled(parts)
+
+
+car = partial(_passenger_car, profile=SALOON)
+hatchback = partial(_passenger_car, profile=HATCHBACK)
+"""A small car with a steep tail."""
 
 
 def _cabin(length: float, y: float, height: float, color: Color, profile: CarProfile) -> list[ColoredMesh]:
