@@ -106,14 +106,12 @@ def run_command(parsed: argparse.Namespace) -> int:
 def snakemake_command(arguments: Sequence[str]) -> list[str]:
     """The command line of Snakemake for the workflow of this copy. Presets and profiles that it brings along are found
     from any folder; the default profile is that beside the Snakefile, unless the current folder has one."""
-    found = [_found(argument) for argument in arguments]
+    found = []
+    for argument in arguments:  # also of the form --option=value
+        option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+        along = value.startswith(BROUGHT_ALONG)
+        found.append(f"{option}{equals}{of_the_workflow(value)}" if along else argument)
     return [sys.executable, "-m", "snakemake", "--snakefile", str(SNAKEFILE), *found]
-
-
-def _found(argument: str) -> str:
-    """An argument, also of the form `--option=value`, with the path of what the workflow brings along."""
-    option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
-    return f"{option}{equals}{of_the_workflow(value)}" if value.startswith(BROUGHT_ALONG) else argument
 
 
 def run_workflow(arguments: Sequence[str]) -> int:

@@ -26,10 +26,7 @@ R = TypeVar("R")
 
 
 def write_arrays(
-    path: str | Path,
-    content: Any,
-    kind: type = np.ndarray,
-    to_array: Callable[[Any], np.ndarray] = lambda array: array,
+    path: str | Path, content: Any, kind: type = np.ndarray, to_array: Callable[[Any], np.ndarray] = lambda array: array
 ) -> None:
     """Writes plain containers, scalars, arrays and dataclasses of them, atomically; `kind` is the class of arrays.
 

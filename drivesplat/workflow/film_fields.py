@@ -24,16 +24,11 @@ def film(at: JobScope) -> dict[str, Any]:
 
 
 def quad(at: JobScope) -> dict[str, Any]:
-    """Of an `EditJob` that writes no frames. Raises ConfigError for an unknown edit."""
+    """Of an `EditJob`, without `frames`. Raises ConfigError for an unknown edit."""
     edits = scene_edits(at.config, at.scene)
     if at.film not in edits:
         raise ConfigError(no_such_edit(at.scene, at.film, edits))
     return {"edit": edits[at.film], **film_format(at)}
-
-
-def edited_film(at: JobScope) -> dict[str, Any]:
-    """Of an `EditJob`; raises as `quad`."""
-    return {**quad(at), "frames": at.config.render.edited_frames}
 
 
 def _edit_or_trajectory(at: JobScope) -> dict[str, Any]:

@@ -3,11 +3,9 @@
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_args
 
 from drivesplat.errors import ConfigError, DriveSplatError
-from drivesplat.io.regular_file import regular_file
 from drivesplat.provenance.file_digests import record_output
 from drivesplat.readers.datasets import index, layout
 from drivesplat.readers.truth import TRUTH_FILE
@@ -201,17 +199,6 @@ class Inputs:
         """The user's extra seed points, if given."""
         path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
         return [str(Path(path).expanduser())] if path else []
-
-    def refuse_special_points_file(self, scene: str) -> None:
-        """Raises ConfigError if the user's seed points are a folder, a circle of links, or a pipe that a job would wait
-        for. Snakemake names them where they are absent."""
-        for path in self.points_file(SimpleNamespace(scene=scene)):
-            try:
-                regular_file(path)
-            except FileNotFoundError:
-                pass
-            except OSError as error:
-                raise ConfigError(f"lidar_seed.points_file {path}: {error}; name a PLY file of points") from None
 
     def of_images(self, name: str, of_tracks: bool = False) -> Callable[[Any], list[str]]:
         """The function of wildcards that gives a scene's result `name`, which is made from images: none without

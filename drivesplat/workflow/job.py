@@ -15,13 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.storage import Provenance, unwritable
 from drivesplat.io.this_copy import in_this_copy
-from drivesplat.provenance.file_digests import (
-    check_dataset,
-    checked_digest,
-    file_digests,
-    member_states,
-    record_output,
-)
+from drivesplat.provenance.file_digests import check_dataset, checked_digest, file_digests, member_states, record_output
 from drivesplat.provenance.record import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings

@@ -106,10 +106,6 @@ class Outputs(Inputs):
         methods = self.config.all_methods
         return [name for name in methods if any(self.renders_lidar(scene, name) for scene in self._first_scenes)]
 
-    def methods_with_lidar(self, scene: str) -> list[str]:
-        """The methods that render LiDAR on a scene."""
-        return [name for name in self.config.all_methods if self.renders_lidar(scene, name)]
-
     def metrics(self, _: Any = None) -> list[str]:
         """The metrics.json of the batch's scenes."""
         return [f"{self.config.results_dir}/{scene}/metrics.json" for scene in self.config.batch_scenes]
@@ -160,10 +156,7 @@ class Outputs(Inputs):
         )
 
     def of_methods(
-        self,
-        names: Callable[[str, str], Iterable[str]],
-        scenes: Iterable[str] | None = None,
-        cameras: bool = True,
+        self, names: Callable[[str, str], Iterable[str]], scenes: Iterable[str] | None = None, cameras: bool = True
     ) -> list[str]:
         """The files below the folders of all methods of `scenes`, by default the batch's; `names` gives those of one
         scene and method. With `cameras` without those that have no camera."""

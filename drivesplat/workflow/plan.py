@@ -14,6 +14,7 @@ from typing import Any
 from drivesplat import IS_CHECKOUT
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.file_lock import LockHeldError, locked_file
+from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
@@ -162,8 +163,8 @@ class Plan(JobResources):
         if rest in (["drive"], ["scans"]):
             folder = "/".join([self.config.results_dir, scene, method, *path])
             raise ConfigError(f"{folder} is a folder; ask for the file {folder}/{rest[0]}.json")
-        if rest[:1] == ["scans"] and method not in self.methods_with_lidar(scene):
-            able = [name for name in self.methods_with_lidar(scene) if name in self.config.methods]
+        if rest[:1] == ["scans"] and not self.renders_lidar(scene, method):
+            able = [name for name in self.config.methods if self.renders_lidar(scene, name)]
             raise ConfigError(
                 f"method {method!r} does not render LiDAR, so it has no scans; those do: {', '.join(able) or 'none'} "
                 "(train.scans.per_image above 0, as in presets/lidar.yaml)"
@@ -208,7 +209,14 @@ class Plan(JobResources):
             name = self.config.dataset_of(scene)
             require_methods(self.config, scene)
             self.refuse_unknown_cameras(name, for_scene(self.config, scene).cameras)
-            self.refuse_special_points_file(scene)
+            # Snakemake names a points file that is absent; a job would wait for a pipe
+            for path in self.points_file(of_scene):
+                try:
+                    regular_file(path)
+                except FileNotFoundError:
+                    pass
+                except OSError as error:
+                    raise ConfigError(f"lidar_seed.points_file {path}: {error}; name a PLY file of points") from None
             if self.config.datasets[name].world:
                 refuse_foreign_data(Path(self.root(of_scene)))
 

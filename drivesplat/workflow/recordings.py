@@ -65,7 +65,7 @@ class Recordings:
         and, where `sweeps` is set, of the others in proportion; None while the images are unknown."""
         outline, frames, settings = self.outline(scene), self._frames(scene), for_scene(self._config, scene)
         if outline is None:
-            outline, frames = _extracted(self._results(scene) / "scene.json"), None
+            outline, frames = _extracted(Path(self._config.results_dir, scene, "scene.json")), None
         if outline is None or not outline.key_frames:
             return None
         chosen = outline.key_frames[slice(*frames)] if frames else outline.key_frames
@@ -99,7 +99,8 @@ class Recordings:
         dataset = self._config.datasets[name]
         if not dataset.world:
             return False
-        marker, extracted = Path(dataset.world_root, WORLD_MARKER), self._results(scene) / "scene.json"
+        marker = Path(dataset.world_root, WORLD_MARKER)
+        extracted = Path(self._config.results_dir, scene, "scene.json")
         try:
             if extracted.stat().st_mtime_ns < marker.stat().st_mtime_ns:
                 return False
@@ -132,9 +133,6 @@ class Recordings:
     def _frames(self, scene: str) -> tuple[int, int] | None:
         """The range of key frames that is used of a scene: the first, and the last + 1."""
         return self._config.datasets[self._config.dataset_of(scene)].frames.get(scene)
-
-    def _results(self, scene: str) -> Path:
-        return Path(self._config.results_dir, scene)
 
 
 def _extracted(file: Path) -> Outline | None:

@@ -167,10 +167,6 @@ def _lidar_rays(at: JobScope) -> dict[str, Any]:
     return {"lidar": LidarRays(ray_spacing=at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius"))}
 
 
-def _lidar_depth(at: JobScope) -> dict[str, Any]:
-    return {"ray_spacing": at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius", "box_margin")}
-
-
 def _lidar(at: JobScope, *names: str) -> dict[str, Any]:
     """Settings of the seed that hold for all uses of LiDAR."""
     return {name: getattr(at.config.lidar_seed, name) for name in names}
@@ -244,7 +240,13 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "relabel": (Settings, _nothing),
     "regions": (RegionJob, _nothing),
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
-    "lidar_depth": (LidarDepthJob, _lidar_depth),
+    "lidar_depth": (
+        LidarDepthJob,
+        lambda at: {
+            "ray_spacing": at.config.lidar_depth.ray_spacing,
+            **_lidar(at, "own_car_radius", "box_margin"),
+        },
+    ),
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),
     "discover": (DiscoverJob, _nothing),
@@ -260,7 +262,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "film_parts": (FilmFormat, film_fields.film_format),
     "compare": (CompareJob, film_fields.encoding),
     "truth_film": (CompareJob, film_fields.encoding),
-    "edit": (EditJob, film_fields.edited_film),
+    "edit": (EditJob, lambda at: {**film_fields.quad(at), "frames": at.config.render.edited_frames}),
     "quad": (EditJob, film_fields.quad),
     "drive_folder": (DriveJob, film_fields.drive_folder),
     "scan_folder": (ScanFolderJob, film_fields.scan_folder),
