@@ -79,7 +79,14 @@ def frame_mesh(frame: BicycleFrame, color: Color, luggage: bool) -> ColoredMesh:
         parts.append(cylinder(center + outer, center + inner, radius, Material.METAL, color))
     low = (rear[0], y - 0.012, WHEEL_RADIUS - 0.05)
     parts.append(box(low, (BOTTOM_BRACKET[0], y, WHEEL_RADIUS + 0.045), Material.METAL, color))
-    return concatenate([*parts, *(_luggage(frame) if luggage else [])])
+    if luggage:  # panniers beside the rear wheel, a basket in front of the handlebar
+        x, deck = rear[0], 2 * WHEEL_RADIUS + 0.04
+        parts.append(box((x - 0.22, -0.06, deck), (x + 0.2, 0.06, deck + 0.02), Material.METAL, METAL))
+        for low, high in ((0.07, 0.19), (-0.19, -0.07)):
+            parts.append(box((x - 0.22, low, deck - 0.36), (x + 0.16, high, deck + 0.01), Material.CLOTH, CANVAS))
+        x = frame.head[0] + 0.07
+        parts.append(box((x, -0.18, deck + 0.06), (x + 0.28, 0.18, deck + 0.32), Material.CLOTH, CANVAS))
+    return concatenate(parts)
 
 
 def wheel() -> ColoredMesh:
@@ -114,16 +121,3 @@ def pedals(crank_angle: np.ndarray) -> np.ndarray:
     y = np.broadcast_to(PEDAL_OFFSET * np.array([1.0, -1.0]), angles.shape)
     circle = np.stack([CRANK_LENGTH * np.cos(angles), y, -CRANK_LENGTH * np.sin(angles)], axis=-1)
     return BOTTOM_BRACKET + circle
-
-
-def _luggage(frame: BicycleFrame) -> list[ColoredMesh]:
-    """Panniers beside the rear wheel, a basket in front of the handlebar."""
-    rear, deck = AXLES[1], 2 * WHEEL_RADIUS + 0.04
-    rack = box((rear[0] - 0.22, -0.06, deck), (rear[0] + 0.2, 0.06, deck + 0.02), Material.METAL, METAL)
-    panniers = [
-        box((rear[0] - 0.22, min(y), deck - 0.36), (rear[0] + 0.16, max(y), deck + 0.01), Material.CLOTH, CANVAS)
-        for y in ((0.07, 0.19), (-0.19, -0.07))
-    ]
-    x = frame.head[0] + 0.07
-    basket = box((x, -0.18, deck + 0.06), (x + 0.28, 0.18, deck + 0.32), Material.CLOTH, CANVAS)
-    return [rack, *panniers, basket]
