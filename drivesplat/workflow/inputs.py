@@ -13,7 +13,7 @@ from drivesplat.scene.scene import REFINED
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.names import suggestion
-from drivesplat.settings.tracks import OTHER_TRACKS, TRACK_FOLDERS, Tracks, tracks_in
+from drivesplat.settings.tracks import OTHER_TRACKS, TRACK_FOLDERS, Tracks
 from drivesplat.settings.world import CameraChannel
 from drivesplat.workflow.stages import SCAN_BASELINES, SCANS, refines_poses, training_inputs
 from drivesplat.workflow.without_cameras import has_cameras
@@ -162,7 +162,7 @@ class Inputs:
     def tracks(self, wildcards: Any) -> Tracks:
         """The tracks of a job: those of its results' folder, or those that its method trains with."""
         if hasattr(wildcards, "tracks"):
-            return tracks_in(wildcards.tracks)
+            return next(own for own, folder in TRACK_FOLDERS.items() if folder == wildcards.tracks.rstrip("/"))
         return self.config.all_methods[wildcards.method].tracks if hasattr(wildcards, "method") else "annotated"
 
     def _shown_tracks(self, wildcards: Any) -> Tracks:

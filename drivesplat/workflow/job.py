@@ -23,7 +23,7 @@ from drivesplat.settings.track_references import TrackReferences
 from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow import IN_SCRIPT
 from drivesplat.workflow.gpus import hold_gpu
-from drivesplat.workflow.running_code import running_code
+from drivesplat.workflow.running_code import RunningCode
 
 S = TypeVar("S", bound=Settings)
 
@@ -138,7 +138,8 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
     threading.excepthook = lambda failed: log.info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)
     log.info("%s begins", current.name)
     try:
-        code = running_code(snakemake)
+        # None where Snakemake has not started the script of the rule
+        code = RunningCode(snakemake.params.code) if hasattr(sys.modules["__main__"], "__real_file__") else None
         if code:
             code.check()
         if check_inputs:

@@ -19,9 +19,8 @@ from drivesplat.workflow.stages import (
     OF_ONE_SCENE,
     SCAN_BASELINES,
     SIDE_BY_SIDE,
-    method_stages,
-    scene_stages,
     stage_settings,
+    stages_of_metrics,
     track_stages,
     training_inputs,
 )
@@ -205,10 +204,10 @@ class Outputs(Inputs):
         """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
         of_methods = (find(self.config, scene, name) for name in methods for find in (training_inputs, track_stages))
         taken = {stage for stages in of_methods for stage in stages}
-        made = (*scene_stages(self.config, scene), *sorted(taken))
+        of_scene, of_method = stages_of_metrics(self.config, scene)
+        made = (*of_scene, *sorted(taken))
         stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
-        own = method_stages(self.config, scene)
-        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in own}
+        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in of_method}
         return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
 
     def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:

@@ -92,16 +92,11 @@ def _refines(at: JobScope) -> bool:
     return (world is None or world.pose_noise) if enabled == "auto" else enabled
 
 
-def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
-    """The stages of a scene behind its metrics.json."""
+def stages_of_metrics(config: Config, scene: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The stages of a scene, and those of each of its methods, behind its metrics.json."""
     if not has_cameras(config, scene):
-        return LIDAR_SCENE_STAGES
-    return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES
-
-
-def method_stages(config: Config, scene: str) -> tuple[str, ...]:
-    """The stages of each method behind a scene's metrics.json."""
-    return METHOD_STAGES if has_cameras(config, scene) else LIDAR_METHOD_STAGES
+        return LIDAR_SCENE_STAGES, LIDAR_METHOD_STAGES
+    return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES, METHOD_STAGES
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
