@@ -66,7 +66,12 @@ def _mapping(record: BaseModel, indent: int, commented: set[tuple[type, str]]) -
     comments in the lines so far."""
     lines, pad = [], " " * indent
     for name, field in _printed_fields(record, commented):
-        key, comment = (type(record), name), _comment(field, pad)
+        meaning, limits = described(field.description), bounds(field.metadata)
+        if limits and meaning:
+            meaning += f" [{limits.replace(' ', NO_BREAK)}]"
+        wrapped = textwrap.wrap(meaning, WIDTH - len(pad)) if meaning else []
+        comment = "".join(f"{pad}# {line}\n" for line in wrapped).replace(NO_BREAK, " ")
+        key = type(record), name
         text = _value(name, getattr(record, name), indent, commented)
         if text or is_printed(field):
             text = text or " {}\n"
@@ -113,14 +118,6 @@ def _record(name: str, record: BaseModel, indent: int, commented: set[tuple[type
             return f" {flow}\n"
     below = _mapping(record, indent + 2, commented)
     return f"\n{below}" if below else ""
-
-
-def _comment(field: FieldInfo, pad: str) -> str:
-    text, limits = described(field.description), bounds(field.metadata)
-    if limits and text:
-        text += f" [{limits.replace(' ', NO_BREAK)}]"
-    lines = textwrap.wrap(text, WIDTH - len(pad)) if text else []
-    return "".join(f"{pad}# {line}\n" for line in lines).replace(NO_BREAK, " ")
 
 
 def main(arguments: Sequence[str], folder: Path = ROOT) -> int:

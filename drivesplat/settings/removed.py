@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.settings.renamed import current_names, note_of_old_names, settings_trees, subtree
+from drivesplat.settings.renamed import RENAMED, current_names, settings_trees, subtree
 
 REMOVED = {
     "free_space": "fading Gaussians in space that LiDAR rays prove empty improved no measurement",
@@ -70,7 +70,10 @@ def in_this_version(
                 del node[name]
                 dropped.append(where + key)
         refuse_removed(tree, where)
-    notes = [note_of_old_names(old_paths)] if old_paths else []
+    notes = []
+    if old_paths:
+        now = ", ".join(f"{old} (now {next(n for o, n in RENAMED.items() if old.endswith(o))})" for old in old_paths)
+        notes.append(f"old names of settings, which the next version will refuse: {now}")
     if dropped:
         notes.append(f"removed settings, which the next version will refuse: {', '.join(dropped)}")
     return current, notes
