@@ -6,19 +6,20 @@ import shutil
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import repeat
+from itertools import pairwise, repeat
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from drivesplat.errors import ResultError
+from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.storage import Provenance, atomic_write, canonical_json, sha256_text
 from drivesplat.readers.truth import TruthView
 from drivesplat.scene.images import write_png
 from drivesplat.settings.world import WorldJob, WorldSettings
 from drivesplat.world.marker import prepare_folder
+from drivesplat.world.optics.raycast import NO_HIT, StreetRays
 from drivesplat.world.optics.rig import RigSensor, image_height, key_frame_time, recording_sensors, trigger_times
 from drivesplat.world.output.tables import NuScenesTables
 from drivesplat.world.output.truth import (
@@ -28,8 +29,7 @@ from drivesplat.world.output.truth import (
     write_scan,
     write_truth,
 )  # fmt: skip
-from drivesplat.world.placed import require_free_places
-from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
+from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
 from drivesplat.world.shapes.mesh import SurfaceClass
 
 log = logging.getLogger(__name__)
@@ -45,6 +45,10 @@ JPEG_BYTES, TRUTH_BYTES, CLASS_BYTES = 0.45, 2.6, 0.06
 """Bytes per pixel: of an image, of all images of a true view, of the class and sky maps of an image."""
 SWEEP_BYTES, SCAN_BYTES = 600_000, 250_000
 """Bytes of a sweep of 32 beams, and of its truth."""
+CHECK_S = 0.1
+"""Interval in seconds at which placed vehicles are checked."""
+CLEARANCE = 0.25
+"""Height above the ground (metres) of the lowest rays through a vehicle; curbs are lower."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,48 @@ def _annotate(
         box = recorder.box_to_global(item, seconds)
         if np.linalg.norm((box - ego)[:2, 3]) <= ANNOTATED_RANGE:
             tables.add_box(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
+
+
+def require_free_places(recorder: Recorder) -> None:
+    """Raises ConfigError, one line, where a placed vehicle meets an object during the drive."""
+    for name, edit in recorder.edits.items():
+        for number, step in enumerate(edit.steps, start=1):
+            if step.place is None:
+                continue
+            met = first_contact(recorder, name, step.place.name)
+            if met is not None:
+                raise ConfigError(
+                    f"scene {recorder.scene}, edit {name!r}, step {number} (place): {step.place.name!r} is inside "
+                    f"{met[1]} at {met[0]:.1f} s; choose another path"
+                )
+
+
+def first_contact(recorder: Recorder, edit: str, name: str) -> tuple[float, str] | None:
+    """The first second at which the vehicle `name` of an edit touches an object, and that object's name; None if it
+    touches none. Rays through its box find what is inside."""
+    objects = recorder.variation(edit).street.objects
+    placed = next((item for item in objects if item.name == name), None)
+    if placed is None:  # a later step has removed it
+        return None
+    # lines through the vehicle's box, in its frame: its edges and diagonals at several heights
+    length, width, height = placed.size
+    corners = np.array([(x, y) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]) * [length / 2, width / 2]
+    pairs = [*pairwise([*corners, corners[0]]), (corners[0], corners[2]), (corners[1], corners[3])]
+    heights = np.linspace(CLEARANCE, 0.95 * height, 4)
+    starts = np.array([(*start, z) for start, _ in pairs for z in heights])
+    ends = np.array([(*end, z) for _, end in pairs for z in heights])
+    times = np.arange(0.0, recorder.world.seconds, CHECK_S)
+    poses = np.repeat(placed.poses(times), len(starts), axis=0)
+    start, toward = np.tile(starts, (len(times), 1)), np.tile(ends - starts, (len(times), 1))
+    length = np.linalg.norm(toward, axis=1)
+    origins = np.einsum("nij,nj->ni", poses[:, :3, :3], start) + poses[:, :3, 3]
+    directions = np.einsum("nij,nj->ni", poses[:, :3, :3], toward / length[:, None])
+    rays = StreetRays(np.repeat(times, len(starts)), origins, directions, np.arange(len(poses), dtype=np.int32))
+    hits = recorder.snapshot(rays.seconds, Viewpoint(edit=edit, without=name)).cast(rays)
+    inside = np.flatnonzero((hits.object != NO_HIT) & (hits.distance < length))
+    if len(inside) == 0:
+        return None
+    return float(rays.seconds[inside[0]]), objects[int(hits.object[inside[0]])].name
 
 
 _worker: tuple[Path, Recorder]

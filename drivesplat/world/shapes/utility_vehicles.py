@@ -78,24 +78,7 @@ def truck(size: Numbers, color: Color) -> ColoredMesh:
     ]  # fmt: skip
     bars += [box((-front + 0.02, -y, 0.42), (-front + 0.1, y, 0.54), Material.METAL, METAL)]
     beam = box((-front + 0.06, -y, 0.6), (-front + 0.2, y, 1.0), Material.PLAIN, BLACK)
-    top, belt, base, roof = 0.8 * height, 1.45, front - 0.06, front - 0.3
-    shell = [(wall, 0.55, 0.98 * y), (wall, top, 0.94 * y), (roof, top, 0.9 * y), (base, belt, 0.97 * y),
-             (front - 0.02, 0.9, 0.96 * y), (front - 0.02, 0.4, 0.95 * y), (wall, belt, y)]  # fmt: skip
-    screen = [(base, -0.97 * y, belt), (base, 0.97 * y, belt), (roof, 0.9 * y, top), (roof, -0.9 * y, top)]
-    side = [(wall, y, belt), (base, 0.97 * y, belt), (roof, 0.9 * y, top), (wall, 0.94 * y, top)]
-    deflector = [(wall, top - 0.02, 0.8 * y), (roof - 0.2, top - 0.02, 0.8 * y), (wall, height - 0.06, 0.75 * y)]
-    grille = [box((front - 0.1, -0.7 * y, z), (front - 0.004, 0.7 * y, z + 0.07), Material.PLAIN, BLACK)
-              for z in (0.85, 0.98, 1.11)]  # fmt: skip
-    windows = [glass(face, (0.3, 0.93), (0.08, 0.82)) for face in both_sides(side)]
-    marker = box((roof - 0.1, -0.2, top - 0.01), (roof, 0.2, top + 0.04), Material.LAMP, HEADLIGHT)
-    cab = [
-        symmetric_hull(shell, Material.PAINT, color),
-        symmetric_hull(deflector, Material.PAINT, color),
-        *windows,
-        glass(screen, (0.05, 0.95), (0.03, 0.86)),
-        *grille,
-        marker,
-    ]
+    cab = _truck_cab(wall, front, y, height, color)
     bars += [box((x - 0.03, s * (y - 0.1) - 0.03, 0.5), (x + 0.03, s * (y - 0.1) + 0.03, 1.06), Material.PLAIN, BLACK)
              for s in (-1, 1) for x in (-0.2 * length, 0.12 * length)]  # fmt: skip
     edges = [
@@ -156,6 +139,24 @@ def bus(size: Numbers, color: Color) -> ColoredMesh:
         *wing_mirrors(front - 0.2, width / 2, 1.9, 0.4, BLACK),
     ]  # fmt: skip
     return assembled(parts)
+
+
+def _truck_cab(wall: float, front: float, y: float, height: float, color: Color) -> list[ColoredMesh]:
+    """The cab between x = `wall` and `front`, with a deflector on its roof."""
+    top, belt, base, roof = 0.8 * height, 1.45, front - 0.06, front - 0.3
+    shell = [(wall, 0.55, 0.98 * y), (wall, top, 0.94 * y), (roof, top, 0.9 * y), (base, belt, 0.97 * y),
+             (front - 0.02, 0.9, 0.96 * y), (front - 0.02, 0.4, 0.95 * y), (wall, belt, y)]  # fmt: skip
+    screen = [(base, -0.97 * y, belt), (base, 0.97 * y, belt), (roof, 0.9 * y, top), (roof, -0.9 * y, top)]
+    side = [(wall, y, belt), (base, 0.97 * y, belt), (roof, 0.9 * y, top), (wall, 0.94 * y, top)]
+    deflector = [(wall, top - 0.02, 0.8 * y), (roof - 0.2, top - 0.02, 0.8 * y), (wall, height - 0.06, 0.75 * y)]
+    grille = [box((front - 0.1, -0.7 * y, z), (front - 0.004, 0.7 * y, z + 0.07), Material.PLAIN, BLACK)
+              for z in (0.85, 0.98, 1.11)]  # fmt: skip
+    windows = [glass(face, (0.3, 0.93), (0.08, 0.82)) for face in both_sides(side)]
+    marker = box((roof - 0.1, -0.2, top - 0.01), (roof, 0.2, top + 0.04), Material.LAMP, HEADLIGHT)
+    return [
+        symmetric_hull(shell, Material.PAINT, color), symmetric_hull(deflector, Material.PAINT, color), *windows,
+        glass(screen, (0.05, 0.95), (0.03, 0.86)), *grille, marker,
+    ]  # fmt: skip
 
 
 def _rear_doors(x: float, y: float, heights: tuple[float, float]) -> list[ColoredMesh]:
