@@ -66,10 +66,10 @@ def _mapping(record: BaseModel, indent: int, commented: set[tuple[type, str]]) -
     comments in the lines so far."""
     lines, pad = [], " " * indent
     for name, field in _printed_fields(record, commented):
-        meaning, limits = described(field.description), bounds(field.metadata)
-        if limits and meaning:
-            meaning += f" [{limits.replace(' ', NO_BREAK)}]"
-        wrapped = textwrap.wrap(meaning, WIDTH - len(pad)) if meaning else []
+        about, limits = described(field.description), bounds(field.metadata)
+        if limits and about:
+            about += f" [{limits.replace(' ', NO_BREAK)}]"
+        wrapped = textwrap.wrap(about, WIDTH - len(pad)) if about else []
         comment = "".join(f"{pad}# {line}\n" for line in wrapped).replace(NO_BREAK, " ")
         key = type(record), name
         text = _value(name, getattr(record, name), indent, commented)

@@ -139,36 +139,32 @@ class Inputs:
         name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
 
-    def scene(self, wildcards: Any) -> str:
+    def scene(self, wildcards: Any, shown: bool = False) -> str:
         """The scene record with the tracks of a job."""
-        return self._scene(wildcards, self.tracks(wildcards))
+        tracks = self.tracks(wildcards, shown)
+        return self.annotated_scene(wildcards) if tracks == "annotated" else self._of(tracks, wildcards, "scene.json")
 
     def shown_scene(self, wildcards: Any) -> str:
         """The scene record with the tracks that pictures of a method show."""
-        return self._scene(wildcards, self._shown_tracks(wildcards))
+        return self.scene(wildcards, shown=True)
 
     def shown_masks(self, wildcards: Any) -> str:
         """The masks of these tracks."""
-        return self._of(self._shown_tracks(wildcards), wildcards, "masks/masks.json")
-
-    def _scene(self, wildcards: Any, tracks: Tracks) -> str:
-        return self.annotated_scene(wildcards) if tracks == "annotated" else self._of(tracks, wildcards, "scene.json")
+        return self._of(self.tracks(wildcards, shown=True), wildcards, "masks/masks.json")
 
     @property
     def other_tracks(self) -> list[str]:
         """The values of the wildcard `tracks` but that of annotated tracks, which is empty."""
         return [f"{folder}/" for folder in OTHER_TRACKS]
 
-    def tracks(self, wildcards: Any) -> Tracks:
-        """The tracks of a job: those of its results' folder, or those that its method trains with."""
+    def tracks(self, wildcards: Any, shown: bool = False) -> Tracks:
+        """The tracks of a job: those of its results' folder, or those that its method trains with. Those that pictures
+        show (`shown`) of a method without tracks are the annotated ones."""
         if hasattr(wildcards, "tracks"):
-            return next(own for own, folder in TRACK_FOLDERS.items() if folder == wildcards.tracks.rstrip("/"))
-        return self.config.all_methods[wildcards.method].tracks if hasattr(wildcards, "method") else "annotated"
-
-    def _shown_tracks(self, wildcards: Any) -> Tracks:
-        """The tracks that pictures of a method show: its own; the annotated ones of a method without tracks."""
-        own = self.tracks(wildcards)
-        return "annotated" if own == "none" else own
+            own = next(tracks for tracks, name in TRACK_FOLDERS.items() if name == wildcards.tracks.rstrip("/"))
+        else:
+            own = self.config.all_methods[wildcards.method].tracks if hasattr(wildcards, "method") else "annotated"
+        return "annotated" if shown and own == "none" else own
 
     def _of(self, tracks: Tracks, wildcards: Any, name: str) -> str:
         """A result of a scene that depends on tracks."""

@@ -61,13 +61,6 @@ class SurfacePoints:
         places, faces = trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)
         return cls(pieces[faces], np.asarray(places))
 
-    def __len__(self) -> int:
-        return len(self.pieces)
-
-    def at(self, poses: np.ndarray) -> np.ndarray:
-        """The points (n, 3) where the pieces have `poses` (pieces, 4, 4)."""
-        return np.einsum("nij,nj->ni", poses[self.pieces, :3, :3], self.places) + poses[self.pieces, :3, 3]
-
 
 class Recorder:
     """Records the street of `world` as the drive `scene`. Each recording has its own random generator."""
@@ -185,12 +178,17 @@ class Recorder:
         """The visible fraction of each object (objects,) within the images of key frame `index`, of all six cameras
         whether they record or not: of points on its surface."""
         visible, inside, surfaces = np.zeros(len(self.objects)), np.zeros(len(self.objects)), self._surfaces
-        owners = np.repeat(list(surfaces), [len(points) for points in surfaces.values()])
+        owners = np.repeat(list(surfaces), SURFACE_POINTS)
         for sensor in SENSORS:
             if sensor.is_camera and surfaces:
                 time = np.array([(key_frame_time(self.world, index) + sensor.delay_us) * 1e-6])
                 camera = self.camera(sensor, float(time[0]))
-                points = np.concatenate([own.at(self.objects[n].piece_poses(time)[0]) for n, own in surfaces.items()])
+                poses = [self.objects[n].piece_poses(time)[0, own.pieces] for n, own in surfaces.items()]
+                moved = [
+                    np.einsum("nij,nj->ni", pose[:, :3, :3], own.places) + pose[:, :3, 3]
+                    for pose, own in zip(poses, surfaces.values(), strict=True)
+                ]
+                points = np.concatenate(moved)
                 pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
                 limit = np.array([camera.width, camera.height]) - 0.5
                 chosen = (depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)

@@ -45,6 +45,7 @@ class Expectations:
 
     def __init__(self, config: Config, costs: Sequence[Cost]):
         self._config = config
+        self._moving = {name for name, method in config.all_methods.items() if method.moving_parts}
         self._costs: dict[tuple[str, str], list[Cost]] = defaultdict(list)
         for cost in costs:
             self._costs[self._kind(cost.job)].append(cost)
@@ -57,7 +58,7 @@ class Expectations:
         alike: list[Callable[[Cost], bool]] = [
             lambda cost: cost.job == job,
             lambda cost: cost.job.method == job.method,
-            lambda cost: job.stage != TRAIN or self._moves(cost.job.method) == self._moves(job.method),
+            lambda cost: job.stage != TRAIN or (cost.job.method in self._moving) == (job.method in self._moving),
         ]
         for like in alike:
             found = {c.job: seconds for c in peers if like(c) and (seconds := self._scaled(c, job)) is not None}
@@ -101,10 +102,6 @@ class Expectations:
             return cost.seconds
         iterations = for_scene(self._config, job.scene, job.method).train.iterations
         return cost.seconds * iterations / cost.iterations if cost.iterations else None
-
-    def _moves(self, method: str) -> bool:
-        known = self._config.all_methods
-        return method in known and bool(known[method].moving_parts)
 
 
 def _size(files: Iterable[str | Path]) -> float:

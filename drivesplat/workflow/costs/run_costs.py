@@ -72,8 +72,16 @@ class RunCosts:
             if self._jobs:
                 _say(in_one_line(self.estimate()))
                 logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
-                watched = self._planned, logs, self._expectations, self._finished, self._machine, time.time()
-                self._ended = watch(RunProgress(*watched))
+                dag, jobs = self._workflow.dag, self._jobs
+                watched = RunProgress(
+                    self._planned,
+                    logs,
+                    self._expectations,
+                    lambda: {name for name, job in jobs.items() if dag.finished(job)},
+                    self._machine,
+                    time.time(),
+                )
+                self._ended = watch(watched)
         except Exception as error:  # a failed estimate must not end the run
             _say(f"the run cannot be estimated ({type(error).__name__}: {error})")
 
@@ -119,9 +127,6 @@ class RunCosts:
 
     def _expectations(self) -> Expectations:
         return Expectations(self._plan.config, read_costs(self._results)[0])
-
-    def _finished(self) -> set[JobId]:
-        return {name for name, job in self._jobs.items() if self._workflow.dag.finished(job)}
 
 
 def planned_job(name: JobId, job: Any) -> PlannedJob:
