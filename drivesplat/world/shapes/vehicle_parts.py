@@ -39,9 +39,9 @@ def disc(center: Numbers, width: float, radius: float, material: Material, color
     return uniform(mesh, material, color)
 
 
-def wheel(x: float, outer: float, radius: float, width: float = 0.2) -> list[ColoredMesh]:
+def wheel(x: float, outer: float, radius: float) -> list[ColoredMesh]:
     """A wheel at `x` whose outside is at y = `outer`, on the ground, before the dark inset of its arch."""
-    side = np.sign(outer)
+    side, width = np.sign(outer), 0.2
     arch = disc((x, outer - side * 0.16, 1.18 * radius), 0.29, 1.16 * radius, Material.PLAIN, BLACK)
     tyre = disc((x, outer - side * (0.005 + width / 2), radius), width, radius, Material.PLAIN, TYRE)
     rim = disc((x, outer - side * 0.016, radius), 0.026, 0.66 * radius, Material.PLAIN, BLACK)
