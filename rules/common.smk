@@ -50,8 +50,7 @@ try:
         across_scenes.refuse_empty()
         if wanted != [COSTS]:
             plan.refuse_absent_data(wanted)
-        run_costs.report_settings_without_effect()
-        run_costs.report_foreign_records()
+        run_costs.report_at_planning()
 except DriveSplatError as error:
     sys.exit(f"drivesplat: {in_this_copy(str(error))}")
 

@@ -127,7 +127,7 @@ rule parser:
     """
     input:
         scene=plan.scene,
-        seed=plan.images_of_tracks("seed.ply"),
+        seed=plan.of_images("seed.ply", of_tracks=True),
     output:
         pickle="<results>/{scene}/{tracks}parser.pkl",
         parser="<results>/{scene}/{tracks}parser.npz",

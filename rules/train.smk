@@ -14,7 +14,7 @@ rule train:
     input:
         pickle=plan.of_tracks("parser.pkl"),
         parser=plan.of_tracks("parser.npz"),
-        masks=plan.images_of_tracks("masks/masks.json"),
+        masks=plan.of_images("masks/masks.json", of_tracks=True),
         actors=plan.training_input("actors"),
         lidar_depth=plan.training_input("lidar_depth"),
         scans=plan.training_input("scans"),

@@ -29,54 +29,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command of the command line. Returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        _require_folder()
+        try:
+            Path.cwd()
+        except FileNotFoundError:
+            raise DriveSplatError("the current folder has been removed; change to another one") from None
         if given[:1] == [RUN]:  # all the rest is Snakemake's
             return run_workflow(given[1:])
         parsed = _parser().parse_args(given)
         with standard_output():
-            return parsed.command(parsed)
+            return run_command(parsed)
         return 0  # nobody reads the rest
     except DriveSplatError as error:
         print(f"drivesplat: {in_this_copy(str(error))}", file=sys.stderr)
         return 1
 
 
-def _require_folder() -> None:
-    """Raises DriveSplatError where the current folder has been removed."""
-    try:
-        Path.cwd()
-    except FileNotFoundError:
-        raise DriveSplatError("the current folder has been removed; change to another one") from None
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("drivesplat", description="Recorded drives as 3D Gaussian splats, measured.")
     parser.add_argument("--version", action="version", version=f"drivesplat {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(required=True, dest="command", metavar="COMMAND")
 
     text = "run the workflow: all arguments are Snakemake's, as in drivesplat run --cores 4 -- metrics"
     commands.add_parser(RUN, help=text)
 
     demo = commands.add_parser("demo", help="run the whole workflow on a synthetic drive, in the current folder")
     demo.add_argument("--cores", default="all", help="number of processors to use (all)")
-    demo.set_defaults(command=_demo)
 
     viewer = commands.add_parser("open", help="open a scene's viewer.html in the browser")
     viewer.add_argument("scene", nargs="?", help="by default the scene exported last")
     viewer.add_argument("method", nargs="?", help="by default one with moving objects")
     viewer.add_argument("--results", type=Path, help="folder of the results (results_dir of config.yaml)")
-    viewer.set_defaults(command=_open)
 
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
-    doctor.set_defaults(command=_doctor)
 
-    setup = commands.add_parser("setup", help="compile the kernels for this machine's GPUs and processors, once")
-    setup.set_defaults(command=_setup)
+    commands.add_parser("setup", help="compile the kernels for this machine's GPUs and processors, once")
 
     config = commands.add_parser("config", help="print common settings with defaults: drivesplat config > config.yaml")
     config.add_argument("--all", action="store_true", help="print docs/settings.md, a page of all settings, instead")
-    config.set_defaults(command=_config)
     return parser
 
 
@@ -87,51 +77,41 @@ def _version() -> str:
         return "of a checkout"
 
 
-def _demo(parsed: argparse.Namespace) -> int:
-    """Runs the whole workflow on the demo world and prints its figures."""
-    status = run_workflow(["--cores", parsed.cores, "--configfile", "presets/demo.yaml", "--", "all"])
-    if status == 0:
-        from drivesplat.evaluation.summary import print_summary
+def run_command(parsed: argparse.Namespace) -> int:
+    """Runs a command with its parsed arguments. Returns the exit status."""
+    if parsed.command == "demo":
+        status = run_workflow(["--cores", parsed.cores, "--configfile", "presets/demo.yaml", "--", "all"])
+        if status == 0:
+            from drivesplat.evaluation.summary import print_summary
 
-        print_summary(results_folder() / "demo" / "metrics.json")
-    return status
+            print_summary(results_folder() / "demo" / "metrics.json")
+        return status
+    if parsed.command == "doctor":
+        from drivesplat.machine.doctor.__main__ import main as doctor
 
+        return doctor(parsed.config)
+    if parsed.command == "setup":
+        from drivesplat.machine.gsplat_build.__main__ import main as compile_gsplat
+        from drivesplat.training.warm_up import main as train_briefly
+        from drivesplat.world.warm_up import main as make_tiny_world
 
-def _open(parsed: argparse.Namespace) -> int:
-    print(open_viewer(parsed.results or results_folder(), parsed.scene, parsed.method))
-    return 0
-
-
-def _doctor(parsed: argparse.Namespace) -> int:
-    from drivesplat.machine.doctor.__main__ import main as doctor
-
-    return doctor(parsed.config)
-
-
-def _setup(_: argparse.Namespace) -> int:
-    from drivesplat.machine.gsplat_build.__main__ import main as compile_gsplat
-    from drivesplat.training.warm_up import main as train_briefly
-    from drivesplat.world.warm_up import main as make_tiny_world
-
-    return compile_gsplat([]) or train_briefly() or make_tiny_world()
-
-
-def _config(parsed: argparse.Namespace) -> int:
-    print((WORKFLOW / ("docs/settings.md" if parsed.all else "config.yaml")).read_text(encoding="utf-8"), end="")
+        return compile_gsplat([]) or train_briefly() or make_tiny_world()
+    if parsed.command == "open":
+        print(open_viewer(parsed.results or results_folder(), parsed.scene, parsed.method))
+    else:  # config
+        print((WORKFLOW / ("docs/settings.md" if parsed.all else "config.yaml")).read_text(encoding="utf-8"), end="")
     return 0
 
 
 def snakemake_command(arguments: Sequence[str]) -> list[str]:
     """The command line of Snakemake for the workflow of this copy. Presets and profiles that it brings along are found
     from any folder; the default profile is that beside the Snakefile, unless the current folder has one."""
-    found = [_found(argument) for argument in arguments]
+    found = []
+    for argument in arguments:  # also of the form --option=value
+        option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+        along = value.startswith(BROUGHT_ALONG)
+        found.append(f"{option}{equals}{of_the_workflow(value)}" if along else argument)
     return [sys.executable, "-m", "snakemake", "--snakefile", str(SNAKEFILE), *found]
-
-
-def _found(argument: str) -> str:
-    """An argument, also of the form `--option=value`, with the path of what the workflow brings along."""
-    option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
-    return f"{option}{equals}{of_the_workflow(value)}" if value.startswith(BROUGHT_ALONG) else argument
 
 
 def run_workflow(arguments: Sequence[str]) -> int:

@@ -26,10 +26,7 @@ R = TypeVar("R")
 
 
 def write_arrays(
-    path: str | Path,
-    content: Any,
-    kind: type = np.ndarray,
-    to_array: Callable[[Any], np.ndarray] = lambda array: array,
+    path: str | Path, content: Any, kind: type = np.ndarray, to_array: Callable[[Any], np.ndarray] = lambda array: array
 ) -> None:
     """Writes plain containers, scalars, arrays and dataclasses of them, atomically; `kind` is the class of arrays.
 
@@ -122,14 +119,12 @@ def _members(file: BinaryIO) -> dict[str, np.ndarray]:
         members = archive.infolist()
         if sum(member.file_size for member in members) > os.fstat(file.fileno()).st_size:
             raise ValueError("its members are larger than the file")
-        return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
-
-
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """The array that a member holds."""
-    with archive.open(member) as file:
-        array = np.lib.format.read_array(file, allow_pickle=False)
-        more = file.read(1)  # at its end, zipfile compares the checksum
-    if more or array.dtype.kind not in "biuf" or array.ndim > MAX_DIMENSIONS:
-        raise ValueError(f"{member.filename} is no array of numbers")
-    return array
+        arrays = {}
+        for member in members:
+            with archive.open(member) as content:
+                array = np.lib.format.read_array(content, allow_pickle=False)
+                more = content.read(1)  # at its end, zipfile compares the checksum
+            if more or array.dtype.kind not in "biuf" or array.ndim > MAX_DIMENSIONS:
+                raise ValueError(f"{member.filename} is no array of numbers")
+            arrays[member.filename.removesuffix(".npy")] = array
+    return arrays

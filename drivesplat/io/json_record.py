@@ -1,7 +1,7 @@
 """JSON files that hold one dataclass each, with the version of their schema."""
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +13,11 @@ R = TypeVar("R")
 
 def write_typed_json(path: str | Path, record: object, schema: int) -> None:
     """Writes a dataclass; arrays and nested dataclasses become lists and objects."""
-    write_json(path, {"schema": schema, **field_values(record)}, _plain)
+    write_json(
+        path,
+        {"schema": schema, **field_values(record)},
+        lambda value: value.tolist() if isinstance(value, np.ndarray) else field_values(value),
+    )
 
 
 def read_typed_json(path: str | Path, rule: str, kind: type[R], schema: int, what: str) -> R:
@@ -26,7 +30,3 @@ def read_typed_json(path: str | Path, rule: str, kind: type[R], schema: int, wha
         return typed_record(kind, content, json=True)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise unreadable(path, rule, f"not {what} ({error})") from error
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else field_values(value)

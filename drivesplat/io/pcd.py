@@ -32,7 +32,20 @@ def read_pcd(path: Path) -> dict[str, np.ndarray]:
     body = memoryview(content)[header.begin :]
     sizes = [kind.itemsize * count for _, kind, count in header.columns]
     if header.data == "ascii":
-        return _ascii(bytes(body), header)
+        per_point = sum(count for _, _, count in header.columns)
+        words = bytes(body).split()
+        if len(words) != header.points * per_point:
+            raise ValueError(
+                f"its {header.points} points of {per_point} values take {header.points * per_point} numbers, and it "
+                f"has {len(words)}"
+            )
+        values = np.array(words, dtype=np.float64).reshape(header.points, per_point)
+        firsts = np.cumsum([0, *(count for _, _, count in header.columns)])
+        return {
+            name: values[:, first]
+            for (name, _, count), first in zip(header.columns, firsts[:-1], strict=True)
+            if count == 1
+        }
     expected = header.points * sum(sizes)
     if header.data == "binary_compressed":
         body = memoryview(_decompressed(body, expected))
@@ -98,23 +111,6 @@ def _whole(words: str | list[str], key: str) -> int:
     if not (word.isascii() and word.isdigit() and len(word) <= 10):
         raise ValueError(f"{key} of its header is {word[:80]!r}; it must be a whole number")
     return int(word)
-
-
-def _ascii(body: bytes, header: Header) -> dict[str, np.ndarray]:
-    per_point = sum(count for _, _, count in header.columns)
-    words = body.split()
-    if len(words) != header.points * per_point:
-        raise ValueError(
-            f"its {header.points} points of {per_point} values take {header.points * per_point} numbers, and it has "
-            f"{len(words)}"
-        )
-    values = np.array(words, dtype=np.float64).reshape(header.points, per_point)
-    firsts = np.cumsum([0, *(count for _, _, count in header.columns)])
-    return {
-        name: values[:, first]
-        for (name, _, count), first in zip(header.columns, firsts[:-1], strict=True)
-        if count == 1
-    }
 
 
 def _decompressed(body: memoryview, expected: int) -> bytes:

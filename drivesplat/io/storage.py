@@ -53,7 +53,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(path)
+        # partial files of killed writers: those that have not been modified for an hour
+        for partial in path.parent.glob(f".{glob.escape(path.stem)}.[0-9]*.partial{glob.escape(path.suffix)}"):
+            with suppress(OSError):
+                if time.time() - partial.stat().st_mtime > ABANDONED_SECONDS:
+                    partial.unlink()
         yield aside
         _fsync(aside)
         aside.replace(path)
@@ -73,14 +77,6 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
     """
     with atomic_path(path) as aside, open(aside, "wb") as file:
         yield file
-
-
-def _remove_abandoned(path: Path) -> None:
-    """Removes partial files of killed writers of `path`: those that have not been modified for an hour."""
-    for partial in path.parent.glob(f".{glob.escape(path.stem)}.[0-9]*.partial{glob.escape(path.suffix)}"):
-        with suppress(OSError):
-            if time.time() - partial.stat().st_mtime > ABANDONED_SECONDS:
-                partial.unlink()
 
 
 def _fsync(path: Path) -> None:

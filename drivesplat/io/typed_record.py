@@ -38,12 +38,16 @@ def typed_record(kind: type[R], values: Any, json: bool = False) -> R:
     known = {name: _value(hints[name], values[name], json) for name in hints if name in values}
     sizes: dict[str, int] = {}
     for name, value in known.items():
-        classes = _classes(hints[name])
+        members = (typing.get_origin(member) or member for member in _members(hints[name]))
+        classes = tuple(member if isinstance(member, type) else object for member in members)
         if not isinstance(value, classes) or not _fits(value, classes, sizes):
-            raise ValueError(f"{name} is {_described(value)}, not {getattr(hints[name], '__name__', hints[name])}")
+            found = f"{value.dtype} {list(value.shape)}" if hasattr(value, "dtype") else f"a {type(value).__name__}"
+            raise ValueError(f"{name} is {found}, not {getattr(hints[name], '__name__', hints[name])}")
         require_finite(name, value)
     if "provenance" in known:
-        _require_provenance(known["provenance"])
+        lacking = [name for name in ("stages", "inputs") if not isinstance(known["provenance"].get(name), dict)]
+        if lacking:  # later stages merge them
+            raise ValueError(f"its provenance lacks {', '.join(lacking)}")
     record = kind(**known)
     if hasattr(record, "fault") and (fault := record.fault()):
         raise ValueError(fault)
@@ -55,13 +59,6 @@ def require_finite(name: str, value: Any) -> None:
     numbers = np.asarray(value) if isinstance(value, float | np.ndarray) else np.empty(0)
     if numbers.dtype.kind == "f" and numbers.size and not np.isfinite([numbers.min(), numbers.max()]).all():
         raise ValueError(f"{name} is not finite")
-
-
-def _require_provenance(record: dict[str, Any]) -> None:
-    """Raises ValueError where a record of provenance lacks what later stages merge."""
-    lacking = [name for name in ("stages", "inputs") if not isinstance(record.get(name), dict)]
-    if lacking:
-        raise ValueError(f"its provenance lacks {', '.join(lacking)}")
 
 
 def _value(hint: Any, value: Any, json: bool) -> Any:
@@ -84,12 +81,6 @@ def _members(hint: Any) -> tuple[Any, ...]:
     return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
 
 
-def _classes(hint: Any) -> tuple[type, ...]:
-    """The classes that values of an annotation may have."""
-    members = (typing.get_origin(member) or member for member in _members(hint))
-    return tuple(member if isinstance(member, type) else object for member in members)
-
-
 def _fits(value: Any, classes: tuple[type, ...], sizes: dict[str, int]) -> bool:
     """Whether the named dimensions of an array of one of the `classes` have the `sizes` known so far; adds new ones.
     jaxtyping's `jaxtyped` would compare them, too, but imports jax where it is installed, which takes a second."""
@@ -98,7 +89,3 @@ def _fits(value: Any, classes: tuple[type, ...], sizes: dict[str, int]) -> bool:
             named = zip(kind.dim_str.split(), value.shape, strict=True)
             return all(sizes.setdefault(dim, size) == size for dim, size in named if dim.isidentifier())
     return True
-
-
-def _described(value: Any) -> str:
-    return f"{value.dtype} {list(value.shape)}" if hasattr(value, "dtype") else f"a {type(value).__name__}"

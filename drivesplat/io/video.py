@@ -48,7 +48,32 @@ def write_video(
     number, size or rate. Raises ValueError for a frame of another shape or type.
     """
     with atomic_path(path) as aside:
-        count = _encode(path, frames, size, _command(path, aside, size, fps, crf, threads))
+        try:
+            executable = imageio_ffmpeg.get_ffmpeg_exe()
+        except RuntimeError as error:
+            raise _not_started(path, error) from error
+        source = ffmpeg.input("pipe:", format="rawvideo", pix_fmt="rgb24", s=f"{size[0]}x{size[1]}", framerate=fps)
+        # By default ffmpeg converts RGB to YUV by the BT.601 matrix, but players convert back by BT.709: colours shift.
+        # New versions tag a film by its frames (setparams), old ones by the output options.
+        bt709 = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709"}
+        converted = (
+            source.filter(
+                "scale", out_color_matrix="bt709", out_range="tv", flags="bicubic+accurate_rnd+full_chroma_int"
+            )
+            .filter("format", "yuv420p")
+            .filter("setparams", range="tv", **bt709)
+        )
+        film = converted.output(
+            f"file:{aside}",
+            format="mp4",
+            vcodec="libx264",
+            crf=crf,
+            movflags="+faststart",
+            threads=threads,
+            color_range="tv",
+            **bt709,
+        ).global_args("-hide_banner", "-nostdin", "-nostats", "-loglevel", "error")
+        count = _encode(path, frames, size, ffmpeg.compile(film, cmd=executable, overwrite_output=True))
         expected, found = Footage(count, *size, float(fps)), read_footage(aside)
         if found != expected:
             raise ResultError(f"{path}: ffmpeg was given {expected} and wrote {found}; free disk space and rerun")
@@ -68,33 +93,6 @@ def read_footage(path: Path) -> Footage:
         capture.release()
 
 
-def _command(path: Path, aside: Path, size: tuple[int, int], fps: int, crf: int, threads: int) -> list[str]:
-    try:
-        executable = imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise _not_started(path, error) from error
-    source = ffmpeg.input("pipe:", format="rawvideo", pix_fmt="rgb24", s=f"{size[0]}x{size[1]}", framerate=fps)
-    # By default ffmpeg converts RGB to YUV by the BT.601 matrix, but players convert back by BT.709: colours shift.
-    # New versions tag a film by its frames (setparams), old ones by the output options.
-    bt709 = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709"}
-    converted = (
-        source.filter("scale", out_color_matrix="bt709", out_range="tv", flags="bicubic+accurate_rnd+full_chroma_int")
-        .filter("format", "yuv420p")
-        .filter("setparams", range="tv", **bt709)
-    )
-    film = converted.output(
-        f"file:{aside}",
-        format="mp4",
-        vcodec="libx264",
-        crf=crf,
-        movflags="+faststart",
-        threads=threads,
-        color_range="tv",
-        **bt709,
-    ).global_args("-hide_banner", "-nostdin", "-nostats", "-loglevel", "error")
-    return ffmpeg.compile(film, cmd=executable, overwrite_output=True)
-
-
 def _encode(path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], command: list[str]) -> int:
     """Encodes all frames and returns their number. In any case the ffmpeg process has ended afterwards."""
     count = 0
@@ -103,9 +101,18 @@ def _encode(path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], com
         for frame in frames:
             if frame.shape != (size[1], size[0], 3) or frame.dtype != np.uint8:
                 raise ValueError(f"a frame of {frame.shape} {frame.dtype} in a film of {size[0]}x{size[1]}")
-            if not _accepted(process, frame):
+            # ffmpeg does not read the frame if it ended, closed its input or exceeds PATIENCE
+            watchdog = Timer(PATIENCE, process.kill)
+            watchdog.start()
+            try:
+                process.stdin.write(np.ascontiguousarray(frame).data)
+                process.stdin.flush()
+            except BrokenPipeError:
+                watchdog.cancel()  # not for the process that ends now
                 _wait(process, min(10.0, PATIENCE))
-                raise _failed(path, f"took no more than {count} frames", process, messages)
+                raise _failed(path, f"took no more than {count} frames", process, messages) from None
+            finally:
+                watchdog.cancel()
             count += 1
         process.stdin.close()
         _wait(process, PATIENCE)
@@ -128,20 +135,6 @@ def _running(path: Path, command: list[str], messages: BinaryIO) -> Iterator[sub
         process.wait()
         with suppress(OSError):
             process.stdin.close()
-
-
-def _accepted(process: subprocess.Popen, frame: np.ndarray) -> bool:
-    """Whether ffmpeg read the frame. It did not if it ended, closed its input or exceeded PATIENCE."""
-    watchdog = Timer(PATIENCE, process.kill)
-    watchdog.start()
-    try:
-        process.stdin.write(np.ascontiguousarray(frame).data)
-        process.stdin.flush()
-    except BrokenPipeError:
-        return False
-    finally:
-        watchdog.cancel()
-    return True
 
 
 def _wait(process: subprocess.Popen, seconds: float) -> None:

@@ -70,8 +70,21 @@ def _require_gpu(needed_gb: float) -> None:
 
 def _require_gsplat() -> None:
     """Loads gsplat's kernels. Never compiles them, which gsplat would by default, silently and for minutes."""
-    if torch.version.cuda and not {"gsplat.csrc", "gsplat.cuda._backend"} & sys.modules.keys():
-        _refuse_uncompiled()
+    loaded = {"gsplat.csrc", "gsplat.cuda._backend"} & sys.modules.keys()
+    if torch.version.cuda and not loaded and package_folder() is not None:  # without one, the import reports it
+        if compiled_extension() is None:
+            raise DeviceError(
+                "gsplat is installed, but its CUDA kernels are not compiled for this torch, and runs do not compile "
+                f"them: {COMPILE} (minutes, once; it installs nvcc), `make doctor` says what it needs; or write "
+                "device: cpu"
+            )
+        archs, capability = build_record().get("archs"), torch.cuda.get_device_capability()
+        if archs and not covers(archs, capability):
+            raise DeviceError(
+                f"gsplat has been compiled for compute capability {', '.join(archs)}, and "
+                f"{torch.cuda.get_device_name()} has {dotted(capability)}: run "
+                f'`GSPLAT_ARCHS="{";".join([*archs, dotted(capability)])}" make setup`, or write device: cpu'
+            )
     try:
         if torch.version.cuda and "gsplat.cuda._backend" not in sys.modules:
             import_module("gsplat.csrc")  # gsplat would compile kernels that it cannot load
@@ -87,23 +100,6 @@ def _require_gsplat() -> None:
         raise DeviceError(
             "gsplat is not compiled and there is no CUDA toolkit (nvcc) to compile it with; "
             f"{COMPILE}, `make doctor` says what that needs; or write device: cpu"
-        )
-
-
-def _refuse_uncompiled() -> None:
-    if package_folder() is None:
-        return  # the import reports it
-    if compiled_extension() is None:
-        raise DeviceError(
-            "gsplat is installed, but its CUDA kernels are not compiled for this torch, and runs do not compile them: "
-            f"{COMPILE} (minutes, once; it installs nvcc), `make doctor` says what it needs; or write device: cpu"
-        )
-    archs, capability = build_record().get("archs"), torch.cuda.get_device_capability()
-    if archs and not covers(archs, capability):
-        raise DeviceError(
-            f"gsplat has been compiled for compute capability {', '.join(archs)}, and {torch.cuda.get_device_name()} "
-            f'has {dotted(capability)}: run `GSPLAT_ARCHS="{";".join([*archs, dotted(capability)])}" make setup`, '
-            "or write device: cpu"
         )
 
 

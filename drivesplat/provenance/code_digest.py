@@ -4,7 +4,6 @@ Snakemake compares a rule's `params`; this digest and the stage's canonical sett
 """
 
 import hashlib
-from collections.abc import Iterator
 from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
@@ -68,14 +67,10 @@ def _pages(path: Path) -> list[Path]:
 @cache
 def _imports(path: Path, package: str) -> frozenset[str]:
     """The modules of this package that a file names, with the packages that contain them."""
-    names = _absolute(_syntax(path).names, package)
+    names = (resolve_name(name, package) if name.startswith(".") else name for name in _syntax(path).names)
     parts = [name.split(".") for pattern in names for name in expanded(pattern)]
     candidates = {".".join(p[: i + 1]) for p in parts if p[0] == PACKAGE for i in range(len(p))}
     return frozenset(name for name in candidates if _file_of(name) is not None)
-
-
-def _absolute(names: tuple[str, ...], package: str) -> Iterator[str]:
-    return (resolve_name(name, package) if name.startswith(".") else name for name in names)
 
 
 def expanded(pattern: str) -> list[str]:

@@ -45,7 +45,8 @@ def member_states(output: str | Path) -> dict[str, tuple[int, int]]:
     if path.name not in WITH_MEMBERS:
         return {}
     others = (file for file in path.parent.rglob("*") if file.is_file() and FOLDER not in file.parts and file != path)
-    return {file.relative_to(path.parent).as_posix(): _state(file) for file in others}
+    states = ((file, file.stat()) for file in others)
+    return {file.relative_to(path.parent).as_posix(): (stat.st_ino, stat.st_mtime_ns) for file, stat in states}
 
 
 def record_output(
@@ -115,11 +116,6 @@ def check_dataset(scene_folder: str | Path, kinds: Iterable[str]) -> None:
                 f"{path}: changed since the rule 'extract' read it; restore it, or delete {scene} and rerun: "
                 "the rule 'extract' reads it again"
             )
-
-
-def _state(file: Path) -> tuple[int, int]:
-    stat = file.stat()
-    return stat.st_ino, stat.st_mtime_ns
 
 
 def _record_path(path: Path) -> Path:

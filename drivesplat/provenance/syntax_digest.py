@@ -55,9 +55,19 @@ def _own_content() -> bytes:
 
 def syntax_digest(content: bytes) -> SyntaxDigest:
     """The digest of a file with this content. Raises SyntaxError where it is not Python."""
-    tree = ast.parse(content)
-    names = sorted(set(_names(tree)))
-    return SyntaxDigest(hashlib.sha256(canonical_tree(tree).encode()).hexdigest(), tuple(names))
+    tree, names = ast.parse(content), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            dot = "" if base.endswith(".") else "."
+            names |= {base, *(f"{base}{dot}{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # a string constant may be a module that is imported by its name
+            parts = node.value.split(".")
+            names |= {node.value} if len(parts) > 1 and all(p.isidentifier() or p == "*" for p in parts) else set()
+    return SyntaxDigest(hashlib.sha256(canonical_tree(tree).encode()).hexdigest(), tuple(sorted(names)))
 
 
 def canonical_tree(node: Any) -> str:
@@ -70,18 +80,16 @@ def canonical_tree(node: Any) -> str:
         return f"[{','.join(map(canonical_tree, node))}]"
     if not isinstance(node, ast.AST):
         return repr(node)
-    fields = ((name, _canonical_field(node, name)) for name in node._fields if name not in IGNORED_FIELDS)
-    written = (f"{name}={canonical_tree(value)}" for name, value in fields if value is not None and value != [])
+    written = []
+    for name in node._fields:
+        value = getattr(node, name, None)
+        if isinstance(node, ast.JoinedStr):
+            value = list(_merged_constants(value))
+        elif name == "body" and isinstance(value, list):
+            value = [statement for statement in value if not _is_bare_string(statement)] or [ast.Pass()]
+        if name not in IGNORED_FIELDS and value is not None and value != []:
+            written.append(f"{name}={canonical_tree(value)}")
     return f"{type(node).__name__}({','.join(written)})"
-
-
-def _canonical_field(node: ast.AST, name: str) -> Any:
-    value = getattr(node, name, None)
-    if isinstance(node, ast.JoinedStr):
-        return list(_merged_constants(value))
-    if name == "body" and isinstance(value, list):
-        return [statement for statement in value if not _is_bare_string(statement)] or [ast.Pass()]
-    return value
 
 
 def _merged_constants(values: Iterable[ast.expr]) -> Iterator[ast.expr]:
@@ -105,23 +113,6 @@ def _flat(values: Iterable[ast.expr]) -> Iterator[ast.expr]:
             yield from _flat(value.values)
         else:
             yield value
-
-
-def _names(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
-            yield base
-            yield from (f"{base}{'' if base.endswith('.') else '.'}{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and _is_dotted(node.value):
-            yield node.value
-
-
-def _is_dotted(text: str) -> bool:
-    """Whether a string constant may be a module that is imported by its name."""
-    return "." in text and all(part.isidentifier() or part == "*" for part in text.split("."))
 
 
 def _is_bare_string(statement: ast.AST) -> bool:

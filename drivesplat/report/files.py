@@ -47,7 +47,11 @@ def write_report(
     media = collect_media([*pictures, *links], results)
     write_json(record, report)
     write_figures(table, report)
-    costs = _costs(results, job)
+    # the costs of the configured scenes so far
+    stages = [name for stages in job.expected.values() for name in stages]
+    methods = dict.fromkeys(name.partition("/")[0] for name in stages if "/" in name)
+    totals = {total["scene"]: total for total in scene_totals(read_costs(results)[0], list(methods))}
+    costs = [totals[scene] for scene in job.expected if scene in totals]
     _write_page(ghosts, render_ghosts_page())
     _write_page(page, report_page(report, media, costs))
     _write_page(archived, report_page(report, media, costs, lambda name: address_in_archive(results / name)))
@@ -58,14 +62,6 @@ def _write_page(path: Path, page: str) -> None:
     path.parent.mkdir(exist_ok=True)
     with atomic_write(path) as file:
         file.write(page.encode())
-
-
-def _costs(results: Path, job: ReportJob) -> list[dict[str, Any]]:
-    """The costs of the configured scenes so far."""
-    stages = [name for stages in job.expected.values() for name in stages]
-    methods = dict.fromkeys(name.partition("/")[0] for name in stages if "/" in name)
-    totals = {total["scene"]: total for total in scene_totals(read_costs(results)[0], list(methods))}
-    return [totals[scene] for scene in job.expected if scene in totals]
 
 
 def console_table(report: dict[str, Any]) -> str:

@@ -175,16 +175,13 @@ def _gaps_closed(rows: list[dict[str, Any]], reference: str | None, random_seed:
     found = []
     for method, own in methods.items():
         both = [(given[scene], row) for scene, row in own.items() if scene in given]
-        closed = {group: gap_closed(_paired(both, group), random_seed) for group in HELD_OUT_GROUPS}
+        closed = {}
+        for group in HELD_OUT_GROUPS:
+            figures = ([row[f"{group}_{name}"] for row in pair for name in REGIONS[:2]] for pair in both)
+            closed[group] = gap_closed([PairedPsnr(*known) for known in figures if None not in known], random_seed)
         if any(closed.values()):
             found.append({"method": method, **closed})
     return found
-
-
-def _paired(rows: list[tuple[dict[str, Any], dict[str, Any]]], group: str) -> list[PairedPsnr]:
-    """The figures of a reference's and a method's rows of the same scenes, of scenes that have all of them."""
-    figures = ([row[f"{group}_{name}"] for row in pair for name in REGIONS[:2]] for pair in rows)
-    return [PairedPsnr(*found) for found in figures if None not in found]
 
 
 def _by_method(rows: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -231,23 +228,20 @@ def summary_sentences(report: dict[str, Any]) -> list[str]:
             scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
             name = mean["method"] + NOTES[mean["tracks"]]
             line = (
-                f"{name}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
-                f"{_decibels(gap, '{:.1f}')} to static pixels, {scenes}"
+                f"{name}, {GROUP_PLACES[group]}: moving vehicles {_with_interval(moving, '{:.1f}')} dB, a gap "
+                f"of {_with_interval(gap, '{:.1f}')} dB to static pixels, {scenes}"
             )
             part = closed.get(mean["method"], {}).get(group)
-            lines.append(line + (_compared(part, report["reference"]) if part else ""))
+            if part:
+                percent = {name: part[name] and 100.0 * part[name] for name in ("low", "high")}
+                share = _with_interval({"mean": 100.0 * part["fraction"], **percent}, "{:z.0f}")
+                line += (
+                    f"; against {report['reference']}: moving vehicles "
+                    f"{_with_interval(part['moving_change'], '{:+z.1f}')} dB, {share} % of its gap closed; static "
+                    f"pixels {_with_interval(part['static_change'], '{:+z.1f}')} dB"
+                )
+            lines.append(line)
     return lines
-
-
-def _compared(part: dict[str, Any], reference: str) -> str:
-    percent = {name: part[name] and 100.0 * part[name] for name in ("low", "high")}
-    share = _with_interval({"mean": 100.0 * part["fraction"], **percent}, "{:z.0f}")
-    moving, static = (_decibels(part[name], "{:+z.1f}") for name in ("moving_change", "static_change"))
-    return f"; against {reference}: moving vehicles {moving}, {share} % of its gap closed; static pixels {static}"
-
-
-def _decibels(found: dict[str, Any], form: str) -> str:
-    return f"{_with_interval(found, form)} dB"
 
 
 def _with_interval(found: dict[str, Any], form: str) -> str:

@@ -2,12 +2,12 @@
 
 import io
 from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drivesplat.evaluation.comparison import GROUP_PLACES
@@ -69,6 +69,13 @@ def report_page(
         scenes.setdefault(row["scene"], []).append(row)
     names = NAMES if shows_other_tracks(report) else NAMES[:-1]
     configured = len(scenes) + len(report["left_out"]) + len(report["missing"])
+    # the tables of published figures by publication, whose rows have those measured on the same scenes
+    published, place = report["published"], itemgetter("scene", "scenes", "group", "region")
+    tables: dict[str, dict[str, Any]] = {}
+    for before, row in zip([None, *published], published, strict=False):
+        table = tables.setdefault(row["source"], {"source": row["source"], "url": row["url"], "rows": []})
+        first = not row["measured"] and before is not None and place(before) != place(row)
+        table["rows"].append({**row, "scene_label": scene_label(row), "pixels": pixels_label(row), "first": first})
     return filled_page(
         page,
         report=report,
@@ -85,7 +92,7 @@ def report_page(
         ],
         aside=aside_table(report["aside"]),
         lidar=page_table(report["lidar"]),
-        publications=_publications(report["published"]),
+        publications=list(tables.values()),
         published_columns=PUBLISHED_FIGURES,
         scenes=scenes,
         links_of=lambda scene: media.get((scene, ""), MethodMedia()).links,
@@ -109,27 +116,15 @@ def _table(
     return {"title": title, "groups": groups, "names": len(names), "columns": [*names, *figures, *of_methods]}
 
 
-def _publications(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The tables of published figures: per publication its name and address, and its rows with those measured on the
-    same scenes; `first` marks the first row of a comparison."""
-    tables: dict[str, dict[str, Any]] = {}
-    for before, row in zip([None, *rows], rows, strict=False):
-        table = tables.setdefault(row["source"], {"source": row["source"], "url": row["url"], "rows": []})
-        first = not row["measured"] and before is not None and _comparison(before) != _comparison(row)
-        shown = {**row, "scene_label": scene_label(row), "pixels": pixels_label(row), "first": first}
-        table["rows"].append(shown)
-    return list(tables.values())
-
-
-def _comparison(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in ("scene", "scenes", "group", "region"))
-
-
 def _looks(row: dict[str, Any], media: MethodMedia) -> dict[str, Any]:
     """The images of a method on a scene, embedded: pairs to compare, each starting where they differ, the ghost panel,
     and LiDAR scans; and its links."""
+    shown, where = row["shown"], "an image"
+    if shown is not None:
+        of_group = "a training image" if shown["group"] == "train" else f"held out {GROUP_PLACES[shown['group']]}"
+        where = f"key frame {shown['key_frame']}, {of_group}"
     pairs = (
-        ("recorded", "rendered", "recorded", row["method"], _where(row["shown"])),
+        ("recorded", "rendered", "recorded", row["method"], where),
         ("with_car", "without_car", "with vehicle", "without vehicle", "with and without a vehicle"),
     )
     comparisons = []
@@ -145,14 +140,6 @@ def _looks(row: dict[str, Any], media: MethodMedia) -> dict[str, Any]:
     return {"comparisons": comparisons, "panel": panel, "lidar": lidar, "links": media.links}
 
 
-def _where(shown: dict[str, Any] | None) -> str:
-    if shown is None:
-        return "an image"
-    if shown["group"] == "train":
-        return f"key frame {shown['key_frame']}, a training image"
-    return f"key frame {shown['key_frame']}, held out {GROUP_PLACES[shown['group']]}"
-
-
 def gap_plot(report: dict[str, Any]) -> str:
     """The gap in dB as an SVG: for each group of held-out frames with moving vehicles a dot per scene and method, and
     the mean with its interval. Empty without a gap."""
@@ -162,32 +149,28 @@ def gap_plot(report: dict[str, Any]) -> str:
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(4.4 * len(drawn), 3.4), layout="constrained")
         axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
+        methods = [mean["method"] for mean in report["means"]]
         for panel, group in zip(axes, drawn, strict=True):
-            _draw_gaps(panel, report, group)
+            for at, mean in enumerate(report["means"]):
+                color = PLOT_COLORS[at % len(PLOT_COLORS)]
+                gaps = [moving_gap(row, group) for row in report["rows"] if row["method"] == mean["method"]]
+                known = sorted(gap for gap in gaps if gap is not None)
+                offsets = 0.28 * np.linspace(-1.0, 1.0, len(known)) if len(known) > 1 else np.zeros(len(known))
+                panel.plot(at + offsets, known, "o", color=color, alpha=0.45, markersize=5)
+                found = mean["figures"][f"{group}_gap_db"]
+                if found:
+                    panel.plot([at - 0.36, at + 0.36], [found["mean"]] * 2, color=color, linewidth=2.5)
+                    if found["low"] is not None:
+                        panel.plot([at, at], [found["low"], found["high"]], color=color, linewidth=2.5)
+            panel.axhline(0.0, color="#888888", linewidth=0.8)
+            panel.set_xticks(range(len(methods)), methods)
+            panel.set_xlim(-0.6, len(methods) - 0.4)
+            panel.set_title(GROUP_PLACES[group], fontsize=11)
+            panel.grid(axis="y", color="#dddddd", linewidth=0.6)
+            panel.set_axisbelow(True)
+            panel.spines[["top", "right"]].set_visible(False)
         axes[0].set_ylabel("gap: static minus moving vehicles, dB")
         drawing = io.StringIO()
         figure.savefig(drawing, format="svg", metadata={"Date": None, "Creator": None})
     text = drawing.getvalue()
     return text[text.index("<svg") :]
-
-
-def _draw_gaps(axes: Axes, report: dict[str, Any], group: str) -> None:
-    methods = [mean["method"] for mean in report["means"]]
-    for at, mean in enumerate(report["means"]):
-        color = PLOT_COLORS[at % len(PLOT_COLORS)]
-        gaps = [moving_gap(row, group) for row in report["rows"] if row["method"] == mean["method"]]
-        known = sorted(gap for gap in gaps if gap is not None)
-        offsets = 0.28 * np.linspace(-1.0, 1.0, len(known)) if len(known) > 1 else np.zeros(len(known))
-        axes.plot(at + offsets, known, "o", color=color, alpha=0.45, markersize=5)
-        found = mean["figures"][f"{group}_gap_db"]
-        if found:
-            axes.plot([at - 0.36, at + 0.36], [found["mean"]] * 2, color=color, linewidth=2.5)
-            if found["low"] is not None:
-                axes.plot([at, at], [found["low"], found["high"]], color=color, linewidth=2.5)
-    axes.axhline(0.0, color="#888888", linewidth=0.8)
-    axes.set_xticks(range(len(methods)), methods)
-    axes.set_xlim(-0.6, len(methods) - 0.4)
-    axes.set_title(GROUP_PLACES[group], fontsize=11)
-    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)

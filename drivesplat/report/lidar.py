@@ -70,22 +70,19 @@ def lidar_report(rows: Sequence[dict[str, Any]], random_seed: int) -> dict[str, 
     methods: dict[str, list[dict[str, Any]]] = {}
     for row in sorted(rows, key=lambda row: row["baseline"]):
         methods.setdefault(row["method"], []).append(row)
+    counts = tuple(f"_{name}" for name in COUNTS)
     means = [
         {
             "method": method,
             "baseline": own[0]["baseline"],
-            "figures": {column: _pooled(column, own, random_seed) for column in LIDAR_COLUMNS},
+            "figures": {
+                column: sum(values) if column.endswith(counts) else mean_over_scenes(values, random_seed)
+                for column, values in ((column, [row[column] for row in own]) for column in LIDAR_COLUMNS)
+            },
         }
         for method, own in methods.items()
     ]
     return {"rows": list(rows), "means": means}
-
-
-def _pooled(column: str, rows: Sequence[dict[str, Any]], random_seed: int) -> Any:
-    values = [row[column] for row in rows]
-    if column.endswith(tuple(f"_{name}" for name in COUNTS)):
-        return sum(values)
-    return mean_over_scenes(values, random_seed)
 
 
 def page_table(lidar: dict[str, Any]) -> dict[str, Any]:
@@ -103,12 +100,23 @@ def page_table(lidar: dict[str, Any]) -> dict[str, Any]:
         rows += [_shown({**row, "row": row}, region, columns) for region in SCAN_REGIONS for row in own]
     for region in SCAN_REGIONS if len({row["scene"] for row in lidar["rows"]}) > 1 else ():
         means += [_shown({**mean, "row": mean["figures"]}, region, columns) for mean in lidar["means"]]
+    # the reasons of null figures; each names the rows that it holds for unless these are all
+    found: dict[tuple[str, str, str, str], list[str]] = {}
+    for row in lidar["rows"]:
+        for group, regions in row["reasons"].items():
+            for region, why in regions.items():
+                found.setdefault((row["scene"], region, group, why), []).append(row["method"])
+    counts = Counter(row["scene"] for row in lidar["rows"])
     return {
         "groups": [(place, len(TABLE_FIGURES)) for place in GROUP_PLACES.values()],
         "columns": columns,
         "rows": rows,
         "means": means,
-        "reasons": _reasons(lidar["rows"]),
+        "reasons": [
+            f"{scene}, {REGION_NAMES[region]}, {GROUP_PLACES[group]}"
+            f"{'' if len(methods) == counts[scene] else ' (' + ', '.join(methods) + ')'}: {why}"
+            for (scene, region, group, why), methods in found.items()
+        ],
     }
 
 
@@ -133,18 +141,3 @@ def _in_units(value: Any, scale: int | float) -> Any:
         scaled = {name: _in_units(value[name], scale) for name in ("mean", "low", "high")}
         return {**value, **scaled}
     return None if value is None else value * scale
-
-
-def _reasons(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """A sentence for each reason of null figures; it names the rows that it holds for unless these are all."""
-    found: dict[tuple[str, str, str, str], list[str]] = {}
-    for row in rows:
-        for group, regions in row["reasons"].items():
-            for region, why in regions.items():
-                found.setdefault((row["scene"], region, group, why), []).append(row["method"])
-    counts = Counter(row["scene"] for row in rows)
-    return [
-        f"{scene}, {REGION_NAMES[region]}, {GROUP_PLACES[group]}"
-        f"{'' if len(methods) == counts[scene] else ' (' + ', '.join(methods) + ')'}: {why}"
-        for (scene, region, group, why), methods in found.items()
-    ]

@@ -39,9 +39,17 @@ def beside_published(published: Sequence[PublishedFigures], scenes: Mapping[str,
     published ones first, then those measured on `scenes`. `measured` tells them apart; `scenes` is the number of scenes
     of a mean. A measured mean has figures only if it is over as many scenes as the published one."""
     rows = []
-    for (source, scene, count, group, region), items in _by_comparison(published).items():
+    sources: dict[str, dict[tuple[Any, ...], list[PublishedFigures]]] = {}
+    for item in published:
+        key = (item.source, item.scene, item.scenes, item.group, item.region)
+        sources.setdefault(item.source, {}).setdefault(key, []).append(item)
+    # by what is compared with them, those of a publication one after another
+    comparisons = (comparison for of_source in sources.values() for comparison in of_source.items())
+    for (source, scene, count, group, region), items in comparisons:
         place = {"source": source, "url": items[0].url, "scene": scene, "group": group, "region": region}
-        rows += [{**place, "method": item.method, "measured": False, "scenes": count, **_own(item)} for item in items]
+        for item in items:
+            own = item.model_dump(include={*FIGURES, "gpu"})
+            rows.append({**place, "method": item.method, "measured": False, "scenes": count, **own})
         if scene == MEAN:
             found = _means((group, region), scenes.values(), count)
         else:
@@ -51,19 +59,6 @@ def beside_published(published: Sequence[PublishedFigures], scenes: Mapping[str,
             ]
         rows += [{**place, "measured": True, **row} for row in found]
     return rows
-
-
-def _by_comparison(published: Iterable[PublishedFigures]) -> dict[tuple[Any, ...], list[PublishedFigures]]:
-    """The published figures by what is compared with them, those of a publication one after another."""
-    sources: dict[str, dict[tuple[Any, ...], list[PublishedFigures]]] = {}
-    for item in published:
-        key = (item.source, item.scene, item.scenes, item.group, item.region)
-        sources.setdefault(item.source, {}).setdefault(key, []).append(item)
-    return {key: items for of_source in sources.values() for key, items in of_source.items()}
-
-
-def _own(item: PublishedFigures) -> dict[str, Any]:
-    return item.model_dump(include={*FIGURES, "gpu"})
 
 
 def _means(place: Place, scenes: Iterable[Measured], count: int | None) -> list[dict[str, Any]]:
@@ -76,13 +71,9 @@ def _means(place: Place, scenes: Iterable[Measured], count: int | None) -> list[
     rows = []
     for method, of_scenes in methods.items():
         comparable = count is None or count == len(of_scenes)
-        figures = {name: _mean(of_scenes, name) if comparable else None for name in FIGURES}
+        values = {name: [own[name] for own in of_scenes] for name in FIGURES}
+        figures = {name: mean(own) if comparable and None not in own else None for name, own in values.items()}
         gpus = {own["gpu"] for own in of_scenes}
         gpu = gpus.pop() if len(gpus) == 1 else None
         rows.append({"method": method, "scenes": len(of_scenes), **figures, "gpu": gpu})
     return rows
-
-
-def _mean(of_scenes: Iterable[Mapping[str, Any]], name: str) -> float | None:
-    values = [own[name] for own in of_scenes]
-    return None if None in values else mean(values)

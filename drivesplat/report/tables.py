@@ -45,19 +45,17 @@ def write_figures(path: str | Path, report: dict[str, Any]) -> None:
         shown, of_baselines = [*names, *LIDAR_COLUMNS], scans["baseline"].astype(bool)
         table = pd.concat([table.merge(scans.loc[~of_baselines, shown], how="left"), scans.loc[of_baselines, shown]])
     if report["published"]:
-        shown = [row for row in report["published"] if row["region"] == "all"]
-        added = [_csv_row(row) for row in shown if not row["measured"] or row["scene"] == MEAN]
+        added = []
+        for row in report["published"]:
+            if row["region"] == "all" and (not row["measured"] or row["scene"] == MEAN):
+                figures = {"psnr_frame_mean": row["psnr"], "ssim": row["ssim"], "lpips": row["lpips"]}
+                seconds = None if row["train_minutes"] is None else round(60.0 * row["train_minutes"], 1)
+                line = {"scene": row["scene"], "method": row["method"], "train_seconds": seconds}
+                line |= {f"{row['group']}_{name}": value for name, value in figures.items()}
+                added.append(line | ({} if row["measured"] else {"source": row["source"], "url": row["url"]}))
         table = pd.concat([table, pd.DataFrame(added, columns=[*COLUMNS, "source", "url"], dtype=object)])
     with atomic_write(path) as file:
         file.write(table.to_csv(index=False).encode())
-
-
-def _csv_row(row: dict[str, Any]) -> dict[str, Any]:
-    figures = {"psnr_frame_mean": row["psnr"], "ssim": row["ssim"], "lpips": row["lpips"]}
-    seconds = None if row["train_minutes"] is None else round(60.0 * row["train_minutes"], 1)
-    origin = {} if row["measured"] else {"source": row["source"], "url": row["url"]}
-    of_group = {f"{row['group']}_{name}": value for name, value in figures.items()}
-    return {"scene": row["scene"], "method": row["method"], "train_seconds": seconds, **of_group, **origin}
 
 
 def gap_table(report: dict[str, Any]) -> str:

@@ -161,7 +161,11 @@ class Config(Settings):
             if scene not in owners:
                 raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")
         if self.cameras and self.eval_camera not in self.cameras:
-            raise ValueError(self._no_eval_camera())
+            message = f"eval_camera {self.eval_camera or 'null'} is not among cameras ({', '.join(self.cameras)})"
+            known = get_args(CameraChannel)
+            misspelled = (suggestion(camera, known) for camera in self.cameras if camera not in known)
+            meant = next(filter(None, misspelled), "")
+            raise ValueError(f"{message}: {meant}nuScenes has {', '.join(known)}" if meant else message)
         if not self.cameras and self.eval_camera not in (None, type(self).model_fields["eval_camera"].default):
             raise ValueError(
                 f"eval_camera {self.eval_camera} is set, but cameras is empty: nothing is measured on images; write "
@@ -175,16 +179,6 @@ class Config(Settings):
         if self.scans.sweeps and not self.lidar_seed.sweeps:
             raise ValueError("scans.sweeps needs lidar_seed.sweeps: true, which reads LiDAR between key frames")
         return self
-
-    def _no_eval_camera(self) -> str:
-        """The message where `eval_camera` is not among `cameras`: perhaps since one of these is misspelled."""
-        chosen = self.eval_camera or "null"
-        message = f"eval_camera {chosen} is not among cameras ({', '.join(self.cameras)})"
-        known = get_args(CameraChannel)
-        for camera in self.cameras:
-            if camera not in known and suggestion(camera, known):
-                return f"{message}: {suggestion(camera, known)}nuScenes has {', '.join(known)}"
-        return message
 
     @model_validator(mode="after")
     def _variants_have_names_of_their_own(self) -> "Config":

@@ -66,7 +66,12 @@ def _mapping(record: BaseModel, indent: int, commented: set[tuple[type, str]]) -
     comments in the lines so far."""
     lines, pad = [], " " * indent
     for name, field in _printed_fields(record, commented):
-        key, comment = (type(record), name), _comment(field, pad)
+        about, limits = described(field.description), bounds(field.metadata)
+        if limits and about:
+            about += f" [{limits.replace(' ', NO_BREAK)}]"
+        wrapped = textwrap.wrap(about, WIDTH - len(pad)) if about else []
+        comment = "".join(f"{pad}# {line}\n" for line in wrapped).replace(NO_BREAK, " ")
+        key = type(record), name
         text = _value(name, getattr(record, name), indent, commented)
         if text or is_printed(field):
             text = text or " {}\n"
@@ -115,27 +120,14 @@ def _record(name: str, record: BaseModel, indent: int, commented: set[tuple[type
     return f"\n{below}" if below else ""
 
 
-def _comment(field: FieldInfo, pad: str) -> str:
-    text, limits = described(field.description), bounds(field.metadata)
-    if limits and text:
-        text += f" [{limits.replace(' ', NO_BREAK)}]"
-    lines = textwrap.wrap(text, WIDTH - len(pad)) if text else []
-    return "".join(f"{pad}# {line}\n" for line in lines).replace(NO_BREAK, " ")
-
-
-def _only_lacks(present: Sequence[str], generated: Sequence[str]) -> bool:
-    """Whether `present` has all its lines in `generated`, in order: nothing of it is lost when new settings come in."""
-    rest = iter(generated)
-    return all(line in rest for line in present)
-
-
 def main(arguments: Sequence[str], folder: Path = ROOT) -> int:
     """Writes the files into `folder`; returns the exit status, 1 where config.yaml has lines of its own and stays."""
     parser = argparse.ArgumentParser("python -m drivesplat.settings.config_document", description=__doc__)
     parser.add_argument("--force", action="store_true", help="overwrite config.yaml even if it differs")
     force, path, text = parser.parse_args(arguments).force, folder / "config.yaml", config_yaml()
     present = path.read_text(encoding="utf-8") if path.exists() else text
-    if present != text and not force and not _only_lacks(present.splitlines(), text.splitlines()):
+    rest = iter(text.splitlines())  # a file that only lacks lines loses nothing when new settings come in
+    if present != text and not force and not all(line in rest for line in present.splitlines()):
         lines = (value.splitlines(keepends=True) for value in (present, text))
         sys.stdout.writelines(difflib.unified_diff(*lines, "config.yaml", "config.yaml as generated"))
         print(

@@ -65,22 +65,14 @@ class DatasetSettings(Settings):
         return value
 
     @model_validator(mode="after")
-    def _a_world_has_one_scene(self) -> "DatasetSettings":
+    def _scenes_fit_together(self) -> "DatasetSettings":
         if self.world and len(self.scenes) != 1:
             raise ValueError(f"a dataset with a world has one scene, this one has {len(self.scenes)}")
-        return self
-
-    @model_validator(mode="after")
-    def _frames_are_ranges(self) -> "DatasetSettings":
         for scene, (first, last) in self.frames.items():
             if scene not in self.scenes:
                 raise ValueError(f"frames names scene {scene!r}, which is not in scenes")
             if not 0 <= first < last:
                 raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
-        return self
-
-    @model_validator(mode="after")
-    def _edits_are_of_its_scenes(self) -> "DatasetSettings":
         for scene in self.edits:
             if scene not in self.scenes:
                 raise ValueError(f"edits names scene {scene!r}, which is not in scenes")

@@ -6,13 +6,7 @@ Units: metres, degrees, m/s. Times are seconds since the scene's first image, wh
 from collections.abc import Callable
 from typing import Annotated, Any, ClassVar
 
-from pydantic import (
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    model_serializer,
-    model_validator,
-)
+from pydantic import BeforeValidator, ConfigDict, Field, model_serializer, model_validator
 
 from drivesplat.settings import Settings
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.settings.renamed import current_names, note_of_old_names, settings_trees, subtree
+from drivesplat.settings.renamed import RENAMED, current_names, settings_trees, subtree
 
 REMOVED = {
     "free_space": "fading Gaussians in space that LiDAR rays prove empty improved no measurement",
@@ -60,31 +60,23 @@ def in_this_version(
     current, old_paths = current_names(values, defaults)
     dropped = []
     for where, tree in settings_trees(current):
-        dropped += [where + key for key in without_former_defaults(tree)]
+        for key, default in FORMER_DEFAULTS.items():
+            section, _, name = key.rpartition(".")
+            node = subtree(tree, section)
+            if node is None or name not in node:
+                continue
+            value, of_section = node[name], isinstance(node[name], dict) and isinstance(default, dict)
+            if value == default or (of_section and value.items() <= default.items()):
+                del node[name]
+                dropped.append(where + key)
         refuse_removed(tree, where)
-    notes = [note_of_old_names(old_paths)] if old_paths else []
+    notes = []
+    if old_paths:
+        now = ", ".join(f"{old} (now {next(n for o, n in RENAMED.items() if old.endswith(o))})" for old in old_paths)
+        notes.append(f"old names of settings, which the next version will refuse: {now}")
     if dropped:
         notes.append(f"removed settings, which the next version will refuse: {', '.join(dropped)}")
     return current, notes
-
-
-def without_former_defaults(tree: dict[Any, Any]) -> list[str]:
-    """Drops from a tree of settings what was removed and is at its former default; returns the keys."""
-    dropped = []
-    for key, default in FORMER_DEFAULTS.items():
-        section, _, name = key.rpartition(".")
-        node = subtree(tree, section)
-        if node is not None and name in node and _says_nothing(node[name], default):
-            del node[name]
-            dropped.append(key)
-    return dropped
-
-
-def _says_nothing(value: Any, default: Any) -> bool:
-    """Whether a setting, or each one of a section, is at its default."""
-    if isinstance(value, dict) and isinstance(default, dict):
-        return all(key in default and given == default[key] for key, given in value.items())
-    return value == default
 
 
 def refuse_removed(values: Mapping[str, Any], where: str = "") -> None:

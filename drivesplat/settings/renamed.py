@@ -51,13 +51,6 @@ def current_names(
     return current, old_paths
 
 
-def note_of_old_names(old_paths: list[str]) -> str:
-    """The sentence that tells a user of the old names in a config."""
-    return "old names of settings, which the next version will refuse: " + ", ".join(
-        f"{path} (now {next(new for old, new in RENAMED.items() if path.endswith(old))})" for path in old_paths
-    )
-
-
 def settings_trees(values: dict[Any, Any]) -> Iterator[tuple[str, dict[Any, Any]]]:
     """The trees of settings in a config, each with the path before its keys: the config itself, and the overrides of
     datasets, methods and variants of the ablation."""

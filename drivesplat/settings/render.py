@@ -25,10 +25,6 @@ class TrajectorySettings(Settings):
     without them). Methods without moving parts have only films of 'all'."""
 
 
-def _default_trajectories() -> dict[str, TrajectorySettings]:
-    return {"original": TrajectorySettings(), "lateral_2m": TrajectorySettings(lateral=2.0)}
-
-
 class RenderSettings(Settings):
     """Films along trajectories, at the recorded speed."""
 
@@ -54,7 +50,9 @@ class RenderSettings(Settings):
     always be asked for by its name."""
     edited_frames: bool = False
     """:printed: Also write the frames of edited drives as PNG, at full size, with labels in the JSON file."""
-    trajectories: dict[str, TrajectorySettings] = Field(default_factory=_default_trajectories)
+    trajectories: dict[str, TrajectorySettings] = Field(
+        default_factory=lambda: {"original": TrajectorySettings(), "lateral_2m": TrajectorySettings(lateral=2.0)}
+    )
     """:printed: Films to render, each under a name of your choice."""
 
 

@@ -104,16 +104,13 @@ def _row(name: str, field: FieldInfo, purpose: str, section: str) -> str:
     key = f"**`{name}`**" if is_printed(field) else f"`{name}`"
     values, default = _values(field.annotation, field.metadata), field.get_default(call_default_factory=True)
     if section:
-        values = values.replace("mapping", f"[mapping]({_anchor(section)})")
+        # the link to a section as GitHub makes it of the heading: without dots and other signs
+        anchor = "#" + re.sub(r"[^\w-]", "", section.lower())
+        values = values.replace("mapping", f"[mapping]({anchor})")
     named = _record_in(field.annotation)[0] is None or default is None or isinstance(default, str)
     default = f"`{in_one_line(default)}`" if named and default is not PydanticUndefined else ""
     cells = (key, values, default, _linked(purpose))
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
-
-
-def _anchor(where: str) -> str:
-    """The link to a section as GitHub makes it of the heading: without dots and other signs."""
-    return "#" + re.sub(r"[^\w-]", "", where.lower())
 
 
 def _record_in(annotation: Any) -> tuple[type[BaseModel] | None, str]:
@@ -134,7 +131,8 @@ def _values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     """The values that a type takes, such as 'integer ≥ 1 or null'."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        return _values(arguments[0], _flat(arguments[1:]))
+        limits = (item.metadata if isinstance(item, FieldInfo) else [item] for item in arguments[1:])
+        return _values(arguments[0], [limit for group in limits for limit in group])
     if origin is Literal:
         return ", ".join(f"`{in_one_line(value)}`" for value in arguments)
     if origin in (Union, UnionType):
@@ -149,11 +147,6 @@ def _values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "mapping"
     return " ".join(part for part in (KINDS[annotation], bounds(metadata)) if part)
-
-
-def _flat(metadata: Iterable[Any]) -> list[Any]:
-    """The limits in the metadata of an annotated type."""
-    return [limit for item in metadata for limit in (item.metadata if isinstance(item, FieldInfo) else [item])]
 
 
 def _linked(text: str) -> str:

@@ -13,8 +13,3 @@ OTHER_TRACKS = tuple(folder for folder in TRACK_FOLDERS.values() if folder)
 """The folders of tracks that replace the annotated ones."""
 FOUND = "found_"
 """Start of the ids of discovered tracks."""
-
-
-def tracks_in(folder: str) -> Tracks:
-    """The tracks whose results lie in `folder`, which may end with a slash."""
-    return next(tracks for tracks, name in TRACK_FOLDERS.items() if name == folder.rstrip("/"))

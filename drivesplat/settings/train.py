@@ -206,13 +206,9 @@ class TrainSettings(Settings):
     0: none."""
 
     @model_validator(mode="after")
-    def _scans_need_mcmc(self) -> "TrainSettings":
+    def _terms_have_what_they_need(self) -> "TrainSettings":
         if self.scans.per_image and self.strategy != "mcmc":
             raise ValueError("scans.per_image needs strategy: mcmc, since densification by gradient knows images alone")
-        return self
-
-    @model_validator(mode="after")
-    def _below_road_needs_a_road(self) -> "TrainSettings":
         if self.floaters.below_road and not self.road_weight:
             raise ValueError("floaters.below_road needs road_weight above 0: without it the road is not known")
         return self

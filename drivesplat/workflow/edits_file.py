@@ -28,13 +28,17 @@ def read_edits(path: str | Path) -> dict[str, Edit]:
     edits = {} if content["edits"] is None else content["edits"]
     if not isinstance(edits, dict):
         raise ConfigError(f"{path}: 'edits' is {quoted(edits)}; it holds a list of steps per name")
-    return {_name(name, f"{path}: edit"): _edit(steps, f"{path}: edit {name!r}") for name, steps in edits.items()}
-
-
-def _edit(steps: Any, where: str) -> Edit:
-    if not isinstance(steps, list) or not steps:
-        raise ConfigError(f"{where} is {quoted(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}")
-    return Edit(steps=tuple(_step(step, f"{where}, step {number}") for number, step in enumerate(steps, start=1)))
+    found = {}
+    for name, steps in edits.items():
+        _require_name(name, f"{path}: edit")
+        where = f"{path}: edit {name!r}"
+        if not isinstance(steps, list) or not steps:
+            raise ConfigError(
+                f"{where} is {quoted(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}"
+            )
+        checked = (_step(step, f"{where}, step {number}") for number, step in enumerate(steps, start=1))
+        found[name] = Edit(steps=tuple(checked))
+    return found
 
 
 def _step(step: Any, where: str) -> Step:
@@ -46,7 +50,8 @@ def _step(step: Any, where: str) -> Step:
         raise ConfigError(f"{where}: there is no step {kind!r}; there are: {kinds}")
     where = f"{where} ({kind})"
     if not isinstance(fields, dict):
-        raise ConfigError(f"{where} is {quoted(fields)}; it is a mapping: {kind}: {{{_example(kind)}}}")
+        example = "lateral: 2.0" if kind == "ego" else "track: 6e5c, ..."
+        raise ConfigError(f"{where} is {quoted(fields)}; it is a mapping: {kind}: {{{example}}}")
     for key in fields:
         if not isinstance(key, str):
             raise ConfigError(f"{where}: {key!r} stands where a key should; a decimal has a point: 3.5, not 3,5")
@@ -55,21 +60,16 @@ def _step(step: Any, where: str) -> Step:
     checked = Step(**{kind: validated(record, fields, f"{where}: ", keys=keys)})
     copy = checked.duplicate or checked.place
     if copy is not None:
-        name = _name(copy.name, f"{where}: 'as'")
-        if name in RESERVED:
-            raise ConfigError(f"{where}: 'as' {name!r} is a name kept for the camera's car; choose another")
+        _require_name(copy.name, f"{where}: 'as'")
+        if copy.name in RESERVED:
+            raise ConfigError(f"{where}: 'as' {copy.name!r} is a name kept for the camera's car; choose another")
     return checked
 
 
-def _name(name: Any, what: str) -> str:
+def _require_name(name: Any, what: str) -> None:
     if not isinstance(name, str):
         raise ConfigError(f"{what} {name!r} is not text: put the name in quotes")
     if not re.fullmatch(NAME, name):
         raise ConfigError(f"{what} {name!r} cannot name a file: use letters, digits, '_', '-' and '.'")
     if len(name) > MAX_LENGTH:
         raise ConfigError(f"{what} {quoted(name)} has {len(name)} characters; use at most {MAX_LENGTH}")
-    return name
-
-
-def _example(kind: str) -> str:
-    return "lateral: 2.0" if kind == "ego" else "track: 6e5c, ..."

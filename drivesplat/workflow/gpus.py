@@ -5,7 +5,6 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -40,7 +39,15 @@ def hold_gpu(jobs_per_card: int) -> BinaryIO | None:
     taken. Raises DeviceError where no lock file can be written.
     """
     variable, names = _visible()
-    gpus = dict(zip(names, _identities(names), strict=True))
+    # Names that do not depend on which are visible (a scheduler may show every job its GPU as number 0): UUIDs, or
+    # numbers if nvidia-smi is not available.
+    known: dict[str, str] = {}
+    if any(name.isdigit() for name in names):
+        command = ("nvidia-smi", "--query-gpu=index,uuid", "--format=csv,noheader")
+        with suppress(OSError, subprocess.SubprocessError):
+            lines = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.splitlines()
+            known = dict(line.replace(" ", "").split(",", 1) for line in lines if "," in line)
+    gpus = {name: known.get(name, name) for name in names}
     if not gpus or (len(gpus) == 1 and variable in os.environ and next(iter(gpus.values())).isdigit()):
         return None
     warned = False
@@ -66,7 +73,7 @@ def _free_gpu(gpus: dict[str, str], jobs_per_card: int) -> tuple[str, BinaryIO |
     holders = []
     for place in range(jobs_per_card):
         for gpu, identity in gpus.items():
-            path = _lock_folder() / f"{identity}.{place}"
+            path = Path(tempfile.gettempdir(), f"drivesplat-cards-{os.getuid()}", f"{identity}.{place}")
             try:
                 path.parent.mkdir(mode=0o700, exist_ok=True)
                 return gpu, locked_file(path), []
@@ -90,21 +97,3 @@ def _visible() -> tuple[str, list[str]]:
     amd = [p for p in Path("/sys/class/kfd/kfd/topology/nodes").glob("*/gpu_id") if p.read_text().strip() != "0"]
     variable = "HIP_VISIBLE_DEVICES" if amd and not nvidia else "CUDA_VISIBLE_DEVICES"
     return variable, [str(number) for number in range(len(nvidia) or len(amd))]
-
-
-def _identities(gpus: Sequence[str]) -> list[str]:
-    """Names of GPUs that do not depend on which are visible (a scheduler may show every job its GPU as number 0): their
-    UUIDs, or their numbers if nvidia-smi is not available."""
-    if all(not gpu.isdigit() for gpu in gpus):
-        return list(gpus)
-    command = ("nvidia-smi", "--query-gpu=index,uuid", "--format=csv,noheader")
-    known: dict[str, str] = {}
-    with suppress(OSError, subprocess.SubprocessError):
-        lines = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.splitlines()
-        known = dict(line.replace(" ", "").split(",", 1) for line in lines if "," in line)
-    return [known.get(gpu, gpu) for gpu in gpus]
-
-
-def _lock_folder() -> Path:
-    """The folder of this user's locks on this machine."""
-    return Path(tempfile.gettempdir()) / f"drivesplat-cards-{os.getuid()}"

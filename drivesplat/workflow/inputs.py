@@ -3,11 +3,9 @@
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any, get_args
 
 from drivesplat.errors import ConfigError, DriveSplatError
-from drivesplat.io.regular_file import regular_file
 from drivesplat.provenance.file_digests import record_output
 from drivesplat.readers.datasets import index, layout
 from drivesplat.readers.truth import TRUTH_FILE
@@ -15,7 +13,7 @@ from drivesplat.scene.scene import REFINED
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.names import suggestion
-from drivesplat.settings.tracks import OTHER_TRACKS, TRACK_FOLDERS, Tracks, tracks_in
+from drivesplat.settings.tracks import OTHER_TRACKS, TRACK_FOLDERS, Tracks
 from drivesplat.settings.world import CameraChannel
 from drivesplat.workflow.stages import SCAN_BASELINES, SCANS, refines_poses, training_inputs
 from drivesplat.workflow.without_cameras import has_cameras
@@ -36,7 +34,7 @@ class Inputs:
         self.config = config
         self._prefix = prefix
         self._roots: dict[str, str] = {}
-        self._folders: dict[str, Path] = {}
+        self._indexed: set[str] = set()
 
     def tables(self, wildcards: Any) -> list[str]:
         """The tables that scene.json is made from; none where `scene_tables` gives the rows that it needs."""
@@ -51,11 +49,22 @@ class Inputs:
 
     def scene_tables(self, wildcards: Any) -> list[str]:
         """The file of a scene's own rows of a recorded dataset's tables, where its reader splits them into scenes.
-        Planning keeps it up to date, so that touched tables rerun nothing."""
+        Planning keeps it up to date, once, so that touched tables rerun nothing."""
         name = self.config.dataset_of(wildcards.scene)
         dataset = self.config.datasets[name]
         tables = None if dataset.world else index(dataset.reader)
-        return [str(tables.scene_file(self._scene_tables(name, tables), wildcards.scene))] if tables else []
+        if tables is None:
+            return []
+        folder = Path(self.config.results_dir) / ".tables" / name
+        if name not in self._indexed:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise unwritable_results(self.config, error) from error
+            for file in tables.index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder):
+                record_output(file, "extract", {}, {})
+            self._indexed.add(name)
+        return [str(tables.scene_file(folder, wildcards.scene))]
 
     def root(self, wildcards: Any) -> str:
         """The root of a scene's dataset as results name it: that of a recorded one is a link in the results folder,
@@ -83,19 +92,6 @@ class Inputs:
             found = dataset.world_root if dataset.world else find_root(dataset.dataroot, dataset.version)
             self._roots[name] = str(found)
         return self._roots[name]
-
-    def _scene_tables(self, name: str, tables: ModuleType) -> Path:
-        """The folder with the rows of each scene of a recorded dataset, brought up to date once."""
-        if name not in self._folders:
-            dataset, folder = self.config.datasets[name], Path(self.config.results_dir) / ".tables" / name
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise unwritable_results(self.config, error) from error
-            for file in tables.index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder):
-                record_output(file, "extract", {}, {})
-            self._folders[name] = folder
-        return self._folders[name]
 
     def refuse_unknown_cameras(self, name: str, cameras: Sequence[str]) -> None:
         """Raises ConfigError, with the cameras that a dataset has, if `cameras` names another one."""
@@ -143,36 +139,32 @@ class Inputs:
         name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
 
-    def scene(self, wildcards: Any) -> str:
+    def scene(self, wildcards: Any, shown: bool = False) -> str:
         """The scene record with the tracks of a job."""
-        return self._scene(wildcards, self.tracks(wildcards))
+        tracks = self.tracks(wildcards, shown)
+        return self.annotated_scene(wildcards) if tracks == "annotated" else self._of(tracks, wildcards, "scene.json")
 
     def shown_scene(self, wildcards: Any) -> str:
         """The scene record with the tracks that pictures of a method show."""
-        return self._scene(wildcards, self._shown_tracks(wildcards))
+        return self.scene(wildcards, shown=True)
 
     def shown_masks(self, wildcards: Any) -> str:
         """The masks of these tracks."""
-        return self._of(self._shown_tracks(wildcards), wildcards, "masks/masks.json")
-
-    def _scene(self, wildcards: Any, tracks: Tracks) -> str:
-        return self.annotated_scene(wildcards) if tracks == "annotated" else self._of(tracks, wildcards, "scene.json")
+        return self._of(self.tracks(wildcards, shown=True), wildcards, "masks/masks.json")
 
     @property
     def other_tracks(self) -> list[str]:
         """The values of the wildcard `tracks` but that of annotated tracks, which is empty."""
         return [f"{folder}/" for folder in OTHER_TRACKS]
 
-    def tracks(self, wildcards: Any) -> Tracks:
-        """The tracks of a job: those of its results' folder, or those that its method trains with."""
+    def tracks(self, wildcards: Any, shown: bool = False) -> Tracks:
+        """The tracks of a job: those of its results' folder, or those that its method trains with. Those that pictures
+        show (`shown`) of a method without tracks are the annotated ones."""
         if hasattr(wildcards, "tracks"):
-            return tracks_in(wildcards.tracks)
-        return self.config.all_methods[wildcards.method].tracks if hasattr(wildcards, "method") else "annotated"
-
-    def _shown_tracks(self, wildcards: Any) -> Tracks:
-        """The tracks that pictures of a method show: its own; the annotated ones of a method without tracks."""
-        own = self.tracks(wildcards)
-        return "annotated" if own == "none" else own
+            own = next(tracks for tracks, name in TRACK_FOLDERS.items() if name == wildcards.tracks.rstrip("/"))
+        else:
+            own = self.config.all_methods[wildcards.method].tracks if hasattr(wildcards, "method") else "annotated"
+        return "annotated" if shown and own == "none" else own
 
     def _of(self, tracks: Tracks, wildcards: Any, name: str) -> str:
         """A result of a scene that depends on tracks."""
@@ -181,15 +173,6 @@ class Inputs:
     def of_tracks(self, name: str) -> Callable[[Any], str]:
         """The function of wildcards that gives the result `name` for the tracks of a job."""
         return lambda wildcards: self._of(self.tracks(wildcards), wildcards, name)
-
-    def images_of_tracks(self, name: str) -> Callable[[Any], list[str]]:
-        """As `of_tracks`, of a result that is made from images: none without cameras."""
-
-        def result(wildcards: Any) -> list[str]:
-            there = has_cameras(self.config, wildcards.scene)
-            return [self._of(self.tracks(wildcards), wildcards, name)] if there else []
-
-        return result
 
     def first_parser(self, wildcards: Any) -> str:
         """The training record of the first method: cameras and splits are the same for all tracks."""
@@ -213,24 +196,14 @@ class Inputs:
         path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
         return [str(Path(path).expanduser())] if path else []
 
-    def refuse_special_points_file(self, scene: str) -> None:
-        """Raises ConfigError if the user's seed points are a folder, a circle of links, or a pipe that a job would wait
-        for. Snakemake names them where they are absent."""
-        for path in self.points_file(SimpleNamespace(scene=scene)):
-            try:
-                regular_file(path)
-            except FileNotFoundError:
-                pass
-            except OSError as error:
-                raise ConfigError(f"lidar_seed.points_file {path}: {error}; name a PLY file of points") from None
-
-    def of_images(self, name: str) -> Callable[[Any], list[str]]:
-        """The function of wildcards that gives a scene's result `name`, which is made from images and depends on no
-        tracks: none without cameras."""
+    def of_images(self, name: str, of_tracks: bool = False) -> Callable[[Any], list[str]]:
+        """The function of wildcards that gives a scene's result `name`, which is made from images: none without
+        cameras. With `of_tracks` it depends on the tracks of a job."""
 
         def result(wildcards: Any) -> list[str]:
-            there = has_cameras(self.config, wildcards.scene)
-            return [f"{self.config.results_dir}/{wildcards.scene}/{name}"] if there else []
+            if not has_cameras(self.config, wildcards.scene):
+                return []
+            return [self._of(self.tracks(wildcards) if of_tracks else "annotated", wildcards, name)]
 
         return result
 

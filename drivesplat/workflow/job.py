@@ -15,13 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.storage import Provenance, unwritable
 from drivesplat.io.this_copy import in_this_copy
-from drivesplat.provenance.file_digests import (
-    check_dataset,
-    checked_digest,
-    file_digests,
-    member_states,
-    record_output,
-)
+from drivesplat.provenance.file_digests import check_dataset, checked_digest, file_digests, member_states, record_output
 from drivesplat.provenance.record import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
@@ -29,7 +23,7 @@ from drivesplat.settings.track_references import TrackReferences
 from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow import IN_SCRIPT
 from drivesplat.workflow.gpus import hold_gpu
-from drivesplat.workflow.running_code import running_code
+from drivesplat.workflow.running_code import RunningCode
 
 S = TypeVar("S", bound=Settings)
 
@@ -94,7 +88,9 @@ class Job:
     def check_inputs(self, dataset: Iterable[str] = ()) -> None:
         """Compares the inputs with what their rules wrote, and the dataset's files of the kinds `dataset` ('images',
         'sweeps') with what `extract` read. Raises ResultError naming an altered file and the rule that rebuilds it."""
-        results = self._scene_folder()
+        scene, parents = getattr(self.wildcards, "scene", None), Path(next(iter(self.output), "")).parents
+        # in the folder of the scene's results every file has a record; None for a rule without a scene
+        results = next((folder for folder in reversed(parents) if scene and folder.name == scene), None)
 
         def digest(path: str) -> str:
             return checked_digest(path, warn=results is not None and results in Path(path).parents)
@@ -106,11 +102,6 @@ class Job:
             record = self.input.scene if hasattr(self.input, "scene") else self.input.parser
             folder = Path(record).parent
             check_dataset(folder.parent if folder.name in OTHER_TRACKS else folder, dataset)
-
-    def _scene_folder(self) -> Path | None:
-        """The folder of the scene's results, in which every file has a record; None for a rule without a scene."""
-        scene, parents = getattr(self.wildcards, "scene", None), Path(next(iter(self.output), "")).parents
-        return next((folder for folder in reversed(parents) if scene and folder.name == scene), None)
 
     def record_dataset(self, **files: Iterable[str | Path]) -> None:
         """Computes the digests of the dataset's `files` by kind, for the record beside the outputs."""
@@ -142,12 +133,13 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
     gc.enable()
     log_path = Path(snakemake.log[0])
     _log_into(log_path)
-    threading_hook, threading.excepthook = threading.excepthook, _log_thread
-    current = Job(snakemake)
-    log = logging.getLogger(__name__)
+    current, log, threading_hook = Job(snakemake), logging.getLogger(__name__), threading.excepthook
+    # the caller that waits for a thread reports its failure to the user
+    threading.excepthook = lambda failed: log.info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)
     log.info("%s begins", current.name)
     try:
-        code = running_code(snakemake)
+        # None where Snakemake has not started the script of the rule
+        code = RunningCode(snakemake.params.code) if hasattr(sys.modules["__main__"], "__real_file__") else None
         if code:
             code.check()
         if check_inputs:
@@ -190,8 +182,3 @@ def _log_into(path: Path) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
     logging.captureWarnings(True)
     logging.raiseExceptions = False  # where the disk has no room for a log, what the job was to write says so, once
-
-
-def _log_thread(failed: threading.ExceptHookArgs) -> None:
-    """Logs the failure of a thread; the caller that waits for it reports it to the user."""
-    logging.getLogger(__name__).info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)

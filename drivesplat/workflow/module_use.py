@@ -7,6 +7,7 @@ that changes.
 import sys
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,15 +55,12 @@ def module_config(config: Any, defaults: str | Path, prefix: str) -> dict[str, A
 def stop_at_absent_data(plan: Plan) -> None:
     """Has the input functions that look for a dataset end the process with one line where it is absent: nothing else
     refuses that for a module, whose targets are unknown at planning."""
-    for name in ("tables", "scene_tables", "root"):
-        setattr(plan, name, _stopping(getattr(plan, name)))
 
-
-def _stopping(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    def stopping(wildcards: Any) -> Any:
+    def stopping(function: Callable[[Any], Any], wildcards: Any) -> Any:
         try:
             return function(wildcards)
         except DriveSplatError as error:
             sys.exit(f"drivesplat: {error}")
 
-    return stopping
+    for name in ("tables", "scene_tables", "root"):
+        setattr(plan, name, partial(stopping, getattr(plan, name)))

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import PurePosixPath
 from typing import Any
@@ -40,23 +41,30 @@ def track_references(
     """Those of the annotated or discovered `tracks` that the settings of a scene name and that a run for `targets`
     (none: everything) uses. Without known targets (None) there are none. Raises ConfigError where the edits file is
     invalid."""
-    subject, used = config.subjects.get(scene, SubjectSettings()), _Used(scene, targets)
+    chosen, everything = set(targets or ()), targets is not None and (not targets or "all" in targets)
+    files = [path for path in map(PurePosixPath, chosen) if scene in path.parts]
+    pairs = (pair for path in files for pair in pairwise(path.with_suffix("").parts))
+    films = {name for folder, name in pairs if folder in ("edits", "quad")}
+    every_edit = everything or bool({"edits", "drives"} & chosen)
+    pictured = everything or "looks" in chosen or any(path.stem in FILES_OF_SUBJECT for path in files)
     editable = any(method.object_parts and method.tracks == tracks for method in config.methods.values())
     edits = fitting_edits(config, scene, tracks) if editable else {}
-    named = [reference for name, edit in edits.items() if used.edit(name) for reference in _of_edit(name, edit)]
-    shown = used.subject and shows_subject(subject, tracks)
+    used = (_of_edit(name, edit) for name, edit in edits.items() if every_edit or name in films)
+    named = [reference for references in used for reference in references]
+    subject = config.subjects.get(scene, SubjectSettings())
+    shown = pictured and shows_subject(subject, tracks)
     return TrackReferences(scene=scene, subject=subject.track if shown else None, edits=tuple(named))
 
 
 def fitting_edits(config: Config, scene: str, tracks: Tracks) -> dict[str, Edit]:
     """The edits of a scene that name none but the `tracks` of a method. Raises ConfigError where the edits file is
     invalid."""
-    return {name: edit for name, edit in scene_edits(config, scene).items() if _fits(edit, tracks)}
-
-
-def _fits(edit: Edit, tracks: Tracks) -> bool:
-    found = [reference.track.startswith(FOUND) for reference in _of_edit("", edit)]
-    return {"annotated": not any(found), "discovered": all(found), "none": not found}[tracks]
+    fitting = {}
+    for name, edit in scene_edits(config, scene).items():
+        found = [reference.track.startswith(FOUND) for reference in _of_edit("", edit)]
+        if {"annotated": not any(found), "discovered": all(found), "none": not found}[tracks]:
+            fitting[name] = edit
+    return fitting
 
 
 def shows_subject(subject: SubjectSettings, tracks: Tracks) -> bool:
@@ -96,26 +104,6 @@ def edits_left_out(config: Config, scenes: Iterable[str]) -> list[str]:
     return sentences
 
 
-class _Used:
-    """What a run for some targets uses of a scene's named tracks."""
-
-    def __init__(self, scene: str, targets: Sequence[str] | None):
-        self._everything = targets is not None and (not targets or "all" in targets)
-        self._targets = set(targets or ())
-        self._files = [path for path in map(PurePosixPath, targets or ()) if scene in path.parts]
-
-    def edit(self, name: str) -> bool:
-        parts = [path.with_suffix("").parts for path in self._files]
-        folders = (pair for names in parts for pair in pairwise(names))
-        of_edits = any(folder in ("edits", "quad") and edit == name for folder, edit in folders)
-        return self._everything or bool({"edits", "drives"} & self._targets) or of_edits
-
-    @property
-    def subject(self) -> bool:
-        shown = any(path.stem in FILES_OF_SUBJECT for path in self._files)
-        return self._everything or "looks" in self._targets or shown
-
-
 def _of_edit(name: str, edit: Edit) -> Iterable[EditReference]:
     """The tracks that the steps of an edit name, without its own copies."""
     copies: list[str] = []
@@ -152,26 +140,15 @@ def refuse_wrong_tracks(
         tracks = config.all_methods[job.wildcards.method].tracks
         references = track_references(config, scene, tracks=tracks)
         subject = references.subject if rule in RULES_OF_SUBJECT else None
-        edit = _edit_of(job.wildcards) if rule in RULES_OF_EDITS else None
+        # the folder of a trajectory renders no edit
+        of_edit = rule in RULES_OF_EDITS and getattr(job.wildcards, "kind", EDITS) == EDITS
+        edit = (job.wildcards.drive if hasattr(job.wildcards, "drive") else job.wildcards.edit) if of_edit else None
         edits = tuple(one for one in references.edits if one.edit == edit)
-        _refuse(TrackReferences(scene=scene, subject=subject, edits=edits), scene_file(job.wildcards))
+        if subject is None and not edits:
+            continue
+        from drivesplat.scene.scene import read_scene
+        from drivesplat.scene.track_references import refuse_unknown_tracks  # numpy; most runs name no tracks
 
-
-def _edit_of(wildcards: Any) -> str | None:
-    """The edit that a job renders; None for the folder of a trajectory."""
-    if getattr(wildcards, "kind", EDITS) != EDITS:
-        return None
-    return wildcards.drive if hasattr(wildcards, "drive") else wildcards.edit
-
-
-def _refuse(references: TrackReferences, scene_file: str) -> None:
-    if references.subject is None and not references.edits:
-        return
-    from drivesplat.scene.scene import read_scene
-    from drivesplat.scene.track_references import refuse_unknown_tracks  # numpy; most runs name no tracks
-
-    try:
-        scene = read_scene(scene_file)
-    except ResultError:
-        return  # the job that reads this file reports it
-    refuse_unknown_tracks(references, scene)
+        with suppress(ResultError):  # the job that reads this file reports it
+            record = read_scene(scene_file(job.wildcards))
+            refuse_unknown_tracks(TrackReferences(scene=scene, subject=subject, edits=edits), record)

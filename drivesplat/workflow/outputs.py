@@ -19,9 +19,8 @@ from drivesplat.workflow.stages import (
     OF_ONE_SCENE,
     SCAN_BASELINES,
     SIDE_BY_SIDE,
-    method_stages,
-    scene_stages,
     stage_settings,
+    stages_of_metrics,
     track_stages,
     training_inputs,
 )
@@ -106,10 +105,6 @@ class Outputs(Inputs):
         methods = self.config.all_methods
         return [name for name in methods if any(self.renders_lidar(scene, name) for scene in self._first_scenes)]
 
-    def methods_with_lidar(self, scene: str) -> list[str]:
-        """The methods that render LiDAR on a scene."""
-        return [name for name in self.config.all_methods if self.renders_lidar(scene, name)]
-
     def metrics(self, _: Any = None) -> list[str]:
         """The metrics.json of the batch's scenes."""
         return [f"{self.config.results_dir}/{scene}/metrics.json" for scene in self.config.batch_scenes]
@@ -146,11 +141,12 @@ class Outputs(Inputs):
             Path(scene, TRACK_FOLDERS[own]) for scene in self._with_cameras(self.config.batch_scenes) for own in known
         )
         tracks = [f"{self.config.results_dir}/{place}/tracks.png" for place in places]
-        return [*tracks, *self.of_methods(self._look_names, cameras=False)]
 
-    def _look_names(self, scene: str, method: str) -> list[str]:
-        of_images = LOOKS if has_cameras(self.config, scene) else ()
-        return [*of_images, *(LIDAR_LOOKS if self.renders_lidar(scene, method) else ())]
+        def names(scene: str, method: str) -> list[str]:
+            of_images = LOOKS if has_cameras(self.config, scene) else ()
+            return [*of_images, *(LIDAR_LOOKS if self.renders_lidar(scene, method) else ())]
+
+        return [*tracks, *self.of_methods(names, cameras=False)]
 
     def exports(self, _: Any = None) -> list[str]:
         """The exported files of the batch's scenes and methods, in the formats of the settings."""
@@ -159,10 +155,7 @@ class Outputs(Inputs):
         )
 
     def of_methods(
-        self,
-        names: Callable[[str, str], Iterable[str]],
-        scenes: Iterable[str] | None = None,
-        cameras: bool = True,
+        self, names: Callable[[str, str], Iterable[str]], scenes: Iterable[str] | None = None, cameras: bool = True
     ) -> list[str]:
         """The files below the folders of all methods of `scenes`, by default the batch's; `names` gives those of one
         scene and method. With `cameras` without those that have no camera."""
@@ -211,10 +204,10 @@ class Outputs(Inputs):
         """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
         of_methods = (find(self.config, scene, name) for name in methods for find in (training_inputs, track_stages))
         taken = {stage for stages in of_methods for stage in stages}
-        made = (*scene_stages(self.config, scene), *sorted(taken))
+        of_scene, of_method = stages_of_metrics(self.config, scene)
+        made = (*of_scene, *sorted(taken))
         stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
-        own = method_stages(self.config, scene)
-        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in own}
+        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in of_method}
         return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
 
     def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:

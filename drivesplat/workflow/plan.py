@@ -14,6 +14,7 @@ from typing import Any
 from drivesplat import IS_CHECKOUT
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.file_lock import LockHeldError, locked_file
+from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
@@ -98,40 +99,31 @@ class Plan(JobResources):
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError with the known names if a target names an unknown scene, method or film, or an ablation
         with a variant equal to the complete method."""
+        ablation, known = self.config.ablation, ", ".join(self.config.methods)
         for target in targets:
             scene, *rest = self._inside_results(target)
             if not rest:
                 continue
             self.config.dataset_of(scene)
-            self._refuse_unknown_method(rest)
+            if rest[0] in ABLATION_FILES and not self.config.ablated:
+                raise ConfigError(
+                    f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: {known}"
+                )
+            if len(rest) > 1 and rest[0] not in (*self.config.all_methods, *OTHER_TRACKS, "masks"):
+                more = f"; for the ablation: {ablation.job.name_pattern}" if self.config.ablated else ""
+                meant = suggestion(rest[0], self.config.methods)
+                raise ConfigError(f"method {rest[0]!r} is not in the config; {meant}there are: {known}{more}")
             films = (*for_scene(self.config, scene).render.trajectories, PARTS_FILM)
             refuse_image_results(self.config, scene, rest, films)
-            if rest[0] in ABLATION_FILES:
-                self._refuse_idle_variants(scene)
+            idle = idle_variants(self.config, scene) if rest[0] in ABLATION_FILES else []
+            if idle:
+                drop = ", ".join(f"{name}: null" for name in idle)
+                raise ConfigError(
+                    f"on scene {scene} these variants take nothing out of {ablation.of!r} and would train it again as "
+                    f"it is: {', '.join(idle)}; drop them with ablation: {{without: {{{drop}}}}}"
+                )
             if len(rest) > 1 and rest[0] in self.config.all_methods:
                 self._refuse_unknown_film(scene, rest[0], rest[1:])
-
-    def _refuse_unknown_method(self, path: list[str]) -> None:
-        """Raises ConfigError if `path` below a scene's folder names an unknown method."""
-        ablation, known = self.config.ablation, ", ".join(self.config.methods)
-        if path[0] in ABLATION_FILES and not self.config.ablated:
-            raise ConfigError(
-                f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: {known}"
-            )
-        if len(path) > 1 and path[0] not in (*self.config.all_methods, *OTHER_TRACKS, "masks"):
-            more = f"; for the ablation: {ablation.job.name_pattern}" if self.config.ablated else ""
-            meant = suggestion(path[0], self.config.methods)
-            raise ConfigError(f"method {path[0]!r} is not in the config; {meant}there are: {known}{more}")
-
-    def _refuse_idle_variants(self, scene: str) -> None:
-        """Raises ConfigError if a variant of the ablation has the settings of the whole method."""
-        idle = idle_variants(self.config, scene)
-        if idle:
-            drop = ", ".join(f"{name}: null" for name in idle)
-            raise ConfigError(
-                f"on scene {scene} these variants take nothing out of {self.config.ablation.of!r} and would train it "
-                f"again as it is: {', '.join(idle)}; drop them with ablation: {{without: {{{drop}}}}}"
-            )
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
@@ -139,7 +131,12 @@ class Plan(JobResources):
             self._refuse_unknown_drive(scene, method, path)
             return
         if path in ([f"{LIDAR}.png"], [f"{LIDAR}.mp4"], [f"{LIDAR}.json"]):
-            self._refuse_without_lidar(scene, method)
+            if not self.renders_lidar(scene, method):
+                able = ", ".join(name for name in self.config.methods if self.renders_lidar(scene, name)) or "none"
+                raise ConfigError(
+                    f"method {method!r} renders no LiDAR of scene {scene} (train.scans.per_image is 0); those do: "
+                    f"{able} (docs/lidar.md; presets/lidar.yaml adds street_lidar)"
+                )
             return
         if path in ([f"{TRUTH_FILM}.mp4"], [f"{TRUTH_FILM}.json"]):
             if scene not in self.worlds.values():
@@ -149,10 +146,12 @@ class Plan(JobResources):
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
         of_parts = film == PARTS_FILM or (trajectory is not None and trajectory.parts != "all")
-        if of_parts:
-            self._refuse_without_moving_parts(method)
+        if of_parts and method not in self.methods_with_moving_parts:
+            able = ", ".join(name for name in self.methods_with_moving_parts if name in self.config.methods)
+            raise ConfigError(
+                f"method {method!r} has no moving parts that could be shown apart; those do: {able or 'none'}"
+            )
         if edit is not None:
-            self._refuse_without_actors(method)
             self._refuse_unknown_edit(scene, method, edit)
         if film not in (path[-1], *self._film_names(scene, method)):
             raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
@@ -164,14 +163,13 @@ class Plan(JobResources):
         if rest in (["drive"], ["scans"]):
             folder = "/".join([self.config.results_dir, scene, method, *path])
             raise ConfigError(f"{folder} is a folder; ask for the file {folder}/{rest[0]}.json")
-        if rest[:1] == ["scans"] and method not in self.methods_with_lidar(scene):
-            able = [name for name in self.methods_with_lidar(scene) if name in self.config.methods]
+        if rest[:1] == ["scans"] and not self.renders_lidar(scene, method):
+            able = [name for name in self.config.methods if self.renders_lidar(scene, name)]
             raise ConfigError(
                 f"method {method!r} does not render LiDAR, so it has no scans; those do: {', '.join(able) or 'none'} "
                 "(train.scans.per_image above 0, as in presets/lidar.yaml)"
             )
         if kind == EDITS:
-            self._refuse_without_actors(method)
             self._refuse_unknown_edit(scene, method, name)
             return
         trajectories = for_scene(self.config, scene).render.trajectories
@@ -183,25 +181,10 @@ class Plan(JobResources):
                 "show all: choose another trajectory"
             )
 
-    def _refuse_without_actors(self, method: str) -> None:
+    def _refuse_unknown_edit(self, scene: str, method: str, edit: str) -> None:
         if method not in self.methods_with_actors:
             able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
             raise ConfigError(f"method {method!r} knows no actors that could be edited; those do: {able}")
-
-    def _refuse_without_moving_parts(self, method: str) -> None:
-        if method not in self.methods_with_moving_parts:
-            able = ", ".join(name for name in self.methods_with_moving_parts if name in self.config.methods) or "none"
-            raise ConfigError(f"method {method!r} has no moving parts that could be shown apart; those do: {able}")
-
-    def _refuse_without_lidar(self, scene: str, method: str) -> None:
-        if not self.renders_lidar(scene, method):
-            able = ", ".join(name for name in self.config.methods if self.renders_lidar(scene, name)) or "none"
-            raise ConfigError(
-                f"method {method!r} renders no LiDAR of scene {scene} (train.scans.per_image is 0); those do: {able} "
-                "(docs/lidar.md; presets/lidar.yaml adds street_lidar)"
-            )
-
-    def _refuse_unknown_edit(self, scene: str, method: str, edit: str) -> None:
         if edit not in scene_edits(self.config, scene):
             raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
         refuse_other_tracks(self.config, scene, method, edit)
@@ -216,22 +199,26 @@ class Plan(JobResources):
         one of the cameras, if the scene has neither cameras nor a method that renders LiDAR, or if the points file is
         no file."""
         needing = [target for target in targets if target != DOWNLOAD]
-        for scene in self._scenes_of(needing) if needing or not targets else ():
+        if targets and not needing:
+            return
+        named = [self._scene_of(target) for target in needing]
+        of_batch = not named or any(scene is not None and scene not in self.config.scenes for scene in named)
+        for scene in self.report(needing).scenes if of_batch else filter(None, named):
             of_scene = SimpleNamespace(scene=scene)
             _ = self.tables(of_scene), self.scene_tables(of_scene)
             name = self.config.dataset_of(scene)
             require_methods(self.config, scene)
             self.refuse_unknown_cameras(name, for_scene(self.config, scene).cameras)
-            self.refuse_special_points_file(scene)
+            # Snakemake names a points file that is absent; a job would wait for a pipe
+            for path in self.points_file(of_scene):
+                try:
+                    regular_file(path)
+                except FileNotFoundError:
+                    pass
+                except OSError as error:
+                    raise ConfigError(f"lidar_seed.points_file {path}: {error}; name a PLY file of points") from None
             if self.config.datasets[name].world:
                 refuse_foreign_data(Path(self.root(of_scene)))
-
-    def _scenes_of(self, targets: list[str]) -> list[str]:
-        """The scenes that targets need; those of the batch if a target names none."""
-        scenes = [self._scene_of(target) for target in targets]
-        if not scenes or any(scene is not None and scene not in self.config.scenes for scene in scenes):
-            return self.report(targets).scenes
-        return [scene for scene in scenes if scene is not None]
 
     def scenes_and_methods(self, targets: list[str]) -> set[tuple[str, str]]:
         """The pairs of scene and method that targets concern, and every such scene with an empty method: those of the

@@ -41,7 +41,10 @@ class Recordings:
     def outline(self, scene: str) -> Outline | None:
         """The outline of a scene's recording; None where its reader gives none."""
         if scene not in self._outlines:
-            self._outlines[scene] = self._read(scene)
+            dataset = self._config.datasets[self._config.dataset_of(scene)]
+            read = None if dataset.world else getattr(layout(dataset.reader), "outline", None)
+            root = Path(self._plan.root(SimpleNamespace(scene=scene))) if read else None
+            self._outlines[scene] = read(root, dataset.version, scene) if read else None
         return self._outlines[scene]
 
     def refuse_unfit(self, jobs: Iterable[Any]) -> None:
@@ -62,7 +65,7 @@ class Recordings:
         and, where `sweeps` is set, of the others in proportion; None while the images are unknown."""
         outline, frames, settings = self.outline(scene), self._frames(scene), for_scene(self._config, scene)
         if outline is None:
-            outline, frames = _extracted(self._results(scene) / "scene.json"), None
+            outline, frames = _extracted(Path(self._config.results_dir, scene, "scene.json")), None
         if outline is None or not outline.key_frames:
             return None
         chosen = outline.key_frames[slice(*frames)] if frames else outline.key_frames
@@ -96,7 +99,8 @@ class Recordings:
         dataset = self._config.datasets[name]
         if not dataset.world:
             return False
-        marker, extracted = Path(dataset.world_root, WORLD_MARKER), self._results(scene) / "scene.json"
+        marker = Path(dataset.world_root, WORLD_MARKER)
+        extracted = Path(self._config.results_dir, scene, "scene.json")
         try:
             if extracted.stat().st_mtime_ns < marker.stat().st_mtime_ns:
                 return False
@@ -129,14 +133,6 @@ class Recordings:
     def _frames(self, scene: str) -> tuple[int, int] | None:
         """The range of key frames that is used of a scene: the first, and the last + 1."""
         return self._config.datasets[self._config.dataset_of(scene)].frames.get(scene)
-
-    def _results(self, scene: str) -> Path:
-        return Path(self._config.results_dir, scene)
-
-    def _read(self, scene: str) -> Outline | None:
-        dataset = self._config.datasets[self._config.dataset_of(scene)]
-        read = None if dataset.world else getattr(layout(dataset.reader), "outline", None)
-        return read(Path(self._plan.root(SimpleNamespace(scene=scene))), dataset.version, scene) if read else None
 
 
 def _extracted(file: Path) -> Outline | None:

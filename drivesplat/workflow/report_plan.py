@@ -58,14 +58,14 @@ class ReportPlan:
         """The pictures that its page shows. Every metrics.json comes with a pair of held-out images."""
         with_figures = self._plan.of_methods(lambda *_: HELD_OUT_PAIR.values(), self.scenes)
         looks = self._plan.of_methods(self._looks, self.scenes, cameras=False)
-        return [*(_present(with_figures) if self._alone else with_figures), *self._shown(looks)]
+        return [*_chosen(with_figures, not self._alone), *_chosen(looks, self._everything)]
 
     def links(self, _: Any = None) -> list[str]:
         """The files that its page links to: films, edits and viewers, in an order that does not depend on files of
         settings."""
         viewers = self._plan.of_methods(lambda *_: ["viewer.html"], self.scenes)
         films, edits = self._plan.films(scenes=self.scenes), self._plan.edits(scenes=self.scenes)
-        return self._shown(sorted([*films, *edits, *viewers]))
+        return _chosen(sorted([*films, *edits, *viewers]), self._everything)
 
     def settings(self, _: Any = None) -> str:
         """The settings of its job as canonical JSON."""
@@ -83,9 +83,7 @@ class ReportPlan:
         of_images = LOOKS.values() if has_cameras(self._plan.config, scene) else ()
         return [*of_images, *(LIDAR_LOOKS.values() if self._plan.renders_lidar(scene, method) else ())]
 
-    def _shown(self, files: list[str]) -> list[str]:
-        return files if self._everything else _present(files)
 
-
-def _present(files: list[str]) -> list[str]:
-    return [file for file in files if Path(file).is_file()]
+def _chosen(files: list[str], every: bool) -> list[str]:
+    """All of the files, or those that exist."""
+    return [file for file in files if every or Path(file).is_file()]

@@ -5,7 +5,6 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.provenance.code_digest import PACKAGE, code_digest, code_files
@@ -59,8 +58,3 @@ class RunningCode:
 
     def _changed(self) -> DriveSplatError:
         return DriveSplatError(f"code of {self._script.stem} changed since the run was planned; start again")
-
-
-def running_code(snakemake: Any) -> RunningCode | None:
-    """The code of the rule's script that this process runs; None where Snakemake has not started it."""
-    return RunningCode(snakemake.params.code) if hasattr(sys.modules["__main__"], "__real_file__") else None

@@ -52,50 +52,35 @@ def when_planned(workflow: Any, check: Callable[[Iterable[Any]], None]) -> Calla
 
 
 def name_changes(record: logging.LogRecord) -> bool:
-    """A filter of Snakemake's logger, which shortens the reason of a job in place and drops no record."""
+    """A filter of Snakemake's logger, which shortens the reason of a job in place, where its params have changed, and
+    drops no record."""
     reason = getattr(record, "reason", None)
     if isinstance(reason, str):
         rule, wildcards = getattr(record, "rule_name", ""), getattr(record, "wildcards", {})
-        record.reason = with_named_changes(reason, rule, " ".join([rule, *filter(None, [wildcards.get("method")])]))
+        job = " ".join([rule, *filter(None, [wildcards.get("method")])])
+        record.reason = _CHANGED_PARAMS.sub(lambda found: f"{job}: {_changes(rule, *found.groups())}", reason)
     return True
 
 
-def with_named_changes(reason: str, rule: str, job: str) -> str:
-    """A reason for a job of a rule, with what has changed in its params: 'train street: train.ssim_weight 0.2 ->
-    0.3'. A reason of other form stays as it is."""
-    return _CHANGED_PARAMS.sub(lambda found: f"{job}: {_changes(rule, *found.groups())}", reason)
-
-
 def _changes(rule: str, before: str, now: str) -> str:
-    old, new = _params(before), _params(now)
-    changes = _changed_settings(_settings(old), _settings(new))
-    if any(map(_DIGEST.fullmatch, [*old, *new])):
+    """What has changed in the params of a rule: 'train.ssim_weight 0.2 -> 0.3'."""
+    params = [[ast.literal_eval(literal) for literal in re.findall(_LITERAL, text)] for text in (before, now)]
+    # the settings among the params, by their paths; empty where there are none
+    records = ([json.loads(value) for value in sorted(values) if value.startswith("{")] for values in params)
+    old, new = (leaves(found[-1]) if found else {} for found in records)
+    keys = sorted(key for key in old.keys() | new.keys() if (key in old, old.get(key)) != (key in new, new.get(key)))
+    changes = [f"{key} {_value(old, key)} -> {_value(new, key)}" for key in keys[:MAX_CHANGES]]
+    if len(keys) > MAX_CHANGES:
+        changes.append(f"and {len(keys) - MAX_CHANGES} more settings")
+    if any(_DIGEST.fullmatch(value) for values in params for value in values):
         changes.append(f"code of {rule} changed")
-    others = [", ".join(value for value in values if not _is_known(value)) for values in (old, new)]
+    others = [
+        ", ".join(value for value in values if not (_DIGEST.fullmatch(value) or value.startswith("{")))
+        for values in params
+    ]
     if any(others):
         changes.append(" -> ".join(values or ABSENT for values in others))
     return "; ".join(changes)
-
-
-def _params(text: str) -> list[str]:
-    return [ast.literal_eval(literal) for literal in re.findall(_LITERAL, text)]
-
-
-def _is_known(value: str) -> bool:
-    return bool(_DIGEST.fullmatch(value)) or value.startswith("{")
-
-
-def _settings(params: list[str]) -> dict[str, Any]:
-    """The values of the settings among some params, by their paths; empty where there are none."""
-    records = [json.loads(value) for value in sorted(params) if value.startswith("{")]
-    return leaves(records[-1]) if records else {}
-
-
-def _changed_settings(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    keys = sorted(key for key in old.keys() | new.keys() if (key in old, old.get(key)) != (key in new, new.get(key)))
-    changes = [f"{key} {_value(old, key)} -> {_value(new, key)}" for key in keys]
-    more = [f"and {len(keys) - MAX_CHANGES} more settings"] if len(keys) > MAX_CHANGES else []
-    return [*changes[:MAX_CHANGES], *more]
 
 
 def _value(values: dict[str, Any], key: str) -> str:

@@ -4,6 +4,7 @@ A stage is a rule; its record holds everything but the inputs that determines it
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 from drivesplat.errors import ConfigError
@@ -13,6 +14,7 @@ from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
+from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.discover import DiscoverJob
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
@@ -24,15 +26,15 @@ from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, Region
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob
 from drivesplat.settings.scans import ScansJob
+from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.visuals import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.world import WorldJob
-from drivesplat.workflow import film_fields
-from drivesplat.workflow.film_names import no_such_edit, scene_edits
-from drivesplat.workflow.job_scope import JobScope
+from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.named_tracks import fitting_edits, shows_subject
 from drivesplat.workflow.without_cameras import (
     CAMERA_STAGES,
+    HOW,
     LIDAR_METHOD_STAGES,
     LIDAR_SCENE_STAGES,
     has_cameras,
@@ -57,6 +59,28 @@ SCANS, SCAN_BASELINES = "scans", "scan_baselines"
 """The stages of a scene's LiDAR scans, and of the figures that methods which render them have to beat."""
 TRAINING_INPUTS = ("actors", "lidar_depth", SCANS)
 """Stages of a scene that only some methods train on."""
+
+
+@dataclass(frozen=True)
+class JobScope:
+    """The dataset, scene, method and film (trajectory or edit; of a folder of a drive or of scans with its kind,
+    'edits/…') of a job, empty where it has none, and the config that applies to it. `scene` is also empty for stages
+    that are not in OF_ONE_SCENE."""
+
+    config: Config
+    dataset_name: str
+    scene: str
+    method: str
+    film: str
+
+    @property
+    def dataset(self) -> DatasetSettings:
+        return self.config.datasets[self.dataset_name]
+
+    @property
+    def tracks(self) -> Tracks:
+        """The tracks that the method trains with; the annotated ones without a method."""
+        return self.config.all_methods[self.method].tracks if self.method else "annotated"
 
 
 def stage_settings(config: Config, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:
@@ -92,16 +116,11 @@ def _refines(at: JobScope) -> bool:
     return (world is None or world.pose_noise) if enabled == "auto" else enabled
 
 
-def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
-    """The stages of a scene behind its metrics.json."""
+def stages_of_metrics(config: Config, scene: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The stages of a scene, and those of each of its methods, behind its metrics.json."""
     if not has_cameras(config, scene):
-        return LIDAR_SCENE_STAGES
-    return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES
-
-
-def method_stages(config: Config, scene: str) -> tuple[str, ...]:
-    """The stages of each method behind a scene's metrics.json."""
-    return METHOD_STAGES if has_cameras(config, scene) else LIDAR_METHOD_STAGES
+        return LIDAR_SCENE_STAGES, LIDAR_METHOD_STAGES
+    return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES, METHOD_STAGES
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
@@ -167,10 +186,6 @@ def _lidar_rays(at: JobScope) -> dict[str, Any]:
     return {"lidar": LidarRays(ray_spacing=at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius"))}
 
 
-def _lidar_depth(at: JobScope) -> dict[str, Any]:
-    return {"ray_spacing": at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius", "box_margin")}
-
-
 def _lidar(at: JobScope, *names: str) -> dict[str, Any]:
     """Settings of the seed that hold for all uses of LiDAR."""
     return {name: getattr(at.config.lidar_seed, name) for name in names}
@@ -233,6 +248,47 @@ def _world(at: JobScope) -> dict[str, Any]:
     }
 
 
+def _film_format(at: JobScope) -> dict[str, Any]:
+    """Of a `FilmFormat`."""
+    fields = ("fps", "width", "height", "horizontal_fov", "crf", "captions")
+    return {"camera": at.config.eval_camera, **{name: getattr(at.config.render, name) for name in fields}}
+
+
+def _film(at: JobScope) -> dict[str, Any]:
+    """Of a `FilmJob`. Raises ConfigError for an unknown trajectory."""
+    trajectories = at.config.render.trajectories
+    if at.film not in trajectories:
+        raise ConfigError(no_such_film(at.config, f"dataset {at.dataset_name}", at.film))
+    return {"trajectory": trajectories[at.film], **_film_format(at)}
+
+
+def _quad(at: JobScope) -> dict[str, Any]:
+    """Of an `EditJob`, without `frames`. Raises ConfigError for an unknown edit."""
+    edits = scene_edits(at.config, at.scene)
+    if at.film not in edits:
+        raise ConfigError(no_such_edit(at.scene, at.film, edits))
+    return {"edit": edits[at.film], **_film_format(at)}
+
+
+def _edit_or_trajectory(at: JobScope) -> dict[str, Any]:
+    kind, _, name = at.film.partition("/")
+    of_film = replace(at, film=name)
+    return {"edit": _quad(of_film)["edit"]} if kind == EDITS else {"trajectory": _film(of_film)["trajectory"]}
+
+
+def _scan_folder(at: JobScope) -> dict[str, Any]:
+    """Of a `ScanFolderJob`; raises as `_quad` or `_film`, and ConfigError for an edit of a scene without cameras."""
+    camera = at.config.eval_camera if at.config.cameras else None
+    if camera is None and at.film.startswith(f"{EDITS}/"):
+        raise ConfigError(f"{no_camera(at.scene)}: scans of edits need images; {HOW}")
+    return {**_edit_or_trajectory(at), "eval_camera": camera, "formats": at.config.export.scan_formats}
+
+
+def _encoding(at: JobScope) -> dict[str, Any]:
+    """How films that combine others are encoded."""
+    return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
+
+
 _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] = {
     "demo_world": (WorldJob, _world),
     "extract": (SceneSource, _scene_source),
@@ -244,26 +300,32 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "relabel": (Settings, _nothing),
     "regions": (RegionJob, _nothing),
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
-    "lidar_depth": (LidarDepthJob, _lidar_depth),
+    "lidar_depth": (
+        LidarDepthJob,
+        lambda at: {
+            "ray_spacing": at.config.lidar_depth.ray_spacing,
+            **_lidar(at, "own_car_radius", "box_margin"),
+        },
+    ),
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),
     "discover": (DiscoverJob, _nothing),
     "lidar_picture": (Settings, _nothing),
-    "lidar_film": (LidarFilmJob, film_fields.encoding),
+    "lidar_film": (LidarFilmJob, _encoding),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
     "evaluate_scans": (EvaluateScansJob, lambda at: {"tracks": at.tracks}),
     "scene_metrics": (Settings, _nothing),
     "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
     "tracks": (TracksJob, _nothing),
-    "film": (FilmJob, film_fields.film),
-    "film_parts": (FilmFormat, film_fields.film_format),
-    "compare": (CompareJob, film_fields.encoding),
-    "truth_film": (CompareJob, film_fields.encoding),
-    "edit": (EditJob, film_fields.edited_film),
-    "quad": (EditJob, film_fields.quad),
-    "drive_folder": (DriveJob, film_fields.drive_folder),
-    "scan_folder": (ScanFolderJob, film_fields.scan_folder),
+    "film": (FilmJob, _film),
+    "film_parts": (FilmFormat, _film_format),
+    "compare": (CompareJob, _encoding),
+    "truth_film": (CompareJob, _encoding),
+    "edit": (EditJob, lambda at: {**_quad(at), "frames": at.config.render.edited_frames}),
+    "quad": (EditJob, _quad),
+    "drive_folder": (DriveJob, lambda at: {**_edit_or_trajectory(at), "width": at.config.export.drive_width}),
+    "scan_folder": (ScanFolderJob, _scan_folder),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

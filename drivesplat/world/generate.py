@@ -3,34 +3,33 @@
 import logging
 import multiprocessing
 import shutil
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import repeat
+from itertools import pairwise, repeat
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from drivesplat.errors import ResultError
+from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.storage import Provenance, atomic_write, canonical_json, sha256_text
-from drivesplat.readers.truth import TruthFrame, TruthScan, TruthView
+from drivesplat.readers.truth import TruthView
 from drivesplat.scene.images import write_png
 from drivesplat.settings.world import WorldJob, WorldSettings
 from drivesplat.world.marker import prepare_folder
+from drivesplat.world.optics.raycast import NO_HIT, StreetRays
 from drivesplat.world.optics.rig import RigSensor, image_height, key_frame_time, recording_sensors, trigger_times
 from drivesplat.world.output.tables import NuScenesTables
 from drivesplat.world.output.truth import (
-    ScanPlan,
-    TruthPlan,
     key_frames_of,
-    planned_scans,
-    planned_views,
+    planned,
     write_frame,
     write_scan,
     write_truth,
 )  # fmt: skip
-from drivesplat.world.placed import require_free_places
-from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
+from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
 from drivesplat.world.shapes.mesh import SurfaceClass
 
 log = logging.getLogger(__name__)
@@ -46,6 +45,10 @@ JPEG_BYTES, TRUTH_BYTES, CLASS_BYTES = 0.45, 2.6, 0.06
 """Bytes per pixel: of an image, of all images of a true view, of the class and sky maps of an image."""
 SWEEP_BYTES, SCAN_BYTES = 600_000, 250_000
 """Bytes of a sweep of 32 beams, and of its truth."""
+CHECK_S = 0.1
+"""Interval in seconds at which placed vehicles are checked."""
+CLEARANCE = 0.25
+"""Height above the ground (metres) of the lowest rays through a vehicle; curbs are lower."""
 
 
 @dataclass(frozen=True)
@@ -74,45 +77,42 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
             pool.submit(_check_places, job).result()
     prepare_folder(root, provenance)
     source = sha256_text(canonical_json(provenance["stages"]))
-    tables = NuScenesTables(job.scene, _description(job.world), source, START_US, job.world)
-    for index in range(job.world.key_frames):
-        tables.add_sample(index, key_frame_time(job.world, index))
-    files = [file for sensor in recording_sensors(job.world) for file in _sensor_files(tables, recorder, sensor)]
-    views, scans = planned_views(recorder), planned_scans(recorder)
-    images = sum(file.sensor.is_camera for file in files)
-    require_space(root, world_bytes(job.world, images, len(files) - images, len(views), len(scans)))
-    with ProcessPoolExecutor(workers, context, _start_worker, (recorder, root)) as pool:
-        counts = pool.map(_write_file, files)
-        visible = pool.map(_visible_fractions, range(job.world.key_frames))
-        frames = [pool.map(_write_frame, repeat(plan), key_frames_of(recorder, plan)) for plan in views]
-        sweeps = [pool.map(_write_scan, repeat(plan), range(job.world.key_frames)) for plan in scans]
-        lidar = {f.index: n for f, n in zip(files, counts, strict=True) if n is not None and f.is_key_frame}
-        for index, fractions in enumerate(visible):
-            _annotate(tables, recorder, index, fractions, lidar[index])
-        true_views = [_view(recorder, plan, tuple(found)) for plan, found in zip(views, frames, strict=True)]
-        write_truth(root, recorder, true_views, [scan for found in sweeps for scan in found])
-    tables.write(root, job.version)
-    log.info("%d recordings, %d boxes in %s", len(files), len(tables.rows["sample_annotation"]), root)
-
-
-def _description(world: WorldSettings) -> str:
-    light = "night" if world.night else "day"
-    return (
+    world, light = job.world, "night" if job.world.night else "day"
+    description = (
         f"Synthetic street, {light}, the ego vehicle {world.ego}, {world.traffic} traffic, {world.vehicles} moving "
         f"vehicles, {world.pedestrians} pedestrians"
     )
-
-
-def _sensor_files(tables: NuScenesTables, recorder: Recorder, sensor: RigSensor) -> list[SensorFile]:
-    """Adds the recordings of a sensor to the tables."""
-    world = recorder.world
-    size = (world.width, image_height(world.width)) if sensor.is_camera else (0, 0)
+    tables = NuScenesTables(job.scene, description, source, START_US, world)
+    for index in range(world.key_frames):
+        tables.add_sample(index, key_frame_time(world, index))
     files = []
-    for time_us, is_key, index in trigger_times(sensor, world):
-        pose = recorder.ego_to_global(time_us * 1e-6)
-        row = tables.add_data(sensor, index, time_us, is_key, pose, size)
-        files.append(SensorFile(sensor, time_us, is_key, index, *row))
-    return files
+    for sensor in recording_sensors(world):
+        size = (world.width, image_height(world.width)) if sensor.is_camera else (0, 0)
+        for time_us, is_key, index in trigger_times(sensor, world):
+            row = tables.add_data(sensor, index, time_us, is_key, recorder.ego_to_global(time_us * 1e-6), size)
+            files.append(SensorFile(sensor, time_us, is_key, index, *row))
+    plans = planned(recorder)
+    views, scans = ([plan for plan in plans if plan.sensor.is_camera == cameras] for cameras in (True, False))
+    images = sum(file.sensor.is_camera for file in files)
+    require_space(root, world_bytes(world, images, len(files) - images, len(views), len(scans)))
+    with ProcessPoolExecutor(workers, context, _start_worker, (root, recorder)) as pool:
+        counts = pool.map(_with_recorder, repeat(_write_file), files)
+        visible = pool.map(_with_recorder, repeat(_visible_fractions), range(world.key_frames))
+        frames = [
+            pool.map(_with_recorder, repeat(write_frame), repeat(plan), key_frames_of(recorder, plan)) for plan in views
+        ]
+        sweeps = [pool.map(_with_recorder, repeat(write_scan), repeat(plan), range(world.key_frames)) for plan in scans]
+        lidar = {f.index: n for f, n in zip(files, counts, strict=True) if n is not None and f.is_key_frame}
+        for index, fractions in enumerate(visible):
+            _annotate(tables, recorder, index, fractions, lidar[index])
+        true_views = []
+        for plan, found in zip(views, frames, strict=True):
+            view = plan.viewpoint
+            without = recorder.instance(view.without) if view.without else None
+            true_views.append(TruthView(plan.sensor.channel, view.left, view.edit, without, tuple(found)))
+        write_truth(root, recorder, true_views, [scan for found in sweeps for scan in found])
+    tables.write(root, job.version)
+    log.info("%d recordings, %d boxes in %s", len(files), len(tables.rows["sample_annotation"]), root)
 
 
 def _annotate(
@@ -129,28 +129,68 @@ def _annotate(
             tables.add_box(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
 
 
-def _view(recorder: Recorder, plan: TruthPlan, frames: tuple[TruthFrame, ...]) -> TruthView:
-    view = plan.viewpoint
-    without = recorder.instance(view.without) if view.without else None
-    return TruthView(plan.sensor.channel, view.left, view.edit, without, frames)
+def require_free_places(recorder: Recorder) -> None:
+    """Raises ConfigError, one line, where a placed vehicle meets an object during the drive."""
+    for name, edit in recorder.edits.items():
+        for number, step in enumerate(edit.steps, start=1):
+            if step.place is None:
+                continue
+            met = first_contact(recorder, name, step.place.name)
+            if met is not None:
+                raise ConfigError(
+                    f"scene {recorder.scene}, edit {name!r}, step {number} (place): {step.place.name!r} is inside "
+                    f"{met[1]} at {met[0]:.1f} s; choose another path"
+                )
 
 
-_worker: tuple[Recorder, Path]
-"""In a worker process: the recorder and the dataset's root."""
+def first_contact(recorder: Recorder, edit: str, name: str) -> tuple[float, str] | None:
+    """The first second at which the vehicle `name` of an edit touches an object, and that object's name; None if it
+    touches none. Rays through its box find what is inside."""
+    objects = recorder.variation(edit).street.objects
+    placed = next((item for item in objects if item.name == name), None)
+    if placed is None:  # a later step has removed it
+        return None
+    # lines through the vehicle's box, in its frame: its edges and diagonals at several heights
+    length, width, height = placed.size
+    corners = np.array([(x, y) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]) * [length / 2, width / 2]
+    pairs = [*pairwise([*corners, corners[0]]), (corners[0], corners[2]), (corners[1], corners[3])]
+    heights = np.linspace(CLEARANCE, 0.95 * height, 4)
+    starts = np.array([(*start, z) for start, _ in pairs for z in heights])
+    ends = np.array([(*end, z) for _, end in pairs for z in heights])
+    times = np.arange(0.0, recorder.world.seconds, CHECK_S)
+    poses = np.repeat(placed.poses(times), len(starts), axis=0)
+    start, toward = np.tile(starts, (len(times), 1)), np.tile(ends - starts, (len(times), 1))
+    length = np.linalg.norm(toward, axis=1)
+    origins = np.einsum("nij,nj->ni", poses[:, :3, :3], start) + poses[:, :3, 3]
+    directions = np.einsum("nij,nj->ni", poses[:, :3, :3], toward / length[:, None])
+    rays = StreetRays(np.repeat(times, len(starts)), origins, directions, np.arange(len(poses), dtype=np.int32))
+    hits = recorder.snapshot(rays.seconds, Viewpoint(edit=edit, without=name)).cast(rays)
+    inside = np.flatnonzero((hits.object != NO_HIT) & (hits.distance < length))
+    if len(inside) == 0:
+        return None
+    return float(rays.seconds[inside[0]]), objects[int(hits.object[inside[0]])].name
+
+
+_worker: tuple[Path, Recorder]
+"""In a worker process: the dataset's root and the recorder."""
 
 
 def _check_places(job: WorldJob) -> None:
     require_free_places(Recorder(job.world, job.scene, job.edits))
 
 
-def _start_worker(recorder: Recorder, root: Path) -> None:
+def _start_worker(root: Path, recorder: Recorder) -> None:
     global _worker
-    _worker = recorder, root
+    _worker = root, recorder
 
 
-def _write_file(file: SensorFile) -> np.ndarray | None:
+def _with_recorder(function: Callable[..., Any], *arguments: Any) -> Any:
+    """In a worker process: calls a function with the root, the recorder and the arguments."""
+    return function(*_worker, *arguments)
+
+
+def _write_file(root: Path, recorder: Recorder, file: SensorFile) -> np.ndarray | None:
     """Writes an image or a sweep. Returns the number of LiDAR returns per object, None for images."""
-    recorder, root = _worker
     with atomic_write(root / file.path) as target:
         if not file.sensor.is_camera:
             scan = recorder.scan(file.sensor, file.time_us)
@@ -160,30 +200,15 @@ def _write_file(file: SensorFile) -> np.ndarray | None:
         image = recorder.to_bytes(picture.radiance, file.sensor, file.time_us)
         Image.fromarray(image).save(target, "JPEG", quality=JPEG_QUALITY)
     if recorder.world.class_maps:
-        write_class_maps(root, file.sensor.channel, file.path, picture.classes)
+        # the sky is unlabelled in the class map: it has no Gaussians
+        sky, name = picture.classes == SurfaceClass.SKY, f"{file.sensor.channel}/{PurePosixPath(file.path).stem}.png"
+        write_png(root / SKY / name, np.where(sky, 255, 0).astype(np.uint8))
+        write_png(root / SEMANTIC / name, np.where(sky, UNLABELLED, picture.classes).astype(np.uint8))
     return None
 
 
-def write_class_maps(root: Path, camera: str, image: str, classes: np.ndarray) -> None:
-    """Writes the maps of an image from its `classes` (h, w). The sky is 255 in its map and unlabelled in the class map:
-    it has no Gaussians."""
-    sky, name = classes == SurfaceClass.SKY, f"{camera}/{PurePosixPath(image).stem}.png"
-    write_png(root / SKY / name, np.where(sky, 255, 0).astype(np.uint8))
-    write_png(root / SEMANTIC / name, np.where(sky, UNLABELLED, classes).astype(np.uint8))
-
-
-def _visible_fractions(index: int) -> np.ndarray:
-    return _worker[0].visible_fractions(index)
-
-
-def _write_frame(plan: TruthPlan, index: int) -> TruthFrame:
-    recorder, root = _worker
-    return write_frame(root, recorder, plan, index)
-
-
-def _write_scan(plan: ScanPlan, index: int) -> TruthScan:
-    recorder, root = _worker
-    return write_scan(root, recorder, plan, index)
+def _visible_fractions(root: Path, recorder: Recorder, index: int) -> np.ndarray:
+    return recorder.visible_fractions(index)
 
 
 def world_bytes(world: WorldSettings, images: int, sweeps: int, views: int, scans: int) -> int:

@@ -61,13 +61,6 @@ class SurfacePoints:
         places, faces = trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)
         return cls(pieces[faces], np.asarray(places))
 
-    def __len__(self) -> int:
-        return len(self.pieces)
-
-    def at(self, poses: np.ndarray) -> np.ndarray:
-        """The points (n, 3) where the pieces have `poses` (pieces, 4, 4)."""
-        return np.einsum("nij,nj->ni", poses[self.pieces, :3, :3], self.places) + poses[self.pieces, :3, 3]
-
 
 class Recorder:
     """Records the street of `world` as the drive `scene`. Each recording has its own random generator."""
@@ -82,18 +75,17 @@ class Recorder:
     def variation(self, edit: str | None = None) -> Variation:
         """The street and the ego path of the drive, or of an edit of it."""
         if edit not in self._variations:
-            self._variations[edit] = self._edited(edit)
+            delays = [sensor.delay_us for sensor in recording_sensors(self.world) if sensor.is_camera]
+            film_start = min(delays, default=0) * 1e-6
+            self._variations[edit] = edited(
+                self.street, self.scene, self.edits[edit], edit, self.world.seconds, film_start
+            )
         return self._variations[edit]
 
     def _caster(self, edit: str | None) -> RayCaster:
         if edit not in self._casters:
             self._casters[edit] = RayCaster(self.variation(edit).street.objects)
         return self._casters[edit]
-
-    def _edited(self, edit: str) -> Variation:
-        delays = [sensor.delay_us for sensor in recording_sensors(self.world) if sensor.is_camera]
-        film_start = min(delays, default=0) * 1e-6
-        return edited(self.street, self.scene, self.edits[edit], edit, self.world.seconds, film_start)
 
     def instance(self, name: str) -> str:
         """The token of an object: the id of its track."""
@@ -184,31 +176,30 @@ class Recorder:
 
     def visible_fractions(self, index: int) -> np.ndarray:
         """The visible fraction of each object (objects,) within the images of key frame `index`, of all six cameras
-        whether they record or not."""
-        visible, inside = np.zeros(len(self.objects)), np.zeros(len(self.objects))
+        whether they record or not: of points on its surface."""
+        visible, inside, surfaces = np.zeros(len(self.objects)), np.zeros(len(self.objects)), self._surfaces
+        owners = np.repeat(list(surfaces), SURFACE_POINTS)
         for sensor in SENSORS:
-            if sensor.is_camera:
-                seconds = (key_frame_time(self.world, index) + sensor.delay_us) * 1e-6
-                self._count_points(self.camera(sensor, seconds), seconds, visible, inside)
+            if sensor.is_camera and surfaces:
+                time = np.array([(key_frame_time(self.world, index) + sensor.delay_us) * 1e-6])
+                camera = self.camera(sensor, float(time[0]))
+                poses = [self.objects[n].piece_poses(time)[0, own.pieces] for n, own in surfaces.items()]
+                moved = [
+                    np.einsum("nij,nj->ni", pose[:, :3, :3], own.places) + pose[:, :3, 3]
+                    for pose, own in zip(poses, surfaces.values(), strict=True)
+                ]
+                points = np.concatenate(moved)
+                pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
+                limit = np.array([camera.width, camera.height]) - 0.5
+                chosen = (depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)
+                center = camera.pose[:3, 3]
+                toward, owner = points[chosen] - center, owners[chosen]
+                toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+                rays = StreetRays(time, center[None], toward, np.zeros(len(toward), np.int32))
+                found = self.snapshot(time).cast(rays).object
+                visible += np.bincount(owner[found == owner], minlength=len(visible))
+                inside += np.bincount(owner, minlength=len(inside))
         return visible / np.maximum(inside, 1)
-
-    def _count_points(self, camera: WorldCamera, seconds: float, visible: np.ndarray, inside: np.ndarray) -> None:
-        """Adds the number of surface points of each object that lie inside the image, and of those that are visible."""
-        time, center = np.array([seconds]), camera.pose[:3, 3]
-        numbers = list(self._surfaces)
-        if not numbers:
-            return
-        points = np.concatenate([own.at(self.objects[n].piece_poses(time)[0]) for n, own in self._surfaces.items()])
-        owner = np.repeat(numbers, [len(points) for points in self._surfaces.values()])
-        pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
-        limit = np.array([camera.width, camera.height]) - 0.5
-        chosen = (depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)
-        toward, owner = points[chosen] - center, owner[chosen]
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        rays = StreetRays(time, center[None], toward, np.zeros(len(toward), np.int32))
-        found = self.snapshot(time).cast(rays).object
-        visible += np.bincount(owner[found == owner], minlength=len(visible))
-        inside += np.bincount(owner, minlength=len(inside))
 
     def ego_to_global(self, seconds: float) -> np.ndarray:
         """The ego pose (4, 4) in the tables. `world.pose_noise` gives it the errors of nuScenes: z = 0, and smooth

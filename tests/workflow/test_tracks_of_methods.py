@@ -52,7 +52,7 @@ def at(method: str | None = None, tracks: str | None = None, scene: str = "a1", 
 def test_a_training_reads_what_was_made_for_its_tracks(method, folder):
     made, job = plan(), at(method)
     assert made.scene(job) == f"{folder}/scene.json" and made.of_tracks("parser.pkl")(job) == f"{folder}/parser.pkl"
-    assert made.images_of_tracks("masks/masks.json")(job) == [f"{folder}/masks/masks.json"]
+    assert made.of_images("masks/masks.json", of_tracks=True)(job) == [f"{folder}/masks/masks.json"]
     stages = ("actors", "lidar_depth", "scans") if method != "blind" else ()
     taken = [file for stage in ("actors", "lidar_depth", "scans") for file in made.training_input(stage)(job)]
     assert taken == [f"{folder}/{stage}.npz" for stage in stages]
@@ -63,8 +63,8 @@ def test_stages_of_a_scene_read_the_record_of_the_folder_that_they_write_to():
     for folder in ("", "discovered/", "unlabelled/"):
         job = at(tracks=folder)
         assert made.scene(job) == f"r/a1/{folder}scene.json"
-        assert made.images_of_tracks("seed.ply")(job) == [f"r/a1/{folder}seed.ply"]
-        assert made.images_of_tracks("seed.ply")(at(tracks=folder, scene="b1")) == []
+        assert made.of_images("seed.ply", of_tracks=True)(job) == [f"r/a1/{folder}seed.ply"]
+        assert made.of_images("seed.ply", of_tracks=True)(at(tracks=folder, scene="b1")) == []
         assert made.actors(job) == ([] if folder == "unlabelled/" else [f"r/a1/{folder}actors.npz"])
         assert made.discovered(job) == (["r/a1/discovered.json"] if folder == "discovered/" else [])
 

@@ -7,8 +7,8 @@ from helpers.demo_worlds import FRONT, LIDAR, edit_of, named, names_of, pose_at,
 from drivesplat.errors import ConfigError
 from drivesplat.settings.edit import Recolour
 from drivesplat.trajectories.edited_actors import color_matrix
+from drivesplat.world.generate import require_free_places
 from drivesplat.world.optics.imaging import to_bytes
-from drivesplat.world.placed import require_free_places
 from drivesplat.world.recorder import Recorder, Viewpoint
 from drivesplat.world.street.objects import EGO_BODY
 

@@ -22,8 +22,7 @@ from nuscenes.nuscenes import NuScenes
 
 from drivesplat.readers.truth import read_truth
 from drivesplat.workflow.edits_file import read_edits
-from drivesplat.world.generate import make_world
-from drivesplat.world.placed import require_free_places
+from drivesplat.world.generate import make_world, require_free_places
 from drivesplat.world.recorder import Recorder
 
 STORED = json.loads(DIGESTS.read_text())

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Literal
 
 from drivesplat.machine.compute_capability import MIN_CAPABILITY, covers, dotted
-from drivesplat.machine.doctor.facts import Dataset, Facts
+from drivesplat.machine.doctor.facts import Facts
 from drivesplat.machine.doctor.torch_builds import BUILDS, advice
 from drivesplat.machine.gsplat_build.toolkit import FROM_PYPI_SINCE, same_major
 from drivesplat.settings.evaluate import BACKBONE, LpipsSettings
@@ -87,7 +87,18 @@ def gpu(facts: Facts) -> Iterator[Finding]:
         yield ok("GPU", f"{gpu}, driver {gpu.driver}{memory}" if gpu.capability else f"{gpu}{memory}")
     torch = facts.torch
     if torch is None or torch.gpu is None:
-        yield _no_gpu(facts)
+        consequence = "the CPU demo runs; real scenes are refused unless you write device: cpu (very slow)"
+        if facts.gpu_problem:
+            remedy = "(re)install NVIDIA's driver (Ubuntu: sudo ubuntu-drivers install), then reboot"
+            yield note("GPU", f"{facts.gpu_problem}: {remedy}; until then {consequence}")
+        elif facts.gpus and torch is not None and (torch.cuda or torch.hip) and _unfit_build(facts) is None:
+            yield fix("GPU", "torch finds no GPU: is CUDA_VISIBLE_DEVICES set, or was the driver updated (reboot)?")
+        elif facts.gpus:
+            yield note("GPU", f"torch cannot use it (see torch above): {consequence}")
+        elif torch is not None and torch.hip:
+            yield note("GPU", f"this torch for ROCm finds no AMD GPU (see docs/amd.md): {consequence}")
+        else:
+            yield note("GPU", f"none found: {consequence}")
         return
     if not facts.gpus:
         known = f", compute capability {dotted(torch.capability)}" if torch.cuda and torch.capability else ""
@@ -97,21 +108,6 @@ def gpu(facts: Facts) -> Iterator[Finding]:
         text = f"{torch.gpu} has {torch.free_gb:.1f} GB of free memory, device.min_free_gb asks for {needed:g}: a "
         text += "training will not start; end other programs on it (nvidia-smi lists them), use a smaller preset "
         yield fix("GPU", text + "(presets/8gb.yaml), or lower train.cap_max, images.width and device.min_free_gb")
-
-
-def _no_gpu(facts: Facts) -> Finding:
-    consequence = "the CPU demo runs; real scenes are refused unless you write device: cpu (very slow)"
-    torch = facts.torch
-    if facts.gpu_problem:
-        remedy = "(re)install NVIDIA's driver (Ubuntu: sudo ubuntu-drivers install), then reboot"
-        return note("GPU", f"{facts.gpu_problem}: {remedy}; until then {consequence}")
-    if facts.gpus and torch is not None and (torch.cuda or torch.hip) and _unfit_build(facts) is None:
-        return fix("GPU", "torch finds no GPU: is CUDA_VISIBLE_DEVICES set, or was the driver updated (reboot)?")
-    if facts.gpus:
-        return note("GPU", f"torch cannot use it (see torch above): {consequence}")
-    if torch is not None and torch.hip:
-        return note("GPU", f"this torch for ROCm finds no AMD GPU (see docs/amd.md): {consequence}")
-    return note("GPU", f"none found: {consequence}")
 
 
 def gsplat(facts: Facts) -> Iterator[Finding]:
@@ -125,33 +121,26 @@ def gsplat(facts: Facts) -> Iterator[Finding]:
         where = "its kernels come with AMD's package" if torch and torch.hip else "its kernels are not needed on a CPU"
         yield ok("gsplat", f"{found.version}; {where}")
     elif found.extension is None:
-        yield _uncompiled(facts)
+        text = f"{found.version} is not compiled: "
+        if torch.capability is None or torch.capability < MIN_CAPABILITY:
+            yield note("gsplat", f'{text}no GPU to compile for; for one elsewhere: GSPLAT_ARCHS="8.6" make setup')
+            return
+        nvcc = f" with a CUDA {torch.cuda} toolkit in CUDA_HOME"
+        if facts.toolkit and same_major(facts.toolkit.release, torch.cuda):
+            nvcc = ""
+        elif int(torch.cuda.split(".")[0]) >= FROM_PYPI_SINCE:
+            nvcc = " (installs nvcc, too)"
+        text += f"training on the GPU will be refused; run make setup{nvcc}, which takes minutes, once"
+        yield fix("gsplat", text)
     else:
-        yield _compiled(facts)
-
-
-def _uncompiled(facts: Facts) -> Finding:
-    torch, text = facts.torch, f"{facts.gsplat.version} is not compiled: "
-    if torch.capability is None or torch.capability < MIN_CAPABILITY:
-        return note("gsplat", f'{text}no GPU to compile for; for one elsewhere: GSPLAT_ARCHS="8.6" make setup')
-    nvcc = f" with a CUDA {torch.cuda} toolkit in CUDA_HOME"
-    if facts.toolkit and same_major(facts.toolkit.release, torch.cuda):
-        nvcc = ""
-    elif int(torch.cuda.split(".")[0]) >= FROM_PYPI_SINCE:
-        nvcc = " (installs nvcc, too)"
-    return fix("gsplat", f"{text}training on the GPU will be refused; run make setup{nvcc}, which takes minutes, once")
-
-
-def _compiled(facts: Facts) -> Finding:
-    archs, torch = facts.gsplat.archs, facts.torch
-    text = f"{facts.gsplat.version}, compiled ({facts.gsplat.extension})"
-    if not archs:
-        return ok("gsplat", text)
-    text += f" for compute capability {', '.join(archs)}"
-    if torch.capability is None or covers(archs, torch.capability):
-        return ok("gsplat", text)
-    has = dotted(torch.capability)
-    return fix("gsplat", f'{text}, but {torch.gpu} has {has}: GSPLAT_ARCHS="{";".join([*archs, has])}" make setup')
+        text = f"{found.version}, compiled ({found.extension})"
+        text += f" for compute capability {', '.join(found.archs)}" if found.archs else ""
+        if not found.archs or torch.capability is None or covers(found.archs, torch.capability):
+            yield ok("gsplat", text)
+        else:
+            has = dotted(torch.capability)
+            archs = ";".join([*found.archs, has])
+            yield fix("gsplat", f'{text}, but {torch.gpu} has {has}: GSPLAT_ARCHS="{archs}" make setup')
 
 
 def triton(facts: Facts) -> Iterator[Finding]:
@@ -194,16 +183,14 @@ def config(facts: Facts) -> Iterator[Finding]:
 
 def datasets(facts: Facts) -> Iterator[Finding]:
     """The datasets that the config names."""
-    yield from map(_dataset, facts.datasets)
-
-
-def _dataset(dataset: Dataset) -> Finding:
-    topic = f"dataset {dataset.name}"
-    if dataset.root is not None:
-        return ok(topic, f"found in {dataset.root}")
-    if dataset.generated:
-        return ok(topic, "not there yet: the workflow generates it when needed")
-    return note(topic, f"{dataset.problem}; make demo does not need it")
+    for dataset in facts.datasets:
+        topic = f"dataset {dataset.name}"
+        if dataset.root is not None:
+            yield ok(topic, f"found in {dataset.root}")
+        elif dataset.generated:
+            yield ok(topic, "not there yet: the workflow generates it when needed")
+        else:
+            yield note(topic, f"{dataset.problem}; make demo does not need it")
 
 
 def disk(facts: Facts) -> Iterator[Finding]:

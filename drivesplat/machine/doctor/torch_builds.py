@@ -80,19 +80,15 @@ def read_gpus(run: Callable[..., subprocess.CompletedProcess] = subprocess.run) 
         except (OSError, subprocess.TimeoutExpired) as error:
             return [], None if isinstance(error, FileNotFoundError) else f"nvidia-smi does not answer ({error})"
         if done.returncode == 0:
-            gpus = [_gpu(line) for line in done.stdout.splitlines() if line.count(",") >= len(fields) - 1]
+            gpus = []
+            for line in done.stdout.splitlines():
+                if line.count(",") >= len(fields) - 1:
+                    name, driver, *memory, capability = (part.strip() for part in [*line.split(","), ""][:5])
+                    total, free = (int(mb) * 2**20 / 1e9 if mb.isdigit() else None for mb in memory)
+                    match = re.fullmatch(r"(\d+)\.(\d+)", capability)
+                    gpus.append(Gpu(name, driver, (int(match[1]), int(match[2])) if match else None, total, free))
             return gpus, None if gpus else "nvidia-smi reports no GPU"
     return [], f"nvidia-smi fails: {' '.join((done.stdout + ' ' + done.stderr).split()) or 'no message'}"
-
-
-def _gpu(line: str) -> Gpu:
-    name, driver, total, free, *rest = (part.strip() for part in line.split(","))
-    match = re.fullmatch(r"(\d+)\.(\d+)", rest[0]) if rest else None
-    return Gpu(name, driver, (int(match[1]), int(match[2])) if match else None, _gb(total), _gb(free))
-
-
-def _gb(mebibytes: str) -> float | None:
-    return int(mebibytes) * 2**20 / 1e9 if mebibytes.isdigit() else None
 
 
 def at_least(version: str, other: str) -> bool:

@@ -80,7 +80,9 @@ def build(environment: Mapping[str, str]) -> str | None:
     if problem := diagnose.missing_prerequisite():
         raise DeviceError(f"gsplat cannot be compiled: {problem}")
     toolkit = provide_toolkit(cuda)
-    jobs = _jobs(environment)
+    given = environment.get("MAX_JOBS", "")
+    jobs = int(given) if given.isdigit() else 0
+    jobs = jobs or building.parallel_jobs(len(os.sched_getaffinity(0)), building.free_memory_gb())
     report(
         f"compiling for compute capability {', '.join(archs)} with nvcc {toolkit.release} ({toolkit.origin}), "
         f"{jobs} file(s) at a time: about {building.expected_minutes(len(archs), jobs)} min, once; "
@@ -88,13 +90,6 @@ def build(environment: Mapping[str, str]) -> str | None:
     )
     report(f"compiled: {building.compile_and_install(toolkit, archs, jobs, report)}")
     return None
-
-
-def _jobs(environment: Mapping[str, str]) -> int:
-    given = environment.get("MAX_JOBS", "")
-    if given.isdigit() and int(given) > 0:
-        return int(given)
-    return building.parallel_jobs(len(os.sched_getaffinity(0)), building.free_memory_gb())
 
 
 def report(text: str) -> None:

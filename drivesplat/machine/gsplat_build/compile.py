@@ -113,7 +113,12 @@ def run_with_progress(command: Sequence[str], env: Mapping[str, str], log: Path,
         try:
             while process.poll() is None:
                 time.sleep(POLL_S)
-                reported = _report_progress(log, start, reported, report)
+                steps = STEP.findall(log.read_text(errors="replace"))
+                done, total = map(int, steps[-1]) if steps else (0, 0)
+                if done > reported:
+                    reported, elapsed = done, (time.monotonic() - start) / 60
+                    remaining = max(1, round(elapsed / done * (total - done)))
+                    report(f"{done}/{total} files compiled, {elapsed:.0f} min so far, about {remaining} min to go")
         finally:
             if process.poll() is None:  # interrupted: end ninja and its compilers, too
                 os.killpg(process.pid, signal.SIGTERM)
@@ -123,17 +128,6 @@ def run_with_progress(command: Sequence[str], env: Mapping[str, str], log: Path,
         report(diagnose.last_lines(text))
         why = diagnose.cause(text) or "see the lines above; docs/installation.md lists known causes"
         raise DeviceError(f"compiling gsplat failed: {why} (whole log: {log})")
-
-
-def _report_progress(log: Path, start: float, reported: int, report: Report) -> int:
-    steps = STEP.findall(log.read_text(errors="replace"))
-    done, total = map(int, steps[-1]) if steps else (0, 0)
-    if done <= reported:
-        return reported
-    elapsed = (time.monotonic() - start) / 60
-    remaining = max(1, round(elapsed / done * (total - done)))
-    report(f"{done}/{total} files compiled, {elapsed:.0f} min so far, about {remaining} min to go")
-    return done
 
 
 def install(built: Path, package: Path, archs: Iterable[str]) -> Path:

@@ -45,6 +45,7 @@ class Expectations:
 
     def __init__(self, config: Config, costs: Sequence[Cost]):
         self._config = config
+        self._moving = {name for name, method in config.all_methods.items() if method.moving_parts}
         self._costs: dict[tuple[str, str], list[Cost]] = defaultdict(list)
         for cost in costs:
             self._costs[self._kind(cost.job)].append(cost)
@@ -57,7 +58,7 @@ class Expectations:
         alike: list[Callable[[Cost], bool]] = [
             lambda cost: cost.job == job,
             lambda cost: cost.job.method == job.method,
-            lambda cost: job.stage != TRAIN or self._moves(cost.job.method) == self._moves(job.method),
+            lambda cost: job.stage != TRAIN or (cost.job.method in self._moving) == (job.method in self._moving),
         ]
         for like in alike:
             found = {c.job: seconds for c in peers if like(c) and (seconds := self._scaled(c, job)) is not None}
@@ -101,10 +102,6 @@ class Expectations:
             return cost.seconds
         iterations = for_scene(self._config, job.scene, job.method).train.iterations
         return cost.seconds * iterations / cost.iterations if cost.iterations else None
-
-    def _moves(self, method: str) -> bool:
-        known = self._config.all_methods
-        return method in known and bool(known[method].moving_parts)
 
 
 def _size(files: Iterable[str | Path]) -> float:
@@ -184,29 +181,21 @@ def in_one_line(found: Estimate) -> str:
     """'27 jobs, about 12 min on 4 cores (from 22 measured jobs; 3 not measured yet), about 0.4 GB of disk (…)'."""
     if not found.jobs:
         return "nothing is to be run"
-    return f"{found.jobs} job{'s' * (found.jobs > 1)}, {_time(found)}, {_disk(found)}"
-
-
-def _time(found: Estimate) -> str:
     cores, gpus = found.machine.cores, found.machine.gpus
     where = f"{cores} core{'s' * (cores > 1)}" + (f" and {gpus} GPUs" if gpus > 1 else "")
     rest = found.jobs - found.known
     rough = f"{NOT_MEASURED}, by other machines very roughly {spelled(found.rough_seconds)}"
-    if not found.known:
-        return f"time {rough} on {where}"
-    missing = f"; {rest} {rough} in all" if rest else ""
-    basis = f"from {found.measured} measured job{'s' * (found.measured > 1)}{missing}"
-    return f"about {spelled(found.seconds)} on {where} ({basis})"
-
-
-def _disk(found: Estimate) -> str:
+    basis = f"from {found.measured} measured job{'s' * (found.measured > 1)}"
+    basis += f"; {rest} {rough} in all" if rest else ""
+    time = f"about {spelled(found.seconds)} on {where} ({basis})" if found.known else f"time {rough} on {where}"
     free = f"{found.free_disk / 1e9:.1f} GB free"
-    if found.unknown_disk == found.jobs:
-        return f"disk {NOT_MEASURED} ({free})"
     missing = f"; {found.unknown_disk} jobs {NOT_MEASURED}" if found.unknown_disk else ""
     warning = "; that is more than there is" if found.disk > found.free_disk else ""
     size = f"{found.disk / 1e9:.1f} GB" if found.disk >= 1e9 else f"{found.disk / 1e6:.0f} MB"
-    return f"about {size} of disk ({free}{missing}){warning}"
+    disk = f"about {size} of disk ({free}{missing}){warning}"
+    if found.unknown_disk == found.jobs:
+        disk = f"disk {NOT_MEASURED} ({free})"
+    return f"{found.jobs} job{'s' * (found.jobs > 1)}, {time}, {disk}"
 
 
 def in_full(found: Estimate) -> str:

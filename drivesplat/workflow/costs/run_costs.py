@@ -42,10 +42,10 @@ class RunCosts:
         self._jobs: dict[JobId, Any] = {}
         self._ended: threading.Event | None = None
 
-    def report_settings_without_effect(self) -> None:
+    def report_at_planning(self) -> None:
         """Prints each setting that an override replaces for the scenes and methods of the targets, methods that
-        scenes without cameras leave out, and edits whose tracks no method has. Called at planning, so that
-        `snakemake -n` and a run with nothing to do print them, too."""
+        scenes without cameras leave out, and edits whose tracks no method has: `snakemake -n` and a run with nothing
+        to do print them, too. Removes records on which Snakemake would fail, and prints which."""
         wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
         if wanted or COSTS not in self._targets:
             places = self._plan.scenes_and_methods(wanted)
@@ -53,9 +53,6 @@ class RunCosts:
             absent = [*methods_left_out(self._plan.config, scenes), *edits_left_out(self._plan.config, scenes)]
             for sentence in (*without_effect(self._plan.config, places), *absent):
                 _say(sentence)
-
-    def report_foreign_records(self) -> None:
-        """Removes records on which Snakemake would fail, and prints which."""
         sentence = drop_foreign_records()
         if sentence:
             _say(sentence)
@@ -75,8 +72,16 @@ class RunCosts:
             if self._jobs:
                 _say(in_one_line(self.estimate()))
                 logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
-                watched = self._planned, logs, self._expectations, self._finished, self._machine, time.time()
-                self._ended = watch(RunProgress(*watched))
+                dag, jobs = self._workflow.dag, self._jobs
+                watched = RunProgress(
+                    self._planned,
+                    logs,
+                    self._expectations,
+                    lambda: {name for name, job in jobs.items() if dag.finished(job)},
+                    self._machine,
+                    time.time(),
+                )
+                self._ended = watch(watched)
         except Exception as error:  # a failed estimate must not end the run
             _say(f"the run cannot be estimated ({type(error).__name__}: {error})")
 
@@ -122,9 +127,6 @@ class RunCosts:
 
     def _expectations(self) -> Expectations:
         return Expectations(self._plan.config, read_costs(self._results)[0])
-
-    def _finished(self) -> set[JobId]:
-        return {name for name, job in self._jobs.items() if self._workflow.dag.finished(job)}
 
 
 def planned_job(name: JobId, job: Any) -> PlannedJob:

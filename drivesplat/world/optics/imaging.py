@@ -74,19 +74,16 @@ def render(snapshot: StreetSnapshot, light: Light, camera: WorldCamera, samples:
     over `samples` rays."""
     picture, radiance, edges = _through_centers(snapshot, light, camera)
     rows, columns = np.nonzero(edges)
+    # offsets in pixels from a pixel's centre, which is the first; the others spread evenly over it
+    spread = (0.5 + R2_STEPS * np.arange(samples)[:, None]) % 1.0 - 0.5
     for block in _blocks(len(rows) if samples > 1 else 0, samples - 1):
         y, x = (np.repeat(at[block], samples - 1) for at in (rows, columns))
-        offsets = np.tile(sample_offsets(samples)[1:], (len(rows[block]), 1))
+        offsets = np.tile(spread[1:], (len(rows[block]), 1))
         rays = camera.rays(x + offsets[:, 0], y + offsets[:, 1], y)
         found, _ = _radiance(snapshot, light, camera, rays, snapshot.cast(rays))
         total = found.reshape(-1, samples - 1, 3).sum(axis=1) + radiance[rows[block], columns[block]]
         radiance[rows[block], columns[block]] = total / samples
     return replace(picture, radiance=radiance * camera.gains)
-
-
-def sample_offsets(samples: int) -> np.ndarray:
-    """Offsets (samples, 2) in pixels from a pixel's centre, which is the first; the others spread evenly over it."""
-    return (0.5 + R2_STEPS * np.arange(samples)[:, None]) % 1.0 - 0.5
 
 
 def geometry(snapshot: StreetSnapshot, camera: WorldCamera) -> StreetImage:
@@ -98,7 +95,7 @@ def _through_centers(
     snapshot: StreetSnapshot, light: Light | None, camera: WorldCamera
 ) -> tuple[StreetImage, np.ndarray, np.ndarray]:
     """The geometry at pixel centres, the radiance there (h, w, 3) unless there is no `light`, and the pixels (h, w)
-    bool in which a surface ends or its light changes."""
+    bool in which a surface ends or its light changes: they differ from one beside, above or below."""
     count, caster = camera.width * camera.height, snapshot.caster
     depth, objects, face = np.empty(count), np.empty(count, np.int32), np.empty(count, np.int64)
     radiance, lit = np.empty((count if light else 0, 3)), np.zeros(count, dtype=bool)
@@ -115,21 +112,15 @@ def _through_centers(
     classes = np.where(face >= 0, caster.surface_class[face], int(SurfaceClass.SKY)).astype(np.uint8)
     picture = StreetImage(np.empty((0, 0, 3)), depth.reshape(size), objects.reshape(size), classes.reshape(size))
     surfaces = np.where(face >= 0, caster.surface[face], NO_HIT).reshape(size)
-    edges = _edges(surfaces, lit.reshape(size), picture.depth) if light else np.zeros(size, dtype=bool)
-    return picture, radiance.reshape(*size, 3) if light else radiance, edges
-
-
-def _edges(surfaces: np.ndarray, lit: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """The pixels (h, w) bool that differ from one beside, above or below in surface, light or depth."""
-    edges, inverse_depth = np.zeros(surfaces.shape, dtype=bool), 1.0 / depth
-    for axis in (0, 1):
+    edges, lit, inverse_depth = np.zeros(size, dtype=bool), lit.reshape(size), 1.0 / picture.depth
+    for axis in (0, 1) if light else ():
         first, second = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
         near = np.maximum(inverse_depth[first], inverse_depth[second])
         differs = np.abs(inverse_depth[first] - inverse_depth[second]) > DEPTH_STEP * near
         differs |= (surfaces[first] != surfaces[second]) | (lit[first] != lit[second])
         edges[first] |= differs
         edges[second] |= differs
-    return edges
+    return picture, radiance.reshape(*size, 3) if light else radiance, edges
 
 
 def _blocks(count: int, rays_each: int) -> Iterator[slice]:

@@ -10,7 +10,7 @@ from drivesplat.settings.world import WorldLidarSettings
 from drivesplat.world.optics.lighting import facing_normal, texture_point
 from drivesplat.world.optics.materials import GLASS, LEAVES, METAL, PAINT, ROAD_, SIGN, surface
 from drivesplat.world.optics.patterns import compiled
-from drivesplat.world.optics.raycast import NO_HIT, RayHits, StreetRays, StreetSnapshot
+from drivesplat.world.optics.raycast import NO_HIT, StreetRays, StreetSnapshot
 
 ELEVATIONS = {32: np.radians(np.linspace(-30.67, 10.67, 32)), 64: np.radians(np.linspace(-24.8, 2.0, 64))}
 """Of the Velodyne HDL-32E, which nuScenes uses, and of the HDL-64E (KITTI's); lowest first."""
@@ -88,9 +88,26 @@ def scan(
     lidar: WorldLidarSettings, wet: float, random: np.random.Generator,
 ) -> StreetScan:  # fmt: skip
     """One revolution. `seconds` (m,) are the times of the pattern's moments, `sensor_to_street` (m, 4, 4) the poses."""
-    found = [_cast(snapshot, pattern, sensor_to_street, seconds, wet, *offset) for offset in _beam_offsets(lidar)]
+    # upward and sideward angles (radians) of the rays that stand for one beam; the first is its axis
+    half = lidar.divergence_mrad / 2000.0
+    offsets = [(0.0, 0.0), *(((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half)) if half else ())]
+    found = [_cast(snapshot, pattern, sensor_to_street, seconds, wet, *offset) for offset in offsets]
     distance, power, objects = (np.stack(values) for values in zip(*found, strict=True))
-    true_range, intensity, hit, echo = _strongest_echo(distance, power, objects)
+    # the range, reflected fraction and object of each beam's axis, or of its strongest echo where other rays hit a
+    # surface nearer or farther; and the range of that echo, the mean of its rays
+    echo_power = np.zeros_like(power)
+    echo_range = np.zeros_like(distance)
+    for ray in range(len(distance)):
+        with np.errstate(invalid="ignore"):
+            same = np.isfinite(distance) & (np.abs(distance - distance[ray]) < EDGE_GAP)
+        weight = np.where(same, power / len(power), 0.0)
+        echo_power[ray] = weight.sum(axis=0)
+        total = np.maximum(echo_power[ray], 1e-12)
+        echo_range[ray] = (weight * np.where(same, distance, 0.0)).sum(axis=0) / total
+    best = np.argmax(echo_power + 1e-9 * (np.arange(len(power)) == 0)[:, None, None], axis=0)[None]
+    chosen = (np.take_along_axis(a, best, axis=0)[0] for a in (distance, echo_power, objects, echo_range))
+    true_range, intensity, hit, echo = chosen
+    echo = np.where(intensity > 0.0, echo, true_range)
     weakest = 0.05 * (true_range / MAX_RANGE) ** 2
     in_range = (hit != NO_HIT) & (true_range > MIN_RANGE) & (true_range < MAX_RANGE)
     returned = in_range & (intensity > np.where(in_range, weakest, 0.0) * random.uniform(0.5, 1.5, pattern.shape))
@@ -112,12 +129,6 @@ def returns(
     return np.column_stack([points, intensity, ring]).astype(np.float32)
 
 
-def _beam_offsets(lidar: WorldLidarSettings) -> list[tuple[float, float]]:
-    """Upward and sideward angles (radians) of the rays that stand for one beam; the first is its axis."""
-    half = lidar.divergence_mrad / 2000.0
-    return [(0.0, 0.0), *(((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half)) if half else ())]
-
-
 def _cast(
     snapshot: StreetSnapshot, pattern: ScanPattern, sensor_to_street: np.ndarray, seconds: np.ndarray, wet: float,
     up: float, aside: float,
@@ -129,39 +140,12 @@ def _cast(
     moment = np.tile(of_step, len(pattern.elevations))
     rays = StreetRays(seconds, sensor_to_street[:, :3, 3], directions, moment)
     hits = snapshot.cast(rays)
-    power = _reflected(snapshot, rays, hits, wet)
-    return hits.distance.reshape(pattern.shape), power.reshape(pattern.shape), hits.object.reshape(pattern.shape)
-
-
-def _strongest_echo(
-    distance: np.ndarray, power: np.ndarray, objects: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Per beam, of the rays that stand for it (rays, beams, steps): the range, the reflected fraction and the object of
-    its axis, or of the strongest echo where other rays hit a surface nearer or farther; and the range of that echo,
-    the mean of its rays."""
-    echo_power = np.zeros_like(power)
-    echo_range = np.zeros_like(distance)
-    for ray in range(len(distance)):
-        with np.errstate(invalid="ignore"):
-            same = np.isfinite(distance) & (np.abs(distance - distance[ray]) < EDGE_GAP)
-        weight = np.where(same, power / len(power), 0.0)
-        echo_power[ray] = weight.sum(axis=0)
-        total = np.maximum(echo_power[ray], 1e-12)
-        echo_range[ray] = (weight * np.where(same, distance, 0.0)).sum(axis=0) / total
-    best = np.argmax(echo_power + 1e-9 * (np.arange(len(power)) == 0)[:, None, None], axis=0)[None]
-    chosen = (np.take_along_axis(a, best, axis=0)[0] for a in (distance, echo_power, objects, echo_range))
-    true_range, intensity, hit, echo = chosen
-    return true_range, intensity, hit, np.where(intensity > 0.0, echo, true_range)
-
-
-def _reflected(snapshot: StreetSnapshot, rays: StreetRays, hits: RayHits, wet: float) -> np.ndarray:
-    """The fraction of light (n,) that each ray's surface returns: reflectivity times the cosine of incidence."""
     reflected, caster = np.zeros(len(rays)), snapshot.caster
     _reflect(
         rays.directions, hits.face, hits.normal, hits.weights, caster.texture, caster.texture_normal, caster.material,
         caster.color, wet, reflected,
     )  # fmt: skip
-    return reflected
+    return hits.distance.reshape(pattern.shape), reflected.reshape(pattern.shape), hits.object.reshape(pattern.shape)
 
 
 @compiled

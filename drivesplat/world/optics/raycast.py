@@ -37,10 +37,6 @@ class StreetRays:
     def __len__(self) -> int:
         return len(self.directions)
 
-    def starts(self) -> np.ndarray:
-        """Origins (n, 3)."""
-        return self.origins[self.moment]
-
 
 @dataclass(frozen=True)
 class RayHits:
@@ -121,7 +117,13 @@ class RayCaster:
                 pieces = zip(item.body.pieces, firsts, strict=True)
                 scenes = tuple(EmbreePiece([mesh], [number], [first]) for mesh, first in pieces)
                 spheres = tuple(_bounding_sphere(mesh) for mesh in item.body.pieces)
-                self._moving.append(MovingObject(item, scenes, spheres, _sphere_around(item, spheres)))
+                # a sphere in the object's frame around those of its pieces, at the times sampled
+                center, radius = np.array([0.0, 0.0, item.size[2] / 2]), 0.0
+                poses = item.body.poses(np.linspace(0.0, 6.0, SAMPLED_TIMES), np.linspace(0.0, 10.0, SAMPLED_TIMES))
+                for piece, sphere in enumerate(spheres):
+                    places = sphere.centers(poses[:, piece])
+                    radius = max(radius, float(np.linalg.norm(places - center, axis=1).max()) + sphere.radius)
+                self._moving.append(MovingObject(item, scenes, spheres, Sphere(center, 1.02 * radius)))
             else:
                 poses = item.piece_poses(np.zeros(1))[0]
                 placed = (mesh.transformed(pose) for mesh, pose in zip(item.body.pieces, poses, strict=True))
@@ -134,17 +136,14 @@ class RayCaster:
         edges = self.texture[:, 1:] - self.texture[:, :1]
         normals = np.cross(edges[:, 0], edges[:, 1])
         self.texture_normal = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        self.surface = self._surfaces(meshes)
-
-    def _surfaces(self, meshes: Sequence[ColoredMesh]) -> np.ndarray:
-        """The number (f,) of each face's surface: faces of one object, material, colour and direction share it."""
+        # faces of one object, material, colour and direction are one surface
         owners = [number for number, item in enumerate(self.objects) for _ in item.body.pieces]
         owner = np.repeat(owners, [len(mesh.faces) for mesh in meshes])
         rows = [owner, self.material, *(255 * self.color).round().T, *(8 * self.texture_normal).round().T]
         columns = np.stack(rows).astype(np.int64)
         columns -= columns.min(axis=1, keepdims=True)
         key = np.ravel_multi_index(tuple(columns), columns.max(axis=1) + 1)
-        return np.unique(key, return_inverse=True)[1]
+        self.surface = np.unique(key, return_inverse=True)[1]
 
     def at(self, seconds: np.ndarray, without: Collection[str] = ()) -> "StreetSnapshot":
         """The street at the times `seconds` (m,), without the moving objects of these names."""
@@ -172,7 +171,7 @@ class StreetSnapshot:
         )  # fmt: skip
         if self.caster._static is not None:
             static = self.caster._static
-            _keep_nearer(hits, static, static.intersect(rays.starts(), rays.directions), np.arange(count))
+            _keep_nearer(hits, static, static.intersect(rays.origins[rays.moment], rays.directions), np.arange(count))
         for piece, poses, chosen in self._near(rays.directions, rays.moment, rays.origins, per_ray=False):
             start, at = rays.origins[rays.moment[chosen]], rays.moment[chosen]
             origins, toward = _in_frame(poses[:, :3, :3], poses[:, :3, 3], at, start, rays.directions[chosen])
@@ -212,19 +211,9 @@ class StreetSnapshot:
 
 def _bounding_sphere(mesh: ColoredMesh) -> Sphere:
     """A sphere around a mesh, with room for rounding."""
-    center, radius = mesh.bounding_sphere
+    center = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(mesh.vertices - center, axis=1).max())
     return Sphere(center, 1.001 * radius + 1e-3)
-
-
-def _sphere_around(item: StreetObject, spheres: Sequence[Sphere]) -> Sphere:
-    """A sphere in an object's frame around the `spheres` of all its pieces, at the times sampled."""
-    center = np.array([0.0, 0.0, item.size[2] / 2])
-    poses = item.body.poses(np.linspace(0.0, 6.0, SAMPLED_TIMES), np.linspace(0.0, 10.0, SAMPLED_TIMES))
-    radius = 0.0
-    for number, sphere in enumerate(spheres):
-        places = sphere.centers(poses[:, number])
-        radius = max(radius, float(np.linalg.norm(places - center, axis=1).max()) + sphere.radius)
-    return Sphere(center, 1.02 * radius)
 
 
 def _keep_nearer(

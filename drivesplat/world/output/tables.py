@@ -31,35 +31,35 @@ class NuScenesTables(TableRows):
         log = {"logfile": f"demo-{source}", "vehicle": "demo", "date_captured": "2026-01-01", "location": "demo"}
         super().__init__(token(scene, "log"), log, ATTRIBUTES)
         for sensor in recording_sensors(world):
-            self._sensor(sensor, world)
+            # readout_s, readout_direction, beam_elevations, azimuth_steps and spin are additions to nuScenes' schema
+            modality = "camera" if sensor.is_camera else "lidar"
+            self.add("sensor", token("sensor", sensor.channel), channel=sensor.channel, modality=modality)
+            if sensor.is_camera:
+                shutter = {"readout_s": world.readout_s, "readout_direction": "down"}
+                details = {
+                    "camera_intrinsic": sensor.intrinsics(world.width).tolist(),
+                    **(shutter if world.readout_s else {}),
+                }
+            else:
+                pattern = scan_pattern(world.lidar, world.lidar_hz)
+                steps = len(pattern.azimuths)
+                details = {
+                    "camera_intrinsic": [], "beam_elevations": pattern.elevations.tolist(), "azimuth_steps": steps,
+                    **({"spin": spin_of(world.lidar_hz)} if world.lidar.spins else {}),
+                }  # fmt: skip
+            self.add(
+                "calibrated_sensor",
+                token("calibrated", sensor.channel),
+                sensor_token=token("sensor", sensor.channel),
+                translation=list(sensor.translation),
+                rotation=sensor.rotation.tolist(),
+                **details,
+            )
         self._scene_row = self.add(
             "scene", token(scene), log_token=token(scene, "log"), nbr_samples=0, first_sample_token="",
             last_sample_token="", name=f"scene-{scene}", description=description,
         )  # fmt: skip
         self._start_us = start_us
-
-    def _sensor(self, sensor: RigSensor, world: WorldSettings) -> None:
-        """`readout_s`, `readout_direction`, `beam_elevations`, `azimuth_steps` and `spin` are additions to nuScenes'
-        schema."""
-        modality = "camera" if sensor.is_camera else "lidar"
-        self.add("sensor", token("sensor", sensor.channel), channel=sensor.channel, modality=modality)
-        if sensor.is_camera:
-            shutter = {"readout_s": world.readout_s, "readout_direction": "down"}
-            details = {
-                "camera_intrinsic": sensor.intrinsics(world.width).tolist(),
-                **(shutter if world.readout_s else {}),
-            }
-        else:
-            pattern = scan_pattern(world.lidar, world.lidar_hz)
-            steps = len(pattern.azimuths)
-            details = {
-                "camera_intrinsic": [], "beam_elevations": pattern.elevations.tolist(), "azimuth_steps": steps,
-                **({"spin": spin_of(world.lidar_hz)} if world.lidar.spins else {}),
-            }  # fmt: skip
-        self.add(
-            "calibrated_sensor", token("calibrated", sensor.channel), sensor_token=token("sensor", sensor.channel),
-            translation=list(sensor.translation), rotation=sensor.rotation.tolist(), **details,
-        )  # fmt: skip
 
     def add_sample(self, index: int, time_us: int) -> None:
         """Adds a key frame, `time_us` after the start of the drive."""

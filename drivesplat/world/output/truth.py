@@ -20,7 +20,7 @@ from drivesplat.readers.truth import (
 )  # fmt: skip
 from drivesplat.scene.images import write_png
 from drivesplat.scene.rigid import apply, inverse
-from drivesplat.world.optics.imaging import StreetImage, to_bytes
+from drivesplat.world.optics.imaging import to_bytes
 from drivesplat.world.optics.rig import SENSORS, RigSensor, image_height, key_frame_time
 from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
 from drivesplat.world.shapes.mesh import SurfaceClass
@@ -33,65 +33,39 @@ CLEARANCE = 0.3
 
 @dataclass(frozen=True)
 class TruthPlan:
-    """A view to write: its camera and viewpoint, and the folder below truth/."""
+    """A view, or scans, to write: the camera or LiDAR, its viewpoint, and the folder below truth/."""
 
     sensor: RigSensor
     viewpoint: Viewpoint
     folder: str
 
 
-@dataclass(frozen=True)
-class ScanPlan:
-    """LiDAR scans to write: their viewpoint, and the folder below truth/."""
-
-    viewpoint: Viewpoint
-    folder: str
-
-
-def planned_views(recorder: Recorder) -> list[TruthPlan]:
-    """The views of each camera with truth: recorded, lateral, without the leading vehicle, edited."""
-    plans, settings, viewpoints = [], recorder.world.truth, _viewpoints(recorder)
-    for sensor in SENSORS:
-        if sensor.channel in settings.cameras:
-            plans += [TruthPlan(sensor, view, f"{sensor.channel}/{name}") for name, view in viewpoints.items()]
-    return plans
-
-
-def planned_scans(recorder: Recorder) -> list[ScanPlan]:
-    """The scans of the LiDAR: recorded, lateral, without the leading vehicle, edited; none unless the settings ask for
-    them."""
-    if not recorder.world.truth.lidar:
-        return []
-    return [ScanPlan(view, f"lidar/{name}") for name, view in _viewpoints(recorder).items()]
-
-
-def _viewpoints(recorder: Recorder) -> dict[str, Viewpoint]:
-    """The viewpoints of truth, by the names of their folders."""
-    viewpoints = {"recorded": Viewpoint(), **_lateral(recorder)}
+def planned(recorder: Recorder) -> list[TruthPlan]:
+    """The views of each camera with truth, and the scans of the LiDAR if the settings ask for them: recorded, lateral,
+    without the leading vehicle, edited."""
+    truth = recorder.world.truth
+    offsets = dict.fromkeys(offset for offset in truth.lateral_m if offset)
+    viewpoints = {"recorded": Viewpoint()}
+    viewpoints |= {f"{'left' if m > 0 else 'right'}_{abs(m):g}m": Viewpoint(left=m) for m in offsets}
     if recorder.street.leading:
         viewpoints["without_leading"] = Viewpoint(without=recorder.street.leading)
-    return viewpoints | {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+    viewpoints |= {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+    folders = {sensor: sensor.channel for sensor in SENSORS if sensor.channel in truth.cameras}
+    folders |= {LIDAR: "lidar"} if truth.lidar else {}
+    return [TruthPlan(at, view, f"{top}/{name}") for at, top in folders.items() for name, view in viewpoints.items()]
 
 
 def key_frames_of(recorder: Recorder, plan: TruthPlan) -> list[int]:
     """The key frames of a view: all but those at which its camera is inside an object or about to touch one."""
-    return [i for i in range(recorder.world.key_frames) if not _touches(recorder, plan, i)]
-
-
-def _touches(recorder: Recorder, plan: TruthPlan, index: int) -> bool:
-    seconds = np.array([(key_frame_time(recorder.world, index) + plan.sensor.delay_us) * 1e-6])
-    center = (recorder.ego_to_street(seconds, plan.viewpoint)[0] @ plan.sensor.sensor_to_ego)[:3, 3]
-    for item in recorder.variation(plan.viewpoint.edit).street.objects:
-        if item.category and item.name != plan.viewpoint.without:
-            beside = np.abs(apply(inverse(item.box_poses(seconds)[0]), center[None])[0])
-            if (beside < item.size / 2 + CLEARANCE).all():
-                return True
-    return False
-
-
-def _lateral(recorder: Recorder) -> dict[str, Viewpoint]:
-    offsets = dict.fromkeys(offset for offset in recorder.world.truth.lateral_m if offset)
-    return {f"{'left' if m > 0 else 'right'}_{abs(m):g}m": Viewpoint(left=m) for m in offsets}
+    view, free = plan.viewpoint, []
+    others = [it for it in recorder.variation(view.edit).street.objects if it.category and it.name != view.without]
+    for index in range(recorder.world.key_frames):
+        seconds = np.array([(key_frame_time(recorder.world, index) + plan.sensor.delay_us) * 1e-6])
+        center = (recorder.ego_to_street(seconds, view)[0] @ plan.sensor.sensor_to_ego)[:3, 3]
+        beside = ((it, np.abs(apply(inverse(it.box_poses(seconds)[0]), center[None])[0])) for it in others)
+        if not any((distance < it.size / 2 + CLEARANCE).all() for it, distance in beside):
+            free.append(index)
+    return free
 
 
 def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> TruthFrame:
@@ -100,8 +74,12 @@ def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> 
     time_us = key_frame_time(recorder.world, index) + sensor.delay_us
     recorded = view == Viewpoint() and sensor.channel in (recorder.world.cameras or ())
     picture = (recorder.geometry if recorded else recorder.picture)(sensor, time_us, view)
-    images = {"depth": _depth(picture), "instances": _instances(recorder, view, picture)}
-    images["classes"] = picture.classes
+    depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNITS_PER_METRE, 0.0)
+    images = {
+        "depth": np.clip(depth + 0.5, 0, DEPTH_LIMIT).astype(np.uint16),
+        "instances": _numbers_of_objects(recorder, view)[picture.objects + 1],
+        "classes": picture.classes,
+    }
     if not recorded:
         images["image"] = to_bytes(picture.radiance)
     names = {kind: f"{plan.folder}/{kind}/{index:04}.png" for kind in images}
@@ -110,15 +88,6 @@ def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> 
     pose = STREET_TO_GLOBAL @ recorder.camera(sensor, time_us * 1e-6, view).pose
     image = token(recorder.scene, sensor.channel, time_us)
     return TruthFrame(image, index, pose.tolist(), **{"image": None, **names})
-
-
-def _depth(picture: StreetImage) -> np.ndarray:
-    depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNITS_PER_METRE, 0.0)
-    return np.clip(depth + 0.5, 0, DEPTH_LIMIT).astype(np.uint16)
-
-
-def _instances(recorder: Recorder, view: Viewpoint, picture: StreetImage) -> np.ndarray:
-    return _numbers_of_objects(recorder, view)[picture.objects + 1]
 
 
 def instance_numbers(recorder: Recorder) -> dict[str, int]:
@@ -136,20 +105,20 @@ def _numbers_of_objects(recorder: Recorder, view: Viewpoint) -> np.ndarray:
     return np.array([0, *(numbers.get(recorder.instance(item.name), 0) for item in objects)], dtype=np.uint8)
 
 
-def write_scan(root: Path, recorder: Recorder, plan: ScanPlan, index: int) -> TruthScan:
+def write_scan(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> TruthScan:
     """Casts and writes the LiDAR scan of key frame `index`."""
+    view = plan.viewpoint
     time_us = key_frame_time(recorder.world, index) + LIDAR.delay_us
-    found = recorder.scan(LIDAR, time_us, plan.viewpoint)
+    found = recorder.scan(LIDAR, time_us, view)
     name = f"{plan.folder}/{index:04}.npz"
     with atomic_write((root / TRUTH_FILE).parent / name) as file:
         np.savez_compressed(
             file,
             range=found.range.astype(np.float32),
             intensity=found.intensity.astype(np.float32),
-            instance=_numbers_of_objects(recorder, plan.viewpoint)[found.object + 1],
+            instance=_numbers_of_objects(recorder, view)[found.object + 1],
             returned=found.returned,
         )
-    view = plan.viewpoint
     without = recorder.instance(view.without) if view.without else None
     pose = STREET_TO_GLOBAL @ recorder.ego_to_street(np.array([time_us * 1e-6]), view)[0] @ LIDAR.sensor_to_ego
     sweep = token(recorder.scene, LIDAR.channel, time_us)

@@ -68,8 +68,36 @@ class Dog:
             limb(HIND_LEG[1], (0.055, 0.046, 0.046), plain, fur),
         ]
         links_of_legs = [group[i] for group in (uppers, lowers) for i in (0, 0, 1, 1)]
-        pieces = [_body(fur), _head(fur), limb(0.36, (0.05, 0.06, 0.05, 0.025), plain, fur), *links_of_legs]
-        pieces = [*pieces, *([_paw(fur)] * 4)]
+        # the head, with its origin at the neck's base: neck, collar, skull with muzzle, nose, ears
+        neck = limb(0.34, (0.15, 0.13, 0.11), Material.PLAIN, fur)
+        collar = loft([(-0.2, 0.0, 0.137, 0.137), (-0.24, 0.0, 0.133, 0.133)], Material.CLOTH, COLLAR)
+        up = oriented(np.zeros((1, 3)), pitch=np.radians(180.0 + 40.0))[0]
+        skull = [
+            (-0.1, 0.0, 0.06, 0.06), (-0.04, -0.01, 0.115, 0.11), (0.05, -0.01, 0.12, 0.115), (0.11, 0.02, 0.09, 0.085),
+            (0.15, 0.04, 0.072, 0.065), (0.24, 0.045, 0.066, 0.056), (0.28, 0.045, 0.04, 0.04),
+        ]  # fmt: skip
+        center = np.array([0.25, 0.0, 0.3])
+        parts = [neck.transformed(up), collar.transformed(up)]
+        parts.append(loft(skull, Material.PLAIN, fur).transformed(_LAID_DOWN).moved(center))
+        parts.append(ellipsoid(np.add(center, (0.275, 0.0, -0.012)), (0.024, 0.027, 0.022), Material.PLAIN, DARK))
+        flap = [(-0.05, 0.08, 0.015), (0.04, 0.08, 0.015), (-0.05, -0.09, 0.012), (0.03, -0.1, 0.012)]
+        ear = symmetric_hull(flap, Material.PLAIN, shade(fur, 0.5))
+        trunk = [
+            (-0.54, -0.06, 0.08, 0.07), (-0.47, -0.05, 0.16, 0.13), (-0.3, -0.03, 0.19, 0.16),
+            (-0.05, 0.0, 0.205, 0.165), (0.2, 0.01, 0.25, 0.18), (0.36, -0.02, 0.24, 0.165),
+            (0.46, -0.06, 0.17, 0.13), (0.52, -0.08, 0.09, 0.08),
+        ]  # fmt: skip
+        pieces = [
+            loft(trunk, plain, fur, 12).transformed(_LAID_DOWN),
+            concatenate([*parts, *(ear.moved(np.add(center, (-0.02, side * 0.11, 0.01))) for side in (-1, 1))]),
+            limb(0.36, (0.05, 0.06, 0.05, 0.025), plain, fur),
+            *links_of_legs,
+        ]
+        profile = [
+            (-0.045, -PAW_HEIGHT, 0.035), (0.065, -PAW_HEIGHT, 0.045), (0.08, -0.02, 0.035), (0.03, 0.03, 0.035),
+            (-0.05, 0.01, 0.03),
+        ]  # fmt: skip
+        pieces += [symmetric_hull(profile, Material.PLAIN, fur)] * 4
         return tuple(in_metres(piece, self.height).classified(SurfaceClass.ANIMAL) for piece in pieces)
 
     @cached_property
@@ -87,7 +115,9 @@ class Dog:
         look = 0.0 if self.walks else 0.5 * np.sin(2.0 * np.pi * seconds / 6.1)
         head = oriented(placed(body, NECK)[:, 0], look, 2.0 * bob)
         tail = oriented(placed(body, TAIL_ROOT)[:, 0], 0.5 * np.sin(2.0 * np.pi * 1.8 * seconds), 2.0)
-        paws, pitch = self._paws(cycles)
+        x, lift, pitch = trot(cycles[:, None] + LEG_PHASES) if self.walks else np.zeros((3, len(cycles), 4))
+        y = np.broadcast_to(0.9 * LEG_ROOTS[:, 1], x.shape)
+        paws = np.stack([LEG_ROOTS[:, 0] + x, y, PAW_HEIGHT + lift], axis=-1)
         roots = placed(body, LEG_ROOTS)
         backward, left = np.array([-1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
         pairs = ((slice(0, 2), FRONT_LEG), (slice(2, 4), HIND_LEG))
@@ -97,12 +127,6 @@ class Dog:
         poses = np.concatenate([trunk, links(roots, joints, left), links(joints, paws, left), feet], axis=1)
         poses[..., :3, 3] *= self.height
         return poses
-
-    def _paws(self, cycles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joints of the paws (n, 4, 3) and their pitches (n, 4)."""
-        x, lift, pitch = trot(cycles[:, None] + LEG_PHASES) if self.walks else np.zeros((3, len(cycles), 4))
-        y = np.broadcast_to(0.9 * LEG_ROOTS[:, 1], x.shape)
-        return np.stack([LEG_ROOTS[:, 0] + x, y, PAW_HEIGHT + lift], axis=-1), pitch
 
 
 def trot(phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -119,39 +143,5 @@ def trot(phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.where(phases < 0.5, stance, forward + slowing), LIFT * arc, SWING_PITCH * arc
 
 
-def _body(fur: Color) -> ColoredMesh:
-    """Built along z, then laid down: -x becomes up."""
-    rings = [
-        (-0.54, -0.06, 0.08, 0.07), (-0.47, -0.05, 0.16, 0.13), (-0.3, -0.03, 0.19, 0.16), (-0.05, 0.0, 0.205, 0.165),
-        (0.2, 0.01, 0.25, 0.18), (0.36, -0.02, 0.24, 0.165), (0.46, -0.06, 0.17, 0.13), (0.52, -0.08, 0.09, 0.08),
-    ]  # fmt: skip
-    return loft(rings, Material.PLAIN, fur, 12).transformed(_LAID_DOWN)
-
-
-def _head(fur: Color) -> ColoredMesh:
-    """Neck, collar, skull, muzzle, ears and nose; the origin is the neck's base."""
-    neck = limb(0.34, (0.15, 0.13, 0.11), Material.PLAIN, fur)
-    collar = loft([(-0.2, 0.0, 0.137, 0.137), (-0.24, 0.0, 0.133, 0.133)], Material.CLOTH, COLLAR)
-    up = oriented(np.zeros((1, 3)), pitch=np.radians(180.0 + 40.0))[0]
-    skull = [
-        (-0.1, 0.0, 0.06, 0.06), (-0.04, -0.01, 0.115, 0.11), (0.05, -0.01, 0.12, 0.115), (0.11, 0.02, 0.09, 0.085),
-        (0.15, 0.04, 0.072, 0.065), (0.24, 0.045, 0.066, 0.056), (0.28, 0.045, 0.04, 0.04),
-    ]  # fmt: skip
-    center = np.array([0.25, 0.0, 0.3])
-    parts = [neck.transformed(up), collar.transformed(up)]
-    parts.append(loft(skull, Material.PLAIN, fur).transformed(_LAID_DOWN).moved(center))
-    parts.append(ellipsoid(np.add(center, (0.275, 0.0, -0.012)), (0.024, 0.027, 0.022), Material.PLAIN, DARK))
-    flap = [(-0.05, 0.08, 0.015), (0.04, 0.08, 0.015), (-0.05, -0.09, 0.012), (0.03, -0.1, 0.012)]
-    ear = symmetric_hull(flap, Material.PLAIN, shade(fur, 0.5))
-    return concatenate([*parts, *(ear.moved(np.add(center, (-0.02, side * 0.11, 0.01))) for side in (-1, 1))])
-
-
-def _paw(fur: Color) -> ColoredMesh:
-    profile = [
-        (-0.045, -PAW_HEIGHT, 0.035), (0.065, -PAW_HEIGHT, 0.045), (0.08, -0.02, 0.035), (0.03, 0.03, 0.035),
-        (-0.05, 0.01, 0.03),
-    ]  # fmt: skip
-    return symmetric_hull(profile, Material.PLAIN, fur)
-
-
 _LAID_DOWN = oriented(np.zeros((1, 3)), pitch=np.pi / 2)[0]
+"""What is built along z, laid down: -x becomes up."""

@@ -47,8 +47,46 @@ class BicycleFrame:
 
 def frame_mesh(frame: BicycleFrame, color: Color, luggage: bool) -> ColoredMesh:
     """Everything of a bicycle that does not turn; `luggage`: with panniers and a basket."""
-    parts = [*_tubes(frame, color), *_handlebar(frame), _saddle(frame), *_mudguards(color), *_chain_case(color)]
-    return concatenate([*parts, *(_luggage(frame) if luggage else [])])
+    front, rear = AXLES
+    lug = BOTTOM_BRACKET + 0.68 * (frame.saddle - BOTTOM_BRACKET)
+    crown = frame.head + 0.33 * (front - frame.head)
+    mains = [(BOTTOM_BRACKET, lug, 0.02), (lug, frame.head + 0.1 * (front - frame.head), 0.018),
+             (BOTTOM_BRACKET, crown, 0.022), (frame.head, crown, 0.024), (lug, frame.saddle, 0.014)]  # fmt: skip
+    aside = np.array([0.0, 0.06, 0.0])
+    stays = [
+        (joint, axle + side * aside, 0.011)
+        for side in (-1, 1)
+        for joint, axle in ((BOTTOM_BRACKET, rear), (lug, rear), (crown + 0.8 * side * aside, front))
+    ]
+    parts = [cylinder(start, end, radius, Material.METAL, color) for start, end, radius in [*mains, *stays]]
+    axis = (frame.head - AXLES[0]) / np.linalg.norm(frame.head - AXLES[0])
+    top = frame.head + 0.13 * axis
+    parts.append(cylinder(frame.head, top, 0.014, Material.METAL, METAL))
+    for side, grip in ((1, frame.grip), (-1, frame.grip * (1.0, -1.0, 1.0))):
+        bend = top + np.array([0.0, side * 0.2, 0.02])
+        parts.append(cylinder(top, bend, 0.012, Material.METAL, METAL))
+        parts.append(cylinder(bend, grip, 0.016, Material.PLAIN, TYRE))
+    shape = [(-0.13, 0.0, 0.08), (-0.13, 0.03, 0.07), (-0.05, -0.05, 0.05), (0.14, 0.02, 0.018), (0.14, -0.02, 0.015)]
+    parts.append(symmetric_hull(shape, Material.PLAIN, LEATHER).moved(frame.saddle))
+    # mudguards: arcs of plates above the wheels
+    plate = box((-0.07, -0.03, WHEEL_RADIUS + 0.015), (0.075, 0.03, WHEEL_RADIUS + 0.022), Material.METAL, color)
+    for axle, degrees in ((front, np.arange(-65.0, 40.0, 20.0)), (rear, np.arange(-105.0, 60.0, 20.0))):
+        poses = oriented(np.tile(axle, (len(degrees), 1)), pitch=np.radians(degrees))
+        parts += [plate.transformed(pose) for pose in poses]
+    y = -0.052  # of the chain case
+    inner, outer = np.array([0.0, y, 0.0]), np.array([0.0, y - 0.012, 0.0])
+    for center, radius in ((BOTTOM_BRACKET, 0.105), (rear, 0.055)):
+        parts.append(cylinder(center + outer, center + inner, radius, Material.METAL, color))
+    low = (rear[0], y - 0.012, WHEEL_RADIUS - 0.05)
+    parts.append(box(low, (BOTTOM_BRACKET[0], y, WHEEL_RADIUS + 0.045), Material.METAL, color))
+    if luggage:  # panniers beside the rear wheel, a basket in front of the handlebar
+        x, deck = rear[0], 2 * WHEEL_RADIUS + 0.04
+        parts.append(box((x - 0.22, -0.06, deck), (x + 0.2, 0.06, deck + 0.02), Material.METAL, METAL))
+        for low, high in ((0.07, 0.19), (-0.19, -0.07)):
+            parts.append(box((x - 0.22, low, deck - 0.36), (x + 0.16, high, deck + 0.01), Material.CLOTH, CANVAS))
+        x = frame.head[0] + 0.07
+        parts.append(box((x, -0.18, deck + 0.06), (x + 0.28, 0.18, deck + 0.32), Material.CLOTH, CANVAS))
+    return concatenate(parts)
 
 
 def wheel() -> ColoredMesh:
@@ -83,70 +121,3 @@ def pedals(crank_angle: np.ndarray) -> np.ndarray:
     y = np.broadcast_to(PEDAL_OFFSET * np.array([1.0, -1.0]), angles.shape)
     circle = np.stack([CRANK_LENGTH * np.cos(angles), y, -CRANK_LENGTH * np.sin(angles)], axis=-1)
     return BOTTOM_BRACKET + circle
-
-
-def _tubes(frame: BicycleFrame, color: Color) -> list[ColoredMesh]:
-    front, rear = AXLES
-    lug = BOTTOM_BRACKET + 0.68 * (frame.saddle - BOTTOM_BRACKET)
-    crown = frame.head + 0.33 * (front - frame.head)
-    mains = [(BOTTOM_BRACKET, lug, 0.02), (lug, frame.head + 0.1 * (front - frame.head), 0.018),
-             (BOTTOM_BRACKET, crown, 0.022), (frame.head, crown, 0.024), (lug, frame.saddle, 0.014)]  # fmt: skip
-    aside = np.array([0.0, 0.06, 0.0])
-    stays = [
-        (joint, axle + side * aside, 0.011)
-        for side in (-1, 1)
-        for joint, axle in ((BOTTOM_BRACKET, rear), (lug, rear), (crown + 0.8 * side * aside, front))
-    ]
-    return [cylinder(start, end, radius, Material.METAL, color) for start, end, radius in [*mains, *stays]]
-
-
-def _handlebar(frame: BicycleFrame) -> list[ColoredMesh]:
-    left, right = frame.grip, frame.grip * (1.0, -1.0, 1.0)
-    axis = (frame.head - AXLES[0]) / np.linalg.norm(frame.head - AXLES[0])
-    top = frame.head + 0.13 * axis
-    parts = [cylinder(frame.head, top, 0.014, Material.METAL, METAL)]
-    for side, grip in ((1, left), (-1, right)):
-        bend = top + np.array([0.0, side * 0.2, 0.02])
-        parts.append(cylinder(top, bend, 0.012, Material.METAL, METAL))
-        parts.append(cylinder(bend, grip, 0.016, Material.PLAIN, TYRE))
-    return parts
-
-
-def _saddle(frame: BicycleFrame) -> ColoredMesh:
-    shape = [(-0.13, 0.0, 0.08), (-0.13, 0.03, 0.07), (-0.05, -0.05, 0.05), (0.14, 0.02, 0.018), (0.14, -0.02, 0.015)]
-    return symmetric_hull(shape, Material.PLAIN, LEATHER).moved(frame.saddle)
-
-
-def _mudguards(color: Color) -> list[ColoredMesh]:
-    """Arcs of plates above the wheels."""
-    plate = box((-0.07, -0.03, WHEEL_RADIUS + 0.015), (0.075, 0.03, WHEEL_RADIUS + 0.022), Material.METAL, color)
-    arcs = ((AXLES[0], np.arange(-65.0, 40.0, 20.0)), (AXLES[1], np.arange(-105.0, 60.0, 20.0)))
-    return [
-        plate.transformed(pose)
-        for axle, degrees in arcs
-        for pose in oriented(np.tile(axle, (len(degrees), 1)), pitch=np.radians(degrees))
-    ]
-
-
-def _chain_case(color: Color) -> list[ColoredMesh]:
-    rear, y = AXLES[1], -0.052
-    inner, outer = np.array([0.0, y, 0.0]), np.array([0.0, y - 0.012, 0.0])
-    circles = [
-        cylinder(center + outer, center + inner, radius, Material.METAL, color)
-        for center, radius in ((BOTTOM_BRACKET, 0.105), (rear, 0.055))
-    ]
-    low = (rear[0], y - 0.012, WHEEL_RADIUS - 0.05)
-    return [*circles, box(low, (BOTTOM_BRACKET[0], y, WHEEL_RADIUS + 0.045), Material.METAL, color)]
-
-
-def _luggage(frame: BicycleFrame) -> list[ColoredMesh]:
-    """Panniers beside the rear wheel, a basket in front of the handlebar."""
-    rear, deck = AXLES[1], 2 * WHEEL_RADIUS + 0.04
-    rack = box((rear[0] - 0.22, -0.06, deck), (rear[0] + 0.2, 0.06, deck + 0.02), Material.METAL, METAL)
-    panniers = [
-        box((rear[0] - 0.22, min(y), deck - 0.36), (rear[0] + 0.16, max(y), deck + 0.01), Material.CLOTH, CANVAS)
-        for y in ((0.07, 0.19), (-0.19, -0.07))
-    ]
-    x = frame.head[0] + 0.07
-    basket = box((x, -0.18, deck + 0.06), (x + 0.28, 0.18, deck + 0.32), Material.CLOTH, CANVAS)
-    return [rack, *panniers, basket]

@@ -30,7 +30,13 @@ def building(low: Numbers, high: Numbers, color: Color, random: np.random.Genera
     """
     low, high = np.array(low, dtype=float), np.array(high, dtype=float)
     roof_low, roof_high = (low[0] - 0.3, low[1] - 0.3, high[2]), (high[0] + 0.3, high[1] + 0.3, high[2] + 0.4)
-    parts = [_walls(low, high, color), box(roof_low, roof_high, Material.PLAIN, METAL)]
+    walls = box(low, high, Material.FACADE, color)
+    # the texture is stretched so that whole cells fit, and starts at a whole cell
+    cells = np.array([WINDOW[0], WINDOW[0], WINDOW[1]])
+    count = np.maximum(1, np.round((high - low) / cells))
+    first = np.array([*np.floor(low[:2] / WINDOW[0]), 0.0])
+    texture = cells * (first + count * (walls.vertices - low) / (high - low))
+    parts = [replace(walls, texture=texture), box(roof_low, roof_high, Material.PLAIN, METAL)]
     if random is not None:
         front = low[1] if abs(low[1]) <= abs(high[1]) else high[1]
         columns, floors = (max(1, round(size / cell)) for size, cell in zip((high - low)[::2], WINDOW, strict=True))
@@ -102,15 +108,6 @@ def hanging_sign(color: Color) -> ColoredMesh:
     panel = replace(panel, texture=panel.vertices - panel.vertices.mean(axis=0))
     bar = cylinder((0.0, 0.0, 3.25), (0.0, 0.9, 3.25), 0.02, Material.METAL, METAL)
     return concatenate([panel, bar]).classified(SurfaceClass.BUILDING)
-
-
-def _walls(low: np.ndarray, high: np.ndarray, color: Color) -> ColoredMesh:
-    """A box whose texture is stretched so that whole cells fit, and starts at a whole cell."""
-    walls = box(low, high, Material.FACADE, color)
-    cells = np.array([WINDOW[0], WINDOW[0], WINDOW[1]])
-    count = np.maximum(1, np.round((high - low) / cells))
-    first = np.array([*np.floor(low[:2] / WINDOW[0]), 0.0])
-    return replace(walls, texture=cells * (first + count * (walls.vertices - low) / (high - low)))
 
 
 def _front(columns: int, floors: int, cell: np.ndarray, random: np.random.Generator) -> list[ColoredMesh]:

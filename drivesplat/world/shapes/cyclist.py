@@ -85,17 +85,22 @@ class Cyclist:
 
     @cached_property
     def pieces(self) -> tuple[ColoredMesh, ...]:
-        human = dict(zip(HUMAN_PIECES, human_pieces(self.height, self._clothing), strict=True))
-        poses = dict(
-            zip(HUMAN_PIECES, human_poses(self._posture(np.zeros(1), np.zeros(1)), self.height)[0], strict=True)
-        )
+        clothing = Clothing(self.shirt, self.trousers, self.hair, self.skin, SHOES, skirt=0.0)
+        human = dict(zip(HUMAN_PIECES, human_pieces(self.height, clothing), strict=True))
+        resting = human_poses(self._posture(np.zeros(1), np.zeros(1)), self.height)[0]
+        poses = dict(zip(HUMAN_PIECES, resting, strict=True))
         if self.luggage:
-            human["torso"] = concatenate([human["torso"], in_metres(_backpack(), self.height)])
+            backpack = box((-0.24, -0.11, 0.0), (-0.06, 0.11, 0.25), Material.CLOTH, CANVAS)
+            human["torso"] = concatenate([human["torso"], in_metres(backpack, self.height)])
         upper = [human[name].transformed(poses[name]) for name in ("pelvis", "torso", *ARM_PIECES)]
         tread = pedal().moved((self.height * BALL[0], 0.0, self.height * BALL[1]))
         for name in ("left foot", "right foot"):
             human[name] = concatenate([human[name], tread])
-        helmeted = concatenate([head(self.skin, self.hair), _helmet(self.helmet)])
+        helmet = [
+            (0.108, -0.012, 0.064, 0.052), (0.13, -0.002, 0.073, 0.056), (0.155, -0.002, 0.066, 0.05),
+            (0.178, -0.004, 0.045, 0.034), (0.186, -0.004, 0.015, 0.012),
+        ]  # fmt: skip
+        helmeted = concatenate([head(self.skin, self.hair), loft(helmet, Material.PLAIN, self.helmet)])
         pieces = [
             frame_mesh(self._frame, self.bicycle, self.luggage), wheel(), wheel(), crank(), concatenate(upper),
             in_metres(helmeted, self.height), *(human[name] for name in LEG_PIECES),
@@ -121,10 +126,6 @@ class Cyclist:
         return np.concatenate([np.stack([fixed, *wheels, turning, fixed], axis=1), moving], axis=1)
 
     @property
-    def _clothing(self) -> Clothing:
-        return Clothing(self.shirt, self.trousers, self.hair, self.skin, SHOES, skirt=0.0)
-
-    @property
     def _hip(self) -> np.ndarray:
         """Centre of the hip joints (3,), metres."""
         along = np.array([-np.cos(SEAT_ANGLE), 0.0, np.sin(SEAT_ANGLE)])
@@ -147,27 +148,9 @@ class Cyclist:
         wrists = shoulders * (1.0, 0.0, 0.0) + WRIST + np.array([[0.0, 0.145, 0.0], [0.0, -0.145, 0.0]])
         elbow_bend = np.array([[-0.3, 0.5, -0.8], [-0.3, -0.5, -0.8]])
         elbows = two_link(shoulders, wrists, (UPPER_ARM, FOREARM), elbow_bend)
-        ankles, pitch = self._feet(crank_angle)
-        knees = two_link(placed(pelvis, HIPS), ankles, (THIGH, SHIN), np.array([1.0, 0.0, 0.0]))
-        return Posture(pelvis, torso, neck, elbows, wrists, knees, ankles, pitch)
-
-    def _feet(self, crank_angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Ankles (n, 2, 3) in body heights and pitches (n, 2): the balls of the feet are on the pedals."""
         centers = pedals(crank_angle) + np.array([0.0, 0.0, SOLE_ABOVE_PEDAL])
         pitch = FOOT_PITCH - ANKLING * (centers[..., 0] - BOTTOM_BRACKET[0]) / CRANK_LENGTH
         x, z = np.moveaxis(pitched(np.array(BALL), pitch), -1, 0)
-        return centers / self.height - np.stack([x, np.zeros_like(x), z], axis=-1), pitch
-
-
-def _backpack() -> ColoredMesh:
-    """In the torso's frame, in body heights."""
-    return box((-0.24, -0.11, 0.0), (-0.06, 0.11, 0.25), Material.CLOTH, CANVAS)
-
-
-def _helmet(color: Color) -> ColoredMesh:
-    """In the head's frame, in body heights."""
-    rings = [
-        (0.108, -0.012, 0.064, 0.052), (0.13, -0.002, 0.073, 0.056), (0.155, -0.002, 0.066, 0.05),
-        (0.178, -0.004, 0.045, 0.034), (0.186, -0.004, 0.015, 0.012),
-    ]  # fmt: skip
-    return loft(rings, Material.PLAIN, color)
+        ankles, pitch = centers / self.height - np.stack([x, np.zeros_like(x), z], axis=-1), pitch
+        knees = two_link(placed(pelvis, HIPS), ankles, (THIGH, SHIN), np.array([1.0, 0.0, 0.0]))
+        return Posture(pelvis, torso, neck, elbows, wrists, knees, ankles, pitch)

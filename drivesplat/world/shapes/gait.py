@@ -39,7 +39,11 @@ SIDES = np.array([1.0, -1.0])
 def walking(cycles: np.ndarray, left_arm_swing: float = 1.0) -> Posture:
     """Postures at `cycles` (n,) walking cycles; at 0, the left heel lands. An arm with a load swings less."""
     phases = np.stack([cycles, cycles + 0.5], axis=-1)
-    x, z, pitch = foot_path(phases)
+    # the ankles in the body's frame and the pitches of the feet, by the cycles since the heel landed
+    landed = phases % 1.0
+    swing_x, swing_z = np.moveaxis(_swing()(np.maximum(landed, STANCE)), -1, 0)
+    stance_x, stance_z = np.moveaxis(_stance(np.minimum(landed, STANCE)), -1, 0)
+    x, z = np.where(landed < STANCE, stance_x, swing_x), np.where(landed < STANCE, stance_z, swing_z)
     ankles = np.stack([x, np.broadcast_to(0.042 * SIDES, x.shape), z], axis=-1)
     turning, bobbing = 2.0 * np.pi * cycles, 4.0 * np.pi * (cycles - 0.26)
     pelvis = np.stack([np.zeros_like(cycles), 0.01 * np.sin(turning), HIP - 0.025 + 0.011 * np.cos(bobbing)], axis=-1)
@@ -47,7 +51,7 @@ def walking(cycles: np.ndarray, left_arm_swing: float = 1.0) -> Posture:
     free = np.array([left_arm_swing, 1.0])
     turn = np.cos(turning)
     return _posture(
-        pelvis, ankles, pitch,
+        pelvis, ankles, _pitch()(landed),
         pelvis_turn=-0.08 * turn, torso_turn=0.06 * turn, lean=np.full_like(cycles, 0.05), look=np.zeros_like(cycles),
         arm_swing=0.04 + 0.34 * free * swing, elbow_flexion=free * (0.3 + 0.16 * swing),
     )  # fmt: skip
@@ -68,16 +72,6 @@ def standing(seconds: np.ndarray) -> Posture:
         arm_swing=np.stack([0.04 + 0.02 * shift, 0.05 + 0.2 * gesture + 0.06 * wave], axis=-1),
         elbow_flexion=np.stack([0.2 + 0.03 * shift, 0.25 + 1.0 * gesture + 0.25 * wave], axis=-1),
     )  # fmt: skip
-
-
-def foot_path(phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The ankle's x and z in the body's frame, and the foot's pitch in radians, at `phases` (...) in cycles since the
-    heel landed."""
-    phases = phases % 1.0
-    swing_x, swing_z = np.moveaxis(_swing()(np.maximum(phases, STANCE)), -1, 0)
-    stance_x, stance_z = np.moveaxis(_stance(np.minimum(phases, STANCE)), -1, 0)
-    on_ground = phases < STANCE
-    return np.where(on_ground, stance_x, swing_x), np.where(on_ground, stance_z, swing_z), _pitch()(phases)
 
 
 def _stance(phases: np.ndarray) -> np.ndarray:
@@ -109,9 +103,7 @@ def _swing() -> CubicSpline:
     middle = np.array([[0.0, 0.105], [0.155, 0.068]])
     landing = (ends[3] - ends[2]) / step - np.array([0.0, 0.5])
     return CubicSpline(
-        [STANCE, 0.78, 0.9, 1.0],
-        [ends[1], *middle, ends[2]],
-        bc_type=((1, (ends[1] - ends[0]) / step), (1, landing)),
+        [STANCE, 0.78, 0.9, 1.0], [ends[1], *middle, ends[2]], bc_type=((1, (ends[1] - ends[0]) / step), (1, landing))
     )
 
 

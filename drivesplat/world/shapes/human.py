@@ -69,11 +69,25 @@ def human_pieces(height: float, clothing: Clothing) -> tuple[ColoredMesh, ...]:
     thigh = limb(THIGH, (0.05, 0.055, 0.05, 0.046), cloth, clothing.trousers)
     shin = limb(SHIN - 0.005, (0.045, 0.047, 0.042, 0.04), cloth, clothing.trousers)
     if clothing.skirt > 0.0:
-        thigh = concatenate([thigh, _coat_tail(clothing)])
-    forearm = concatenate([sleeve, _hand(clothing.skin)])
-    foot = _foot(clothing.shoes)
+        tail = [  # the half of the coat's skirt that moves with a thigh
+            (0.02, 0.0, 0.05, 0.04), (-0.01, 0.0, 0.074, 0.055), (-0.6 * clothing.skirt, 0.0, 0.082, 0.064),
+            (-clothing.skirt, 0.0, 0.086, 0.068),
+        ]  # fmt: skip
+        thigh = concatenate([thigh, loft(tail, cloth, clothing.coat)])
+    hand = [
+        (-FOREARM + 0.01, 0.0, 0.018, 0.014), (-FOREARM - 0.03, 0.004, 0.025, 0.013),
+        (-FOREARM - 0.065, 0.01, 0.021, 0.013), (-FOREARM - 0.09, 0.013, 0.01, 0.009),
+    ]  # fmt: skip
+    forearm = concatenate([sleeve, loft(hand, Material.PLAIN, clothing.skin, 8)])
+    profile = [
+        (*HEEL, 0.02), (*BALL, 0.029), (*TOE, 0.016), (0.1, 0.03 - ANKLE, 0.018), (0.06, 0.042 - ANKLE, 0.024),
+        (0.02, 0.03, 0.022), (-0.03, 0.03, 0.02), (-0.046, 0.03 - ANKLE, 0.018),
+    ]  # fmt: skip
+    foot = symmetric_hull(profile, Material.PLAIN, clothing.shoes)
+    hem = [(-0.8 * clothing.skirt, 0.0, 0.08, 0.1)] if clothing.skirt > 0.0 else [(-0.045, 0.0, 0.055, 0.08)]
+    pelvis = [(0.06, 0.0, 0.067, 0.086), (0.03, 0.0, 0.073, 0.093), (-0.01, -0.002, 0.082, 0.106), *hem]
     pieces = [
-        loft(_pelvis_rings(clothing.skirt), cloth, clothing.coat if clothing.skirt > 0.0 else clothing.trousers, 12),
+        loft(pelvis, cloth, clothing.coat if clothing.skirt > 0.0 else clothing.trousers, 12),
         loft(_TORSO_RINGS, cloth, clothing.coat, 12),
         head(clothing.skin, clothing.hair),
         *(upper_arm, upper_arm, forearm, forearm, thigh, thigh, shin, shin, foot, foot),
@@ -123,33 +137,3 @@ _TORSO_RINGS: list[Ring] = [
     (0.215, -0.002, 0.064, 0.112), (0.235, -0.004, 0.05, 0.1), (0.25, -0.006, 0.044, 0.072),
     (0.264, -0.006, 0.038, 0.04),
 ]  # fmt: skip
-
-
-def _pelvis_rings(skirt: float) -> list[Ring]:
-    hem = [(-0.8 * skirt, 0.0, 0.08, 0.1)] if skirt > 0.0 else [(-0.045, 0.0, 0.055, 0.08)]
-    return [(0.06, 0.0, 0.067, 0.086), (0.03, 0.0, 0.073, 0.093), (-0.01, -0.002, 0.082, 0.106), *hem]
-
-
-def _coat_tail(clothing: Clothing) -> ColoredMesh:
-    """The half of the coat's skirt that moves with a thigh."""
-    rings = [
-        (0.02, 0.0, 0.05, 0.04), (-0.01, 0.0, 0.074, 0.055), (-0.6 * clothing.skirt, 0.0, 0.082, 0.064),
-        (-clothing.skirt, 0.0, 0.086, 0.068),
-    ]  # fmt: skip
-    return loft(rings, Material.CLOTH, clothing.coat)
-
-
-def _hand(skin: Color) -> ColoredMesh:
-    rings = [
-        (-FOREARM + 0.01, 0.0, 0.018, 0.014), (-FOREARM - 0.03, 0.004, 0.025, 0.013),
-        (-FOREARM - 0.065, 0.01, 0.021, 0.013), (-FOREARM - 0.09, 0.013, 0.01, 0.009),
-    ]  # fmt: skip
-    return loft(rings, Material.PLAIN, skin, 8)
-
-
-def _foot(color: Color) -> ColoredMesh:
-    profile = [
-        (*HEEL, 0.02), (*BALL, 0.029), (*TOE, 0.016), (0.1, 0.03 - ANKLE, 0.018), (0.06, 0.042 - ANKLE, 0.024),
-        (0.02, 0.03, 0.022), (-0.03, 0.03, 0.02), (-0.046, 0.03 - ANKLE, 0.018),
-    ]  # fmt: skip
-    return symmetric_hull(profile, Material.PLAIN, color)

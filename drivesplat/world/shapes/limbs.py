@@ -32,12 +32,12 @@ def loft(rings: Sequence[Ring], material: Material, color: Color, sides: int = 1
     return uniform(trimesh.Trimesh(vertices, np.concatenate(faces), process=False), material, color)
 
 
-def limb(length: float, radii: Sequence[float], material: Material, color: Color, sides: int = 8) -> ColoredMesh:
+def limb(length: float, radii: Sequence[float], material: Material, color: Color) -> ColoredMesh:
     """A link that hangs from the origin down to z = -length, with radii at equal distances and rounded ends."""
     heights = -length * np.linspace(0.0, 1.0, len(radii))
     ends = [(0.7 * radii[0], 0.7 * radii[0]), (-length - 0.7 * radii[-1], 0.7 * radii[-1])]
     rings = [(z, 0.0, radius, radius) for z, radius in [*zip(heights, radii, strict=True), *ends]]
-    return loft(rings, material, color, sides)
+    return loft(rings, material, color, 8)
 
 
 def two_link(root: np.ndarray, end: np.ndarray, lengths: tuple[float, float], bend: np.ndarray) -> np.ndarray:
@@ -77,15 +77,9 @@ def transforms(rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
     return poses
 
 
-def oriented(
-    translations: np.ndarray,
-    yaw: np.ndarray | float = 0.0,
-    pitch: np.ndarray | float = 0.0,
-    roll: np.ndarray | float = 0.0,
-) -> np.ndarray:
-    """The transforms (n, 4, 4) of translations (n, 3) and angles (n,) in radians. A positive pitch lowers the front,
-    a positive roll the right side."""
-    angles = np.stack(np.broadcast_arrays(yaw, pitch, roll, np.zeros(len(translations)))[:3], axis=-1)
+def oriented(translations: np.ndarray, yaw: np.ndarray | float = 0.0, pitch: np.ndarray | float = 0.0) -> np.ndarray:
+    """The transforms (n, 4, 4) of translations (n, 3) and angles (n,) in radians. A positive pitch lowers the front."""
+    angles = np.stack(np.broadcast_arrays(yaw, pitch, np.zeros(len(translations))), axis=-1)
     return transforms(Rotation.from_euler("ZYX", angles).as_matrix(), translations)
 
 

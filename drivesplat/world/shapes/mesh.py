@@ -80,12 +80,6 @@ class ColoredMesh:
         """Length, width and height (3,) of the smallest upright box around it with its centre at x = y = 0."""
         return np.array([*(2.0 * np.abs(self.vertices[:, :2]).max(axis=0)), self.vertices[:, 2].max()])
 
-    @property
-    def bounding_sphere(self) -> tuple[np.ndarray, float]:
-        """Centre (3,) and radius of a sphere around it."""
-        center = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
-        return center, float(np.linalg.norm(self.vertices - center, axis=1).max())
-
     def moved(self, translation: Numbers, yaw: float = 0.0) -> "ColoredMesh":
         """The mesh rotated by `yaw` radians about z, then translated; the texture stays on it."""
         rotated = self.vertices @ Rotation.from_euler("z", yaw).as_matrix().T

@@ -65,7 +65,13 @@ class Person:
         clothing = Clothing(self.shirt, self.trousers, self.hair, self.skin, SHOES, skirt=0.2)
         pieces = human_pieces(self.height, clothing)
         if self.bag:
-            pieces = (*pieces, in_metres(_bag(), self.height))
+            body = box((-0.09, -0.03, -0.22), (0.09, 0.03, -0.06), Material.CLOTH, BAG)
+            straps = [
+                cylinder((0.0, 0.0, 0.0), (x, y, -0.07), 0.004, Material.CLOTH, BAG)
+                for x in (-0.05, 0.05)
+                for y in (-0.02, 0.02)
+            ]
+            pieces = (*pieces, in_metres(concatenate([body, *straps]), self.height))
         return tuple(piece.classified(SurfaceClass.PERSON) for piece in pieces)
 
     @cached_property
@@ -79,24 +85,13 @@ class Person:
         cycles, idle_seconds = distance / self.stride + self.phase, seconds + 7.0 * GESTURE_SECONDS * self.phase
         posture = walking(cycles, BAG_ARM_SWING if self.bag else 1.0) if self.walks else standing(idle_seconds)
         poses = human_poses(posture, self.height)
-        return np.concatenate([poses, self._bag_poses(poses)], axis=1) if self.bag else poses
-
-    def _bag_poses(self, poses: np.ndarray) -> np.ndarray:
-        """Poses (n, 1, 4, 4) of the bag, which tilts less than the arm that holds it."""
+        if not self.bag:
+            return poses
         forearm = poses[:, HUMAN_PIECES.index("left forearm")]
         hand = placed(forearm, self.height * HAND_OF_BAG)[:, 0]
-        return oriented(hand, 0.0, 0.4 * np.arctan2(forearm[:, 0, 2], forearm[:, 2, 2]))[:, None]
-
-
-def _bag() -> ColoredMesh:
-    """A shopping bag that hangs from its handle at the origin, in body heights."""
-    body = box((-0.09, -0.03, -0.22), (0.09, 0.03, -0.06), Material.CLOTH, BAG)
-    straps = [
-        cylinder((0.0, 0.0, 0.0), (x, y, -0.07), 0.004, Material.CLOTH, BAG)
-        for x in (-0.05, 0.05)
-        for y in (-0.02, 0.02)
-    ]
-    return concatenate([body, *straps])
+        # the bag tilts less than the arm that holds it
+        bag = oriented(hand, 0.0, 0.4 * np.arctan2(forearm[:, 0, 2], forearm[:, 2, 2]))
+        return np.concatenate([poses, bag[:, None]], axis=1)
 
 
 def drawn_color(rng: np.random.Generator, low: float, high: float, saturation: float = 0.5) -> Color:

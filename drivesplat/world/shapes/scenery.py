@@ -46,8 +46,9 @@ def sign(color: Color) -> ColoredMesh:
     return concatenate([pole, concatenate([rim, face, symbol, panel]).classified(SurfaceClass.SIGN)])
 
 
-def street_name_sign(color: Color = (0.04, 0.1, 0.4)) -> ColoredMesh:
+def street_name_sign() -> ColoredMesh:
     """A pole with two panels of names, along x and along y."""
+    color = (0.04, 0.1, 0.4)
     pole = cylinder((0, 0, 0), (0, 0, 2.9), 0.03, Material.METAL, METAL).classified(SurfaceClass.POLE)
     along = brand_panel((0.05, -0.012, 2.6), (1.0, 0.012, 2.8), color)
     across = brand_panel((-0.012, -1.0, 2.36), (0.012, -0.05, 2.56), color)
@@ -61,9 +62,9 @@ def cone() -> ColoredMesh:
     return concatenate([base, uniform(mesh, Material.STRIPES, (0.8, 0.25, 0.03))])
 
 
-def fence(length: float, height: float = 1.1, color: Color = DARK) -> ColoredMesh:
-    """Posts and two rails along x, with a bar every 0.15 m."""
-    half = length / 2
+def fence(length: float) -> ColoredMesh:
+    """Posts and two rails along x, 1.1 m high, with a bar every 0.15 m."""
+    half, height, color = length / 2, 1.1, DARK
     posts = [
         box((x - 0.03, -0.03, 0.0), (x + 0.03, 0.03, height), Material.METAL, color)
         for x in np.linspace(-half, half, max(2, round(length / 2) + 1))
@@ -100,8 +101,9 @@ def litter_bin() -> ColoredMesh:
     return concatenate([drum, lid, stem])
 
 
-def mailbox(color: Color = (0.6, 0.42, 0.03)) -> ColoredMesh:
+def mailbox() -> ColoredMesh:
     """A letter box on a foot, whose slot faces y."""
+    color = (0.6, 0.42, 0.03)
     parts = [
         box((-0.06, -0.06, 0.0), (0.06, 0.06, 0.7), Material.METAL, METAL),
         box((-0.22, -0.18, 0.65), (0.22, 0.18, 1.25), Material.PAINT, color),
@@ -112,8 +114,9 @@ def mailbox(color: Color = (0.6, 0.42, 0.03)) -> ColoredMesh:
     return concatenate(parts)
 
 
-def hydrant(color: Color = (0.55, 0.06, 0.04)) -> ColoredMesh:
+def hydrant() -> ColoredMesh:
     """A fire hydrant with outlets along x and y."""
+    color = (0.55, 0.06, 0.04)
     parts = [
         cylinder((0, 0, 0), (0, 0, 0.06), 0.17, Material.PLAIN, color),
         cylinder((0, 0, 0.05), (0, 0, 0.6), 0.11, Material.PLAIN, color),
@@ -165,13 +168,13 @@ def advertising_column(random: np.random.Generator) -> ColoredMesh:
     return concatenate([foot, drum.moved((0.0, 0.0, 1.5)), cap, top]).classified(SurfaceClass.OBJECT)
 
 
-def overhead_wire(start: Numbers, end: Numbers, sag: float = 0.4, thickness: float = 0.012) -> ColoredMesh:
-    """A wire that hangs between two points, `sag` metres below the straight line in its middle."""
+def overhead_wire(start: Numbers, end: Numbers) -> ColoredMesh:
+    """A wire that hangs between two points, 0.4 m below the straight line in its middle."""
     share = np.linspace(0.0, 1.0, 9)[:, None]
     points = (1 - share) * np.asarray(start, dtype=float) + share * np.asarray(end, dtype=float)
-    points[:, 2] -= 4 * sag * (share * (1 - share))[:, 0]
+    points[:, 2] -= 4 * 0.4 * (share * (1 - share))[:, 0]
     pieces = [
-        uniform(trimesh.creation.cylinder(thickness, segment=[a, b], sections=5), Material.PLAIN, DARK)
+        uniform(trimesh.creation.cylinder(0.012, segment=[a, b], sections=5), Material.PLAIN, DARK)
         for a, b in pairwise(points)
     ]
     return concatenate(pieces).classified(SurfaceClass.POLE)

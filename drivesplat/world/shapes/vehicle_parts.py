@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import trimesh
@@ -38,9 +39,9 @@ def disc(center: Numbers, width: float, radius: float, material: Material, color
     return uniform(mesh, material, color)
 
 
-def wheel(x: float, outer: float, radius: float, width: float = 0.2) -> list[ColoredMesh]:
+def wheel(x: float, outer: float, radius: float) -> list[ColoredMesh]:
     """A wheel at `x` whose outside is at y = `outer`, on the ground, before the dark inset of its arch."""
-    side = np.sign(outer)
+    side, width = np.sign(outer), 0.2
     arch = disc((x, outer - side * 0.16, 1.18 * radius), 0.29, 1.16 * radius, Material.PLAIN, BLACK)
     tyre = disc((x, outer - side * (0.005 + width / 2), radius), width, radius, Material.PLAIN, TYRE)
     rim = disc((x, outer - side * 0.016, radius), 0.026, 0.66 * radius, Material.PLAIN, BLACK)
@@ -72,9 +73,8 @@ def pane(
     return hull([point + sign * normal for point in points for sign in (-1, 1)], material, color)
 
 
-def glass(corners: Sequence[Numbers], along: tuple[float, float], up: tuple[float, float]) -> ColoredMesh:
-    """A window on a flat face; see `pane`."""
-    return pane(corners, along, up, Material.GLASS, WINDSCREEN)
+glass = partial(pane, material=Material.GLASS, color=WINDSCREEN)
+"""A window on a flat face."""
 
 
 def both_sides(corners: Sequence[Numbers]) -> list[list[tuple[float, float, float]]]:

@@ -4,6 +4,7 @@ Vehicles fill a box of length, width and height `size` centred at x = y = 0; the
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -52,16 +53,6 @@ HATCHBACK = CarProfile(0.28, 0.1, -0.36, -0.47, 0.5, 0.6, 0.56, (EGO_OVERHANG / 
 ESTATE = CarProfile(
     0.22, 0.07, -0.42, -0.485, 0.55, 0.6, 0.56, (-0.3, 0.3), 0.35, pillars=(0.03, 0.24, 0.27, 0.58, 0.61, 0.97)
 )
-
-
-def car(size: Numbers, color: Color) -> ColoredMesh:
-    """A saloon."""
-    return _passenger_car(size, color, SALOON)
-
-
-def hatchback(size: Numbers, color: Color) -> ColoredMesh:
-    """A small car with a steep tail."""
-    return _passenger_car(size, color, HATCHBACK)
 
 
 def estate(size: Numbers, color: Color) -> ColoredMesh:
@@ -119,14 +110,37 @@ def ego_rear() -> ColoredMesh:
 def _passenger_car(size: Numbers, color: Color, profile: CarProfile) -> ColoredMesh:
     length, width, height = size
     half, front = width / 2, length / 2
-    belt, nose = profile.belt * height, profile.nose * height
-    body = _body(length, half - 0.05, height, color, profile)
+    belt, nose, deck = profile.belt * height, profile.nose * height, profile.deck * height
+    y = half - 0.05
+    # below the windows: sides that bulge at half their height, and the bonnet
+    sides = [
+        (-front + 0.02, 0.3 * height, 0.88 * y), (-front + 0.01, 0.5 * height, 0.9 * y),
+        (-front + 0.05, deck, 0.84 * y),
+        (profile.tail * length, belt, 0.93 * y), (profile.screen * length, belt, 0.93 * y),
+        (front - 0.3, nose + 0.04, 0.84 * y), (front - 0.04, nose - 0.06, 0.78 * y), (front, 0.36 * height, 0.76 * y),
+        (front - 0.02, 0.22 * height, 0.8 * y), (-0.4 * length, 0.4 * height, 0.98 * y),
+        (0.4 * length, 0.38 * height, 0.97 * y),
+        (-0.42 * length, 0.14 * height, 0.92 * y), (0.42 * length, 0.14 * height, 0.92 * y), (0.0, 0.4 * height, y),
+    ]  # fmt: skip
+    sill = box((-0.2 * length, -0.97 * y, 0.13 * height), (0.2 * length, 0.97 * y, 0.2 * height), Material.PLAIN, BLACK)
+    body = symmetric_hull(sides, Material.PAINT, color)
+    y = half - 0.06
+    bumpers = [
+        hull([(x + dx, side * w * y, z * height) for dx, w in ((0.0, 0.72), (-np.sign(x) * 0.26, 0.92))
+              for z in (0.16, 0.26) for side in (-1, 1)], Material.PLAIN, BLACK)
+        for x in (-front, front)
+    ]  # fmt: skip
+    grille = box((front - 0.1, -0.3 * y, 0.29 * height), (front - 0.002, 0.3 * y, 0.36 * height), Material.PLAIN, BLACK)
+    badge = box((front - 0.1, -0.05, 0.38 * height), (front + 0.0, 0.05, 0.42 * height), Material.METAL, METAL)
     parts = [
-        *body,
-        *_cabin(length, half - 0.06, height, color, profile),
-        *_ends(length, half - 0.06, height),
-        *lights(body[0], front, (0.4 * half, 0.71 * half), (nose - 0.16, nose - 0.075)),
-        *lights(body[0], -front, (0.5 * half, 0.84 * half), (0.46 * height, 0.54 * height)),
+        body,
+        sill,
+        *_cabin(length, y, height, color, profile),
+        *bumpers,
+        grille,
+        badge,
+        *lights(body, front, (0.4 * half, 0.71 * half), (nose - 0.16, nose - 0.075)),
+        *lights(body, -front, (0.5 * half, 0.84 * half), (0.46 * height, 0.54 * height)),
         *plates(front, 0.28 * height),
         *axles([x * length for x in profile.axles], half - 0.055, profile.radius),
         *wing_mirrors((profile.screen - 0.07) * length, half, belt - 0.02, 0.16, color),
@@ -139,20 +153,9 @@ def _passenger_car(size: Numbers, color: Color, profile: CarProfile) -> ColoredM
     return assembled(parts)
 
 
-def _body(length: float, y: float, height: float, color: Color, profile: CarProfile) -> list[ColoredMesh]:
-    """The part below the windows: sides that bulge at half their height, and the bonnet."""
-    belt, nose, deck, front = profile.belt * height, profile.nose * height, profile.deck * height, length / 2
-    sides = [
-        (-front + 0.02, 0.3 * height, 0.88 * y), (-front + 0.01, 0.5 * height, 0.9 * y),
-        (-front + 0.05, deck, 0.84 * y),
-        (profile.tail * length, belt, 0.93 * y), (profile.screen * length, belt, 0.93 * y),
-        (front - 0.3, nose + 0.04, 0.84 * y), (front - 0.04, nose - 0.06, 0.78 * y), (front, 0.36 * height, 0.76 * y),
-        (front - 0.02, 0.22 * height, 0.8 * y), (-0.4 * length, 0.4 * height, 0.98 * y),
-        (0.4 * length, 0.38 * height, 0.97 * y),
-        (-0.42 * length, 0.14 * height, 0.92 * y), (0.42 * length, 0.14 * height, 0.92 * y), (0.0, 0.4 * height, y),
-    ]  # fmt: skip
-    sill = box((-0.2 * length, -0.97 * y, 0.13 * height), (0.2 * length, 0.97 * y, 0.2 * height), Material.PLAIN, BLACK)
-    return [symmetric_hull(sides, Material.PAINT, color), sill]
+car = partial(_passenger_car, profile=SALOON)
+hatchback = partial(_passenger_car, profile=HATCHBACK)
+"""A small car with a steep tail."""
 
 
 def _cabin(length: float, y: float, height: float, color: Color, profile: CarProfile) -> list[ColoredMesh]:
@@ -172,16 +175,3 @@ def _cabin(length: float, y: float, height: float, color: Color, profile: CarPro
     for face in both_sides(side):
         windows += [glass(face, span, (0.12, 0.93)) for span in zip(edges[::2], edges[1::2], strict=True)]
     return [symmetric_hull(frame, Material.PAINT, color), symmetric_hull(roof, Material.PAINT, color), *windows]
-
-
-def _ends(length: float, y: float, height: float) -> list[ColoredMesh]:
-    """Bumpers, the grille, fog lights' recesses."""
-    front = length / 2
-    bumpers = [
-        hull([(x + dx, side * w * y, z * height) for dx, w in ((0.0, 0.72), (-np.sign(x) * 0.26, 0.92))
-              for z in (0.16, 0.26) for side in (-1, 1)], Material.PLAIN, BLACK)
-        for x in (-front, front)
-    ]  # fmt: skip
-    grille = box((front - 0.1, -0.3 * y, 0.29 * height), (front - 0.002, 0.3 * y, 0.36 * height), Material.PLAIN, BLACK)
-    badge = box((front - 0.1, -0.05, 0.38 * height), (front + 0.0, 0.05, 0.42 * height), Material.METAL, METAL)
-    return [*bumpers, grille, badge]

@@ -16,7 +16,7 @@ from drivesplat.trajectories.motion import Motion
 from drivesplat.world.shapes.body import RigidBody
 from drivesplat.world.street.objects import EGO_PARTS, StreetObject
 from drivesplat.world.street.paths import GivenPath
-from drivesplat.world.street.street import Street, street_with
+from drivesplat.world.street.street import Street
 from drivesplat.world.tokens import instance_token
 
 MOTION_HZ = 20.0
@@ -44,26 +44,34 @@ def edited(street: Street, scene: str, edit: Edit, name: str, seconds: float, fi
     if a step names an unknown track, changes nothing or contradicts an earlier one.
     """
     by_id = {instance_token(scene, item.name): item for item in street.objects if item.category}
-    editable = {id: item for id, item in by_id.items() if isinstance(item.body, RigidBody) and _is_vehicle(item)}
+    editable = {
+        id: item
+        for id, item in by_id.items()
+        if isinstance(item.body, RigidBody) and (item.category or "").startswith("vehicle.")
+    }
     times = np.linspace(-MARGIN, seconds + MARGIN, round((seconds + 2 * MARGIN) * MOTION_HZ) + 1)
-    actors = [_recorded(id, item, times, film_start) for id, item in editable.items()]
+    motions = {
+        id: Motion(times - film_start, item.box_poses(times), ((0, len(times) - 1),), 0.5 / MOTION_HZ)
+        for id, item in editable.items()
+    }
+    actors = [EditedActor.recorded(id, item.category or "", item.size, motions[id]) for id, item in editable.items()]
     ego = street.ego.poses(np.arange(0.0, seconds, 0.1) + film_start)
     where, others = f"scene {scene}, edit {name!r}", by_id.keys() - editable.keys()
     changed = edited_actors(actors, edit, where, others, ego)
     objects = [_object_of(actor, editable, film_start) for actor in changed]
-    ego_poses = _edited_ego(street, edit, film_start)
+    steps = [step.ego for step in edit.steps if step.ego is not None]
+
+    def recorded(film: np.ndarray) -> np.ndarray:
+        return street.ego.poses(film + film_start)
+
+    def moved(seconds: np.ndarray) -> np.ndarray:
+        return edited_poses(recorded, steps, 0.0, seconds - film_start)
+
+    ego_poses = moved if steps else street.ego.poses
     kept = [item for item in street.objects if item not in editable.values()]
     carried = [replace(item, path=GivenPath(ego_poses)) if item.name in EGO_PARTS else item for item in kept]
-    return Variation(street_with(street, (*carried, *objects)), ego_poses)
-
-
-def _is_vehicle(item: StreetObject) -> bool:
-    return (item.category or "").startswith("vehicle.")
-
-
-def _recorded(id: str, item: StreetObject, times: np.ndarray, film_start: float) -> EditedActor:
-    motion = Motion(times - film_start, item.box_poses(times), ((0, len(times) - 1),), 0.5 / MOTION_HZ)
-    return EditedActor.recorded(id, item.category or "", item.size, motion)
+    objects = sorted((*carried, *objects), key=lambda item: item.moves)
+    return Variation(replace(street, objects=tuple(objects)), ego_poses)
 
 
 def _object_of(actor: EditedActor, originals: Mapping[str, StreetObject], film_start: float) -> StreetObject:
@@ -81,15 +89,3 @@ def _object_of(actor: EditedActor, originals: Mapping[str, StreetObject], film_s
     mesh = original.body.pieces[0].scaled(actor.scale)
     body = RigidBody(mesh if actor.color_matrix is None else mesh.recolored(actor.color_matrix))
     return replace(original, name=name, body=body, path=GivenPath(poses_at))
-
-
-def _edited_ego(street: Street, edit: Edit, film_start: float) -> PosesAt:
-    """The ego poses of the edited drive, as a function of seconds from the first key frame."""
-
-    def recorded(film: np.ndarray) -> np.ndarray:
-        return street.ego.poses(film + film_start)
-
-    steps = [step.ego for step in edit.steps if step.ego is not None]
-    if not steps:
-        return street.ego.poses
-    return lambda seconds: edited_poses(recorded, steps, 0.0, seconds - film_start)

@@ -21,11 +21,8 @@ KERBSIDE: tuple[Callable[[], ColoredMesh], ...] = (
     scenery.litter_bin, scenery.hydrant, scenery.mailbox, scenery.bollard, scenery.street_name_sign,
 )  # fmt: skip
 """Small things beside the curb."""
-
-
-def lamp_places() -> np.ndarray:
-    """Places s, t (m, 2) of the street lamps, alternately on both sides."""
-    return np.array([(s, FURNITURE * (-1) ** i) for i, s in enumerate(range(-30, 200, 24))], dtype=float)
+LAMPS = np.array([(s, FURNITURE * (-1) ** i) for i, s in enumerate(range(-30, 200, 24))], dtype=float)
+"""Places s, t (m, 2) of the street lamps, alternately on both sides."""
 
 
 def trees(road: ReferenceLine, random: np.random.Generator) -> list[ColoredMesh]:
@@ -41,29 +38,25 @@ def trees(road: ReferenceLine, random: np.random.Generator) -> list[ColoredMesh]
                 found.append(road.place(tree, *place))
             between = s + TREE_SPACING / 2
             if side > 0 or abs(between - SHELTER) > 4.0:
-                found.append(road.place(_between_trees(side, random), between, side * 8.9))
+                kind = random.integers(4)
+                if kind < 2:
+                    item = scenery.advertising_column(random) if kind == 0 else plants.planter(random)
+                else:
+                    item = scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
+                found.append(road.place(item, between, side * 8.9))
     return found
 
 
-def _between_trees(side: int, random: np.random.Generator) -> ColoredMesh:
-    kind = random.integers(4)
-    if kind == 0:
-        return scenery.advertising_column(random)
-    if kind == 1:
-        return plants.planter(random)
-    return scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
-
-
-def furniture(road: ReferenceLine, lamps: np.ndarray, random: np.random.Generator) -> list[ColoredMesh]:
-    """Street lamps at the places `lamps` (m, 2) with wires between some of them, signs, a bus shelter, and small things
-    beside the curb, clear of the pedestrians' path."""
-    found = [road.place(scenery.street_lamp(LAMP_HEIGHT, -np.sign(t) * LAMP_ARM), s, t) for s, t in lamps]
+def furniture(road: ReferenceLine, random: np.random.Generator) -> list[ColoredMesh]:
+    """Street lamps with wires between some of them, signs, a bus shelter, and small things beside the curb, clear of
+    the pedestrians' path."""
+    found = [road.place(scenery.street_lamp(LAMP_HEIGHT, -np.sign(t) * LAMP_ARM), s, t) for s, t in LAMPS]
     found += [road.place(scenery.sign(color), s + random.uniform(-3, 3), -FURNITURE) for s, color in SIGNS]
-    tops = road.points(np.column_stack([lamps, np.full(len(lamps), LAMP_HEIGHT - 0.2)]))
+    tops = road.points(np.column_stack([LAMPS, np.full(len(LAMPS), LAMP_HEIGHT - 0.2)]))
     found += [scenery.overhead_wire(tops[i], tops[i + 1]) for i in range(1, len(tops) - 1, 3)]
     found.append(road.place(scenery.bus_shelter(random), SHELTER, -9.0))
     for i, s in enumerate(np.arange(-20.0, 140.0, 11.0)):
         side = (-1) ** i
-        if np.abs(lamps[:, 0] - s).min() > 1.0:
+        if np.abs(LAMPS[:, 0] - s).min() > 1.0:
             found.append(road.place(KERBSIDE[i % len(KERBSIDE)](), s, side * FURNITURE))
     return found

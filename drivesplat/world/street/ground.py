@@ -25,7 +25,17 @@ def ground(road: ReferenceLine) -> list[ColoredMesh]:
         *(_strip(road, *sorted((side * ROAD, side * SIDEWALK)), SurfaceClass.SIDEWALK) for side in (-1, 1)),
         *(_strip(road, *sorted((side * SIDEWALK, side * aside)), SurfaceClass.TERRAIN) for side in (-1, 1)),
     ]
-    return [*strips, *(_curb(road, side) for side in (-1, 1))]
+    cell = 30.0 if road.is_straight else CELL
+    along = np.arange(NEAR[0], NEAR[1] + cell, cell)
+    first = (np.arange(len(along) - 1)[:, None] * 4 + np.arange(3)).ravel()
+    corners = np.stack([first, first + 4, first + 5, first + 1], axis=-1)
+    faces = np.concatenate([corners[:, [0, 2, 1]], corners[:, [0, 3, 2]]])
+    for side in (-1, 1):  # the kerb stones beside the road, which stand out of it
+        low, high = sorted((side * ROAD, side * CURB))
+        profile = np.array([(low, -0.02), (low, CURB_HEIGHT), (high, CURB_HEIGHT), (high, -0.02)])
+        points = np.array([(s, t, h) for s in along for t, h in profile])
+        strips.append(road.follow(_mesh(points, faces, SurfaceClass.SIDEWALK)))
+    return strips
 
 
 def _strip(road: ReferenceLine, right: float, left: float, surface_class: SurfaceClass) -> ColoredMesh:
@@ -42,19 +52,6 @@ def _strip(road: ReferenceLine, right: float, left: float, surface_class: Surfac
     corners = np.stack([first, first + columns, first + columns + 1, first + 1], axis=-1)
     faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
     return road.follow(_mesh(flat, faces, surface_class))
-
-
-def _curb(road: ReferenceLine, side: int) -> ColoredMesh:
-    """The kerb stones beside the road, which stand out of it."""
-    low, high = sorted((side * ROAD, side * CURB))
-    cell = 30.0 if road.is_straight else CELL
-    along = np.arange(NEAR[0], NEAR[1] + cell, cell)
-    profile = np.array([(low, -0.02), (low, CURB_HEIGHT), (high, CURB_HEIGHT), (high, -0.02)])
-    points = np.array([(s, t, h) for s in along for t, h in profile])
-    first = (np.arange(len(along) - 1)[:, None] * 4 + np.arange(3)).ravel()
-    corners = np.stack([first, first + 4, first + 5, first + 1], axis=-1)
-    faces = np.concatenate([corners[:, [0, 2, 1]], corners[:, [0, 3, 2]]])
-    return road.follow(_mesh(points, faces, SurfaceClass.SIDEWALK))
 
 
 def _mesh(points: np.ndarray, faces: np.ndarray, surface_class: SurfaceClass) -> ColoredMesh:

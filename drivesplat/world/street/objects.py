@@ -54,6 +54,6 @@ class StreetObject:
         return poses
 
 
-def fixed(name: str, mesh: ColoredMesh, path: ObjectPath | None = None, category: str | None = None) -> StreetObject:
+def fixed(name: str, mesh: ColoredMesh, path: ObjectPath | None = None) -> StreetObject:
     """A rigid object; without a path its mesh is in the street frame."""
-    return StreetObject(name, RigidBody(mesh), path or StreetPath(0.0, 0.0), category)
+    return StreetObject(name, RigidBody(mesh), path or StreetPath(0.0, 0.0))

@@ -61,11 +61,44 @@ def people(
     world: WorldSettings, road: ReferenceLine, ego: StreetPath, random: np.random.Generator
 ) -> list[StreetObject]:
     """Pedestrians, bystanders, cyclists and dogs."""
-    walkers = _walkers(world, road, ego, random)
-    standing = _bystanders(encounters(world, world.bystanders), road, ego, random)
-    cyclists = [_cyclist(i, met, road, ego, random) for i, met in enumerate(encounters(world, world.cyclists))]
-    dogs = [_dog(i, walkers[i], random) for i in range(min(world.dogs, len(walkers)))]
-    return [*walkers, *standing, *cyclists, *dogs]
+    distance = ABREAST if not world.dogs else 2 * ABREAST
+    walkers: list[StreetObject] = []
+    # each pedestrian is in the first walkway where the others keep their distance
+    walkways = [walkway for walkway in WALKWAYS if walkway.place in world.walkways]
+    walking: dict[Walkway, list[float]] = {walkway: [] for walkway in walkways}
+    for index, met in enumerate(encounters(world, world.pedestrians)):
+        places = ((number // len(walkways), walkways[number % len(walkways)]) for number in count(met.before))
+        starts = ((w, _place(ego, met, w.ahead + ABREAST * row) - w.speed * met.second) for row, w in places)
+        walkway, start = next((w, s) for w, s in starts if all(abs(s - other) >= distance for other in walking[w]))
+        walking[walkway].append(start)
+        path = StreetPath(start, walkway.t, walkway.speed, road=road)
+        body = Person.drawn(random, walks=True)
+        walkers.append(StreetObject(f"pedestrian {index}", body, path, "human.pedestrian.adult", "pedestrian.moving"))
+    found = [*walkers]
+    standing: dict[int, list[float]] = {-1: [], 1: []}
+    for index, met in enumerate(encounters(world, world.bystanders)):  # on both sides, at the first free place
+        start = _place(ego, met, BYSTANDER_AHEAD)
+        sides = ((side, start + ABREAST * row) for row in range(world.bystanders) for side in (-1, 1))
+        side, place = next((a, s) for a, s in sides if all(abs(s - other) >= ABREAST for other in standing[a]))
+        standing[side].append(place)
+        path = StreetPath(
+            place, side * WALL_SIDE, heading=-side * np.pi / 2, turning=random.uniform(0.6, 1.2),
+            period=random.uniform(5.0, 8.0), road=road,
+        )  # fmt: skip
+        body = Person.drawn(random, walks=False)
+        found.append(StreetObject(f"bystander {index}", body, path, "human.pedestrian.adult", "pedestrian.standing"))
+    for index, met in enumerate(encounters(world, world.cyclists)):
+        side = (-1) ** (index + 1)
+        speed = -side * CYCLING_SPEED
+        place = _place(ego, met, CYCLIST_AHEAD + 2 * ABREAST * (met.before // 2))
+        path = StreetPath(place - speed * met.second, side * CYCLE_LANE, speed, road=road)
+        body = Cyclist.drawn(random)
+        found.append(StreetObject(f"cyclist {index}", body, path, "vehicle.bicycle", "cycle.with_rider"))
+    for index, owner in enumerate(walkers[: world.dogs]):
+        walk = owner.path
+        path = StreetPath(walk.s + np.sign(walk.speed) * DOG_LEAD, walk.t, walk.speed, road=walk.road)
+        found.append(StreetObject(f"dog {index}", Dog.drawn(random), path, "animal"))
+    return found
 
 
 def encounters(world: WorldSettings, number: int) -> list[Encounter]:
@@ -86,67 +119,3 @@ def encounters(world: WorldSettings, number: int) -> list[Encounter]:
 def _place(ego: StreetPath, met: Encounter, ahead: float) -> float:
     """The place s (metres) of an encounter."""
     return float(ego.along(np.array([met.second]))[0]) + ahead
-
-
-def _walkers(
-    world: WorldSettings, road: ReferenceLine, ego: StreetPath, random: np.random.Generator
-) -> list[StreetObject]:
-    """Pedestrians, each in the first walkway where the others keep their distance."""
-    distance = ABREAST if not world.dogs else 2 * ABREAST
-    found: list[StreetObject] = []
-    walkways = [walkway for walkway in WALKWAYS if walkway.place in world.walkways]
-    taken: dict[Walkway, list[float]] = {walkway: [] for walkway in walkways}
-    for index, met in enumerate(encounters(world, world.pedestrians)):
-        places = (divmod(number, len(walkways)) for number in count(met.before))
-        starts = ((walkways[number], _start(met, walkways[number], row, ego)) for row, number in places)
-        walkway, start = next((w, s) for w, s in starts if all(abs(s - other) >= distance for other in taken[w]))
-        taken[walkway].append(start)
-        path = StreetPath(start, walkway.t, walkway.speed, road=road)
-        body = Person.drawn(random, walks=True)
-        found.append(StreetObject(f"pedestrian {index}", body, path, "human.pedestrian.adult", "pedestrian.moving"))
-    return found
-
-
-def _start(met: Encounter, walkway: Walkway, row: int, ego: StreetPath) -> float:
-    """The place s (metres) at second 0 of a pedestrian who is met in a walkway."""
-    return _place(ego, met, walkway.ahead + ABREAST * row) - walkway.speed * met.second
-
-
-def _bystanders(
-    met: list[Encounter], road: ReferenceLine, ego: StreetPath, random: np.random.Generator
-) -> list[StreetObject]:
-    """Bystanders on both sides, each at the first place that is free."""
-    found: list[StreetObject] = []
-    taken: dict[int, list[float]] = {-1: [], 1: []}
-    for index, encounter in enumerate(met):
-        start = _place(ego, encounter, BYSTANDER_AHEAD)
-        places = ((side, start + ABREAST * row) for row in range(len(met)) for side in (-1, 1))
-        side, place = next((a, s) for a, s in places if all(abs(s - other) >= ABREAST for other in taken[a]))
-        taken[side].append(place)
-        found.append(_bystander(index, side, place, road, random))
-    return found
-
-
-def _bystander(index: int, side: int, place: float, road: ReferenceLine, random: np.random.Generator) -> StreetObject:
-    path = StreetPath(
-        place, side * WALL_SIDE, heading=-side * np.pi / 2, turning=random.uniform(0.6, 1.2),
-        period=random.uniform(5.0, 8.0), road=road,
-    )  # fmt: skip
-    body = Person.drawn(random, walks=False)
-    return StreetObject(f"bystander {index}", body, path, "human.pedestrian.adult", "pedestrian.standing")
-
-
-def _cyclist(
-    index: int, met: Encounter, road: ReferenceLine, ego: StreetPath, random: np.random.Generator
-) -> StreetObject:  # fmt: skip
-    side = (-1) ** (index + 1)
-    speed = -side * CYCLING_SPEED
-    place = _place(ego, met, CYCLIST_AHEAD + 2 * ABREAST * (met.before // 2))
-    path = StreetPath(place - speed * met.second, side * CYCLE_LANE, speed, road=road)
-    return StreetObject(f"cyclist {index}", Cyclist.drawn(random), path, "vehicle.bicycle", "cycle.with_rider")
-
-
-def _dog(index: int, owner: StreetObject, random: np.random.Generator) -> StreetObject:
-    walk = owner.path
-    path = StreetPath(walk.s + np.sign(walk.speed) * DOG_LEAD, walk.t, walk.speed, road=walk.road)
-    return StreetObject(f"dog {index}", Dog.drawn(random), path, "animal")

@@ -1,6 +1,6 @@
 """The street: scenery and objects, placed at random from a seed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from drivesplat.world.shapes.body import RigidBody
 from drivesplat.world.shapes.mesh import concatenate
 from drivesplat.world.shapes.vehicles import ego_rear, ego_vehicle
 from drivesplat.world.street.buildings import rows_of_buildings
-from drivesplat.world.street.furniture import furniture, lamp_places, trees
+from drivesplat.world.street.furniture import LAMPS, furniture, trees
 from drivesplat.world.street.ground import ground
 from drivesplat.world.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject, fixed
 from drivesplat.world.street.paths import StreetPath
@@ -40,9 +40,9 @@ class Street:
 def build_street(world: WorldSettings) -> Street:
     """The street that the settings describe."""
     random, road = np.random.default_rng(world.random_seed), road_of(world)
-    poles, ego = lamp_places(), ego_path(world, road)
+    ego = ego_path(world, road)
     static = concatenate(
-        [*ground(road), *rows_of_buildings(road, random), *trees(road, random), *furniture(road, poles, random)]
+        [*ground(road), *rows_of_buildings(road, random), *trees(road, random), *furniture(road, random)]
     )
     objects = [fixed("scenery", static), *parked(world, road, CONES, random)]
     for i, (s, t) in enumerate(CONES):
@@ -55,7 +55,7 @@ def build_street(world: WorldSettings) -> Street:
         objects.append(fixed(EGO_VEHICLE, ego_rear(), ego))
     if world.lidar.ego_returns:
         objects.append(fixed(EGO_BODY, ego_vehicle(), ego))
-    lamps = road.points(np.column_stack([poles - np.sign(poles) * [0.0, 1.5], np.full(len(poles), 6.6)]))
+    lamps = road.points(np.column_stack([LAMPS - np.sign(LAMPS) * [0.0, 1.5], np.full(len(LAMPS), 6.6)]))
     leading = next((item.name for item in objects if item.name == "vehicle 0"), None)
     return Street(tuple(sorted(objects, key=lambda item: item.moves)), lamps, road, ego, leading)
 
@@ -67,8 +67,3 @@ def road_of(world: WorldSettings) -> ReferenceLine:
     angle = np.radians(world.bend_deg)
     radius = np.copysign(BEND_RADIUS, angle) if angle else np.inf
     return ReferenceLine(BEND_START, BEND_RADIUS * abs(angle), radius, world.grade, *RISE)
-
-
-def street_with(street: Street, objects: tuple[StreetObject, ...]) -> Street:
-    """The street with other objects."""
-    return replace(street, objects=tuple(sorted(objects, key=lambda item: item.moves)))
