@@ -9,7 +9,6 @@ from drivesplat.editing.actors import recorded_and_edited
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.camera_path import sampled_path
@@ -29,33 +28,25 @@ def sampled_edits(
         return []
     drives, model = [], trained_model(checkpoint)
     for name, edit in edits.items():
-        where = f"scene {scene.name}, edit {name!r}"
+        where, moved = f"scene {scene.name}, edit {name!r}", None
         try:
-            drives.append(_edited_drive(model, scene, camera, name, edit, rate, where))
+            _, edited = recorded_and_edited(model, scene, camera, edit, where)
+            if any(step.kind == "ego" for step in edit.steps):
+                path = edited_camera_path(scene, camera, rate, edit, where)
+                times = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])
+                moved = CameraMotion(times, path.camera_to_world)
         except ConfigError as error:
             log.warning("an edit is left out: %s", error)
+            continue
+        timestamps, _ = sampled_path(scene, camera, rate)
+        seconds = np.array([scene.seconds(timestamp) for timestamp in timestamps])
+        instances = tuple(
+            Instance(
+                actor.id, actor.source, actor.category, actor.size, actor.scale,
+                sampled_actor(actor, seconds) if actor.edited else None,
+                actor.color_matrix, actor.phase,
+            )
+            for actor in edited
+        )  # fmt: skip
+        drives.append(SampledEdit(name, instances, moved))
     return drives
-
-
-def _edited_drive(
-    model: SplatModel, scene: Scene, camera: str, name: str, edit: Edit, rate: int, where: str
-) -> SampledEdit:
-    _, edited = recorded_and_edited(model, scene, camera, edit, where)
-    timestamps, _ = sampled_path(scene, camera, rate)
-    seconds = np.array([scene.seconds(timestamp) for timestamp in timestamps])
-    instances = tuple(
-        Instance(
-            actor.id, actor.source, actor.category, actor.size, actor.scale,
-            sampled_actor(actor, seconds) if actor.edited else None,
-            actor.color_matrix, actor.phase,
-        )
-        for actor in edited
-    )  # fmt: skip
-    return SampledEdit(name, instances, _edited_camera(scene, camera, edit, rate, where))
-
-
-def _edited_camera(scene: Scene, camera: str, edit: Edit, rate: int, where: str) -> CameraMotion | None:
-    if not any(step.kind == "ego" for step in edit.steps):
-        return None
-    path = edited_camera_path(scene, camera, rate, edit, where)
-    return CameraMotion(np.array([scene.seconds(timestamp) for timestamp in path.timestamps]), path.camera_to_world)
