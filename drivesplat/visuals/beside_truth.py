@@ -61,6 +61,6 @@ def even_size(size: tuple[int, int]) -> tuple[int, int]:
     return max(2, width // 2 * 2), max(2, height // 2 * 2)
 
 
-def film_rate(timestamps: Sequence[int]) -> int:
+def film_rate(timestamps: Sequence[int] | np.ndarray) -> int:
     """Recordings a second at these times in microseconds, rounded, at least 1."""
     return max(1, round(1e6 / float(np.median(np.diff(timestamps))))) if len(timestamps) > 1 else 1

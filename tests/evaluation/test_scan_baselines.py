@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 from helpers.scan_drives import AZIMUTHS, KEY_FRAME_US, STEPS, recorded, room
 
-from drivesplat.evaluation.scan_baselines import (
-    fused,
-    measured_points,
-    nearest_scan,
-    neighbouring_scans,
-)
+from drivesplat.evaluation.scan_baselines import fused, measured_points, nearest_scan, neighbouring_scans
+from drivesplat.lidar.moved_sensor import sensor_poses_of
 
 TARGET = recorded(room(), timestamp=KEY_FRAME_US)
 
