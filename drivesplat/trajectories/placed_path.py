@@ -27,34 +27,21 @@ def placed_motion(place: Place, ego_to_world: np.ndarray, height: float) -> Moti
     else:
         times = np.linspace(points[0, 0], points[-1, 0], max(2, int(KNOT_HZ * np.ptp(points[:, 0])) + 1))
         positions = CubicSpline(points[:, 0], points[:, 1:], bc_type="natural")(times)
-    headings = _headings(positions) + np.radians(place.yaw)
-    poses = np.stack([_on_ground(p, h, ego_to_world, height) for p, h in zip(positions, headings, strict=True)])
-    return Motion(times, poses, ((0, len(times) - 1),), 0.5 / KNOT_HZ)
-
-
-def _headings(positions: np.ndarray) -> np.ndarray:
-    """The direction (n,) of a path of `positions` (n, 2) in radians; where it stands, that of its last motion."""
-    steps = np.gradient(positions, axis=0)
+    headings, steps = np.zeros(len(positions)), np.gradient(positions, axis=0)
     moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > MIN_STEP)
-    if not len(moving):
-        return np.zeros(len(positions))
-    known = moving[np.maximum(np.searchsorted(moving, np.arange(len(positions)), side="right") - 1, 0)]
-    return np.arctan2(steps[known, 1], steps[known, 0])
-
-
-def _on_ground(place: np.ndarray, heading: float, ego_to_world: np.ndarray, height: float) -> np.ndarray:
-    """The pose (4, 4) of a box `height` metres high at `place` (2,) in the first ego frame, with the height and tilt
-    of the nearest of the ego poses."""
-    start = ego_to_world[0]
-    at = start[:3, 3] + start[:3, :3] @ np.array([*place, 0.0])
-    nearest = ego_to_world[np.argmin(np.linalg.norm(ego_to_world[:, :2, 3] - at[:2], axis=1))]
-    up = nearest[:3, 2]
-    forward = start[:3, :3] @ np.array([np.cos(heading), np.sin(heading), 0.0])
-    left = np.cross(up, forward)
-    left /= np.linalg.norm(left)
-    above = at[:2] - nearest[:2, 3]
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([np.cross(left, up), left, up], axis=1)
-    pose[:3, 3] = [*at[:2], nearest[2, 3] - above @ up[:2] / up[2]]
-    pose[:3, 3] += 0.5 * height * up
-    return pose
+    if len(moving):  # where it stands, the direction of its last motion
+        known = moving[np.maximum(np.searchsorted(moving, np.arange(len(positions)), side="right") - 1, 0)]
+        headings = np.arctan2(steps[known, 1], steps[known, 0])
+    start, poses = ego_to_world[0], np.tile(np.eye(4), (len(positions), 1, 1))
+    for pose, position, heading in zip(poses, positions, headings + np.radians(place.yaw), strict=True):
+        at = start[:3, 3] + start[:3, :3] @ np.array([*position, 0.0])
+        nearest = ego_to_world[np.argmin(np.linalg.norm(ego_to_world[:, :2, 3] - at[:2], axis=1))]
+        up = nearest[:3, 2]
+        forward = start[:3, :3] @ np.array([np.cos(heading), np.sin(heading), 0.0])
+        left = np.cross(up, forward)
+        left /= np.linalg.norm(left)
+        above = at[:2] - nearest[:2, 3]
+        pose[:3, :3] = np.stack([np.cross(left, up), left, up], axis=1)
+        pose[:3, 3] = [*at[:2], nearest[2, 3] - above @ up[:2] / up[2]]
+        pose[:3, 3] += 0.5 * height * up
+    return Motion(times, poses, ((0, len(times) - 1),), 0.5 / KNOT_HZ)

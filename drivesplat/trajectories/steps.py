@@ -22,15 +22,31 @@ Clock = Callable[[np.ndarray], np.ndarray]
 
 
 def apply_speed(path: ActorPath, speed: Speed) -> ActorPath:
-    """Scales the pace by a factor, or replaces it by a constant speed."""
+    """Scales the pace by a factor, or replaces it by a constant speed, negative backwards."""
     if speed.factor == 1.0:
         return path
     beginning = max(path.begin, 0.0)
     transition = Transition.of(speed, beginning)
     transition = Transition(max(transition.start, beginning), transition.duration)
-    if speed.factor is None:
-        return _at_constant_speed(path, transition, path.direction * speed.to)
-    return _paced(path, lambda times: transition.warp_time(times, speed.factor), transition.start)
+    if speed.factor is not None:
+        return _paced(path, lambda times: transition.warp_time(times, speed.factor), transition.start)
+    # By partial integration, the integral of (1 - fraction) times the speed is (1 - fraction) times the distance plus
+    # the integral of the fraction's rate times the distance; distances are smoother than speeds.
+    start, end, velocity = transition.start, transition.start + transition.duration, path.direction * speed.to
+    if transition.duration:
+        during = np.linspace(start, end, max(5, int(transition.duration / INTEGRATION_STEP) + 1))
+        integral = CubicSpline(during, transition.rate(during) * path.distance(during)).antiderivative()
+    else:
+        there = path.distance(np.array([start]))
+
+    def position(times: np.ndarray) -> PathPosition:
+        before, fraction = path.position(times), transition.fraction(times)
+        recorded, remaining = path.trajectory.distance(before.clock), 1.0 - fraction
+        remainder = integral(times.clip(start, end)) if transition.duration else fraction * there
+        distance = remaining * (recorded + before.advance) + remainder + velocity * transition.integral(times)
+        return PathPosition(before.clock, distance - recorded, before.deviation_weight * remaining)
+
+    return replace(path, position=position, paced_from=min(path.paced_from, start))
 
 
 def apply_stop(path: ActorPath, stop: Stop) -> ActorPath:
@@ -95,34 +111,6 @@ def apply_duplicate(path: ActorPath, duplicate: Duplicate) -> ActorPath:
 def _paced(path: ActorPath, clock: Clock, start: float) -> ActorPath:
     """The path whose position follows `clock`, which differs from film time from second `start` on."""
     return replace(path, position=lambda times: path.position(clock(times)), paced_from=min(path.paced_from, start))
-
-
-def _at_constant_speed(path: ActorPath, transition: Transition, velocity: float) -> ActorPath:
-    """The path along which the speed changes over `transition` to `velocity` (m/s, negative: backwards)."""
-    remainder = _integral(path, transition)
-
-    def position(times: np.ndarray) -> PathPosition:
-        before, remaining = path.position(times), 1.0 - transition.fraction(times)
-        recorded = path.trajectory.distance(before.clock)
-        distance = remaining * (recorded + before.advance) + remainder(times) + velocity * transition.integral(times)
-        return PathPosition(before.clock, distance - recorded, before.deviation_weight * remaining)
-
-    return replace(path, position=position, paced_from=min(path.paced_from, transition.start))
-
-
-def _integral(path: ActorPath, transition: Transition) -> Callable[[np.ndarray], np.ndarray]:
-    """The integral (n,) up to the seconds (n,) of the rate of `transition` times the distance of `path`.
-
-    By partial integration, the integral of (1 - fraction) times the speed is (1 - fraction) times the distance plus
-    this integral; distances are smoother than speeds.
-    """
-    end = transition.start + transition.duration
-    if not transition.duration:
-        distance = path.distance(np.array([transition.start]))
-        return lambda times: transition.fraction(times) * distance
-    during = np.linspace(transition.start, end, max(5, int(transition.duration / INTEGRATION_STEP) + 1))
-    integral = CubicSpline(during, transition.rate(during) * path.distance(during)).antiderivative()
-    return lambda times: integral(times.clip(transition.start, end))
 
 
 def _added_offsets(
