@@ -114,7 +114,11 @@ def render_film(
     model, device = open_model(checkpoint, device_settings)
     panels = Panels((f"{path.parent.name}: {path.stem}",), shot.size)
     parts = job.trajectory.parts
-    pictures = recorded_shot(model, shot, device) if parts == "all" else _shot_of_parts(model, shot, device, parts)
+    if parts == "all":
+        pictures = recorded_shot(model, shot, device)
+    else:
+        model.precompute(shot.seconds)
+        pictures = (frames_of_parts(model, view, [parts])[0] for view in shot.views(device))
     figures = write_film(path, pictures, shot, model, panels)
     return {**shot.record(), "offset": job.trajectory.model_dump(exclude={"parts"}), "parts": parts, **figures}
 
@@ -180,12 +184,6 @@ def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterat
     """The frames of a shot of a model without edits, (h, w, 3) uint8 RGB."""
     model.precompute(shot.seconds)
     return film_frames(model, ((view, None) for view in shot.views(device)))
-
-
-def _shot_of_parts(model: SplatModel, shot: Shot, device: torch.device, parts: ShownParts) -> Iterator[np.ndarray]:
-    """As `recorded_shot`, of the static or the dynamic parts alone."""
-    model.precompute(shot.seconds)
-    return (frames_of_parts(model, view, [parts])[0] for view in shot.views(device))
 
 
 @torch.no_grad()
