@@ -7,6 +7,7 @@ from typing import Any
 
 from PIL import Image
 
+from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
 from drivesplat.editing.render_plan import image_render_plan
@@ -49,12 +50,12 @@ def write_rendered_drive(
     drive = image_render_plan(scene, model, job, folder, what)
     try:
         with explain_out_of_memory(lambda: len(model)):
-            views, placements = drive.views(device), drive.placements()
-            if placements is None:
+            views = drive.views(device)
+            if drive.edited:
+                pictures = edited_frames(model, views, actor_placements(drive.objects.actors, drive.seconds))
+            else:
                 model.precompute(drive.seconds.tolist())
                 pictures = film_frames(model, ((view, None) for view in views))
-            else:
-                pictures = edited_frames(model, views, placements)
             for frame, pixels in zip(drive.scene.frames, prefetch_items(pictures), strict=True):
                 with atomic_write(Path(frame.image_path)) as file:
                     Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)

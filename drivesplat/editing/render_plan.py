@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from drivesplat.editing.actors import (
-    actor_placements,
     other_objects,
     recorded_and_edited,
     trained_actors,
@@ -16,7 +15,6 @@ from drivesplat.editing.actors import (
 )
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.shown_objects import ShownObjects
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.images import continuous_intrinsics, target_size
@@ -59,10 +57,6 @@ class ImageRenderPlan:
                 height=size[1],
                 time=seconds,
             )
-
-    def placements(self) -> list[list[ActorPlacement]] | None:
-        """The actors in each image and where they are; None where all are as trained."""
-        return actor_placements(self.objects.actors, self.seconds) if self.edited else None
 
 
 def image_render_plan(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> ImageRenderPlan:

@@ -57,8 +57,6 @@ def _ego_of_sweeps(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def beside(recorded: RecordedScan, ego: EgoPoses, offset: TrajectorySettings) -> RecordedScan:
     """The scan's rays from a sensor displaced as cameras are (`drivesplat.trajectories.camera_path.displaced`)."""
-    if (offset.lateral, offset.vertical, offset.yaw) == (0.0, 0.0, 0.0):
-        return recorded
     sensor = sensor_poses_of(recorded)
     return moved(recorded, lambda offsets: displaced(sensor(offsets), ego(recorded.seconds + offsets), offset))
 

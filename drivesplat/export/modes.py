@@ -46,10 +46,6 @@ class Modes:
     turns: Float[np.ndarray, "m n 3"]
     weights: Callable[[Gait], Float[np.ndarray, "t m"]]
 
-    @property
-    def count(self) -> int:
-        return len(self.shifts)
-
 
 def fitted_modes(model: SplatModel, groups: Mapping[str, SampledGroup]) -> dict[str, Modes]:
     """The modes of the groups that deform and have Gaussians, by name, fitted to their sampled shapes."""

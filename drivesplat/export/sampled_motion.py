@@ -5,7 +5,7 @@ entry; with this spacing points of a vehicle deviate by about a millimetre. Shap
 fifteen times a second: interpolated linearly, a swing of 1 Hz loses 2 % of its width, and one of 2 Hz 9 %.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -47,10 +47,6 @@ class SampledShapes:
     seconds: np.ndarray
     means: np.ndarray
     quats: np.ndarray
-
-    def of_rows(self, chosen: np.ndarray) -> "SampledShapes":
-        """Those of a part of the Gaussians, by mask (n,)."""
-        return replace(self, means=self.means[:, chosen], quats=self.quats[:, chosen])
 
 
 def shape_seconds(motion: SampledMotion) -> np.ndarray:

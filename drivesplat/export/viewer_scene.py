@@ -180,7 +180,7 @@ def modes_array(groups: Sequence[str], modes: Mapping[str, Modes], count: int) -
     found = [np.zeros((0, count, 2, 3))]
     for own in (modes[name] for name in groups if name in modes):
         stacked = np.stack([own.shifts, own.turns], axis=2).transpose(1, 0, 2, 3)  # (n, m, 2, 3)
-        found.append(np.pad(stacked, ((0, 0), (0, count - own.count), (0, 0), (0, 0))))
+        found.append(np.pad(stacked, ((0, 0), (0, count - len(own.shifts)), (0, 0), (0, 0))))
     return _roots(np.concatenate(found))
 
 
@@ -189,7 +189,7 @@ def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any],
     groups, path, start = content.groups, content.path, content.path.start
     gaussians = concatenate([group.gaussians for group in groups.values()])
     arrays, sh_range = splat_arrays(gaussians)
-    count = max((modes.count for modes in content.modes.values()), default=0)
+    count = max((len(modes.shifts) for modes in content.modes.values()), default=0)
     modes, modes_range = modes_array([*groups], content.modes, count)
     motions, cameras = SampleRows(count), SampleRows()
     made = MotionRecords(motions, cameras, content.modes)

@@ -65,7 +65,7 @@ class ObjectTrajectory:
 
     def distance(self, times: np.ndarray) -> np.ndarray:
         """The distance (n,) in metres at recorded `times` (n,) in seconds."""
-        spline = self._distance_spline
+        spline, _, _ = self._by_distance
         within = times.clip(spline.x[0], spline.x[-1])
         distances, past = spline(within), times - within
         for end, chosen in self._past_ends(past):
@@ -82,7 +82,7 @@ class ObjectTrajectory:
 
     def poses_at_distance(self, distances: np.ndarray) -> np.ndarray:
         """The poses (n, 4, 4) at `distances` (n,) in metres, without the motion of a standing object."""
-        known, poses = self._knots
+        _, known, poses = self._by_distance
         within = distances.clip(known[0], known[-1])
         past, result = distances - within, np.tile(poses[0], (len(distances), 1, 1))
         if len(known) > 1:
@@ -128,8 +128,8 @@ class ObjectTrajectory:
         return bridges
 
     @cached_property
-    def _samples(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Recorded seconds (m,), poses (m, 4, 4) and distances (m,) there, and the indices (k,) of the knots."""
+    def _by_distance(self) -> tuple[PchipInterpolator, np.ndarray, np.ndarray]:
+        """The distance by recorded seconds; distances (k,) and poses (k, 4, 4) of the knots of the path by distance."""
         first, last = self.motion.times[[0, -1]]
         times = np.linspace(first, last, int((last - first) / SAMPLE_INTERVAL) + 1)
         poses = self.poses_at_time(times)
@@ -137,24 +137,15 @@ class ObjectTrajectory:
         if distances[-1] < MIN_PATH_LENGTH:
             heading = poses[0, :2, 0] / np.linalg.norm(poses[0, :2, 0])
             distances, knots = np.maximum.accumulate((poses[:, :2, 3] - poses[0, :2, 3]) @ heading), np.array([0])
-        return times, poses, distances, knots
-
-    @cached_property
-    def _distance_spline(self) -> PchipInterpolator:
-        times, _, distances, _ = self._samples
         if len(times) == 1:
-            return PchipInterpolator([times[0], times[0] + 1.0], [0.0, 0.0])
-        return PchipInterpolator(times, distances)
-
-    @cached_property
-    def _knots(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (k,) and poses (k, 4, 4) of the knots of the path by distance."""
-        _, poses, distances, knots = self._samples
-        return distances[knots], poses[knots]
+            spline = PchipInterpolator([times[0], times[0] + 1.0], [0.0, 0.0])
+        else:
+            spline = PchipInterpolator(times, distances)
+        return spline, distances[knots], poses[knots]
 
     @cached_property
     def _knot_splines(self) -> tuple[CubicSpline, RotationSpline]:
-        distances, poses = self._knots
+        _, distances, poses = self._by_distance
         rotations = Rotation.from_matrix(poses[:, :3, :3])
         return CubicSpline(distances, poses[:, :3, 3], bc_type="natural"), RotationSpline(distances, rotations)
 
