@@ -22,7 +22,7 @@ Clock = Callable[[np.ndarray], np.ndarray]
 
 
 def apply_speed(path: ActorPath, speed: Speed) -> ActorPath:
-    """Scales the pace by a factor, or replaces it by a constant speed, negative backwards."""
+    """Scales the pace by a factor, or replaces it by a constant speed."""
     if speed.factor == 1.0:
         return path
     beginning = max(path.begin, 0.0)
