@@ -92,8 +92,8 @@ class ObjectTrajectory:
             tangent = positions(within[chosen][0], 1) if len(known) > 1 else end.direction
             tangent = tangent / np.linalg.norm(tangent[:2])
             arrived_backwards = not end.speed and tangent[:2] @ end.direction[:2] < 0.0  # a standing object may have
-            onward = end.direction * [-1.0, -1.0, 1.0] if arrived_backwards else end.direction
-            result[chosen, :3, 3] += extrapolate(past[chosen], tangent, onward, SETTLING_DISTANCE)
+            continued = end.direction * [-1.0, -1.0, 1.0] if arrived_backwards else end.direction
+            result[chosen, :3, 3] += extrapolate(past[chosen], tangent, continued, SETTLING_DISTANCE)
         return result
 
     def deviation(self, times: np.ndarray) -> np.ndarray:
