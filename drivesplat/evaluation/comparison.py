@@ -89,12 +89,12 @@ def format_spread(figure: dict[str, Any] | None, digits: int = 1) -> str:
     return f"{figure['mean']:.{digits}f} ({figure['min']:.{digits}f} to {figure['max']:.{digits}f})"
 
 
-def format_difference(difference: dict[str, Any] | None, digits: int = 2) -> str:
+def format_difference(difference: dict[str, Any] | None) -> str:
     """A signed mean with its standard error, if there is one; a dash for null."""
     if difference is None:
         return "-"
     error = difference["standard_error"]
-    return f"{difference['mean']:+.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
+    return f"{difference['mean']:+.2f}" + ("" if error is None else f" ± {error:.2f}")
 
 
 def format_mean(figure: dict[str, Any] | None, template: str) -> str:
