@@ -12,7 +12,8 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.camera_path import sampled_path
-from drivesplat.trajectories.sampled_edit import CameraMotion, Instance, SampledEdit, sampled_actor
+from drivesplat.trajectories.edited_actors import EditedActor
+from drivesplat.trajectories.sampled_edit import CameraMotion, Instance, InstanceMotion, SampledEdit
 
 log = logging.getLogger(__name__)
 
@@ -43,10 +44,22 @@ def sampled_edits(
         instances = tuple(
             Instance(
                 actor.id, actor.source, actor.category, actor.size, actor.scale,
-                sampled_actor(actor, seconds) if actor.edited else None,
+                _sampled_actor(actor, seconds) if actor.edited else None,
                 actor.color_matrix, actor.phase,
             )
             for actor in edited
         )  # fmt: skip
         drives.append(SampledEdit(name, instances, moved))
     return drives
+
+
+def _sampled_actor(actor: EditedActor, seconds: np.ndarray) -> InstanceMotion:
+    """The motion of an edited actor at those of `seconds` (n,) at which it is present. Its spans run from the first to
+    the last of neighbouring ones."""
+    present = actor.present(seconds)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
+    spans = tuple((float(seconds[first]), float(seconds[after - 1])) for first, after in edges.reshape(-1, 2))
+    shown = seconds[present]
+    if not len(shown):
+        return InstanceMotion(shown, np.zeros((0, 4, 4)), np.zeros(0), spans)
+    return InstanceMotion(shown, actor.poses(shown), actor.walked(shown), spans)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.export.nerfstudio import transforms_record
+from drivesplat.export.camera_files import transforms_record
 from drivesplat.export.splat_ply import note_of, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, digests, shown_timestamp, trained_gaussians, trained_groups
 from drivesplat.export.unique_names import unique_names

@@ -12,8 +12,14 @@ from drivesplat.scene.tracks import short_ids
 from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 from drivesplat.trajectories.actor_path import ActorPath, recorded_path
 from drivesplat.trajectories.motion import Motion
-from drivesplat.trajectories.placed_path import placed_motion
-from drivesplat.trajectories.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
+from drivesplat.trajectories.steps import (
+    apply_duplicate,
+    apply_reverse,
+    apply_shift,
+    apply_speed,
+    apply_stop,
+    placed_motion,
+)
 
 MIN_DISTANCE = 0.5
 """Metres; an actor that moves less counts as standing, since annotations are noisy."""

@@ -1,7 +1,8 @@
 """The effect of each step of an edit on an actor's path, as pure functions.
 
 `speed` and `reverse` change the position along the path; offsets keep their film seconds. `stop` and a delay act on
-position and offsets, so that a stopped actor does not slide.
+position and offsets, so that a stopped actor does not slide. `place` has a path of its own: through given points, on
+the ground beside the ego vehicle's path.
 """
 
 from collections.abc import Callable
@@ -10,12 +11,19 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from drivesplat.settings.edit import Duplicate, Reverse, Shift, Speed, Stop
+from drivesplat.settings.edit import Duplicate, Place, Reverse, Shift, Speed, Stop
 from drivesplat.trajectories.actor_path import ActorPath, PathOffsets, PathPosition
+from drivesplat.trajectories.motion import Motion
 from drivesplat.trajectories.transition import Transition
 
 INTEGRATION_STEP = 0.005
 """Seconds between the samples of the distance integral during a change of speed."""
+KNOT_HZ = 10.0
+"""Poses a second of the motion of a placed copy."""
+STANDS_S = 3600.0
+"""Seconds for which a copy on a path of one point is present."""
+MIN_STEP = 1e-3
+"""Metres; a shorter step has no direction."""
 
 Clock = Callable[[np.ndarray], np.ndarray]
 """Maps seconds (n,) of the path after a step to seconds (n,) of the path before it."""
@@ -106,6 +114,39 @@ def apply_duplicate(path: ActorPath, duplicate: Duplicate) -> ActorPath:
         return delayed
     offset = {"longitudinal": duplicate.longitudinal, "lateral": duplicate.lateral}
     return apply_shift(delayed, Shift(track=duplicate.name, **offset))
+
+
+def placed_motion(place: Place, ego_to_world: np.ndarray, height: float) -> Motion:
+    """The motion of a box `height` metres high along the path of `place`, a spline through its points.
+
+    `ego_to_world` (n, 4, 4) are the ego poses of the drive: its first is the frame of the points, and the nearest to
+    each place has the ground's height and slope there. The box faces the direction of its path.
+    """
+    points = np.array(place.path)
+    if len(points) == 1:
+        times = points[0, :1] + np.array([0.0, STANDS_S])
+        positions = np.repeat(points[:, 1:], 2, axis=0)
+    else:
+        times = np.linspace(points[0, 0], points[-1, 0], max(2, int(KNOT_HZ * np.ptp(points[:, 0])) + 1))
+        positions = CubicSpline(points[:, 0], points[:, 1:], bc_type="natural")(times)
+    headings, steps = np.zeros(len(positions)), np.gradient(positions, axis=0)
+    moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > MIN_STEP)
+    if len(moving):  # where it stands, the direction of its last motion
+        known = moving[np.maximum(np.searchsorted(moving, np.arange(len(positions)), side="right") - 1, 0)]
+        headings = np.arctan2(steps[known, 1], steps[known, 0])
+    start, poses = ego_to_world[0], np.tile(np.eye(4), (len(positions), 1, 1))
+    for pose, position, heading in zip(poses, positions, headings + np.radians(place.yaw), strict=True):
+        at = start[:3, 3] + start[:3, :3] @ np.array([*position, 0.0])
+        nearest = ego_to_world[np.argmin(np.linalg.norm(ego_to_world[:, :2, 3] - at[:2], axis=1))]
+        up = nearest[:3, 2]
+        forward = start[:3, :3] @ np.array([np.cos(heading), np.sin(heading), 0.0])
+        left = np.cross(up, forward)
+        left /= np.linalg.norm(left)
+        above = at[:2] - nearest[:2, 3]
+        pose[:3, :3] = np.stack([np.cross(left, up), left, up], axis=1)
+        pose[:3, 3] = [*at[:2], nearest[2, 3] - above @ up[:2] / up[2]]
+        pose[:3, 3] += 0.5 * height * up
+    return Motion(times, poses, ((0, len(times) - 1),), 0.5 / KNOT_HZ)
 
 
 def _paced(path: ActorPath, clock: Clock, start: float) -> ActorPath:
