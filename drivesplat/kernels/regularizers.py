@@ -10,7 +10,7 @@ from drivesplat.kernels.constants import constant
 
 
 def mean_opacity_and_scale(
-    *sets: tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]],
+    *sets: tuple[Float[Tensor, " _"], Float[Tensor, "_ 3"]],
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """The mean opacity, and the mean of all scales (metres), where those of Gaussians with opacity 0 count as 0, over
     the Gaussians of some sets; of each its opacities and scales are given."""

@@ -7,7 +7,6 @@ Gaussians, and where a LiDAR sees Gaussians elsewhere than cameras do, OFFSETS o
 """
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -80,7 +79,7 @@ def make_parameters(params: dict[str, Tensor]) -> nn.ParameterDict:
 
 
 @torch.no_grad()
-def fade(params: Mapping[str, Tensor], rows: Bool[Tensor, " n"]) -> None:
+def fade(params: nn.ParameterDict, rows: Bool[Tensor, " n"]) -> None:
     """Makes Gaussians nearly transparent."""
     opacities, faded = params["opacities"], torch.logit(torch.tensor(FADED)).item()
     opacities.masked_fill_(rows & (opacities > faded), faded)

@@ -1,5 +1,6 @@
 """The report as files (HTML page, JSON record and CSV table), and as text for the console."""
 
+import base64
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
 from drivesplat.workflow.report_plan import REPORT_FILES
 
+_PICTURE = re.compile(r"!\[([^\]\n]*)\]\(([^)\s]+)\)")
 _LINK = re.compile(r"\[([^\]\n]+)\]\((?!https?:)[^)\s]+\)")
 """A link to another document, which the page does not come with."""
 
@@ -87,5 +89,14 @@ def render_ghosts_page(document: Path | None = None) -> str:
     """The page; `document` is by default that of the workflow. Without it, the page names the published fixes only."""
     document = document or WORKFLOW / GHOSTS_DOCUMENT
     text = document.read_text(encoding="utf-8") if document.is_file() else ""
-    content = markdown.markdown(_LINK.sub(r"\1", text), extensions=["tables", "sane_lists"])
+    pictures = _PICTURE.sub(lambda found: _embedded(found[1], document.parent / found[2]), text)
+    content = markdown.markdown(_LINK.sub(r"\1", pictures), extensions=["tables", "sane_lists"])
     return filled_page(ghosts_page, fixes=PUBLISHED_FIXES, document=GHOSTS_DOCUMENT, content=Markup(content))
+
+
+def _embedded(text: str, picture: Path) -> str:
+    """A picture as HTML that needs no other file; nothing where it is missing."""
+    if not picture.is_file():
+        return ""
+    content = base64.b64encode(picture.read_bytes()).decode()
+    return f'<img alt="{text}" src="data:image/{picture.suffix[1:]};base64,{content}">'
