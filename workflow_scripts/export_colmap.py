@@ -1,7 +1,7 @@
 """scene.json and the seed points in parser.npz as a text model of COLMAP."""
 
 from drivesplat.workflow.job import job
-from drivesplat.export.colmap import ColmapFiles, export_colmap
+from drivesplat.export.camera_files import ColmapFiles, export_colmap
 from drivesplat.scene.scene import read_scene
 from drivesplat.scene.training_record import read_training_record
 

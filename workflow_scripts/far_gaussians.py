@@ -1,7 +1,8 @@
 """checkpoint.npz and its training views into far.npz: which Gaussians are too far away for exports."""
 
 from drivesplat.workflow.job import job
-from drivesplat.export.far_gaussians import find_far_in, write_far
+from drivesplat.export.far_gaussians import find_far_in
+from drivesplat.io.array_file import write_arrays
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.export import FarJob
@@ -11,4 +12,4 @@ with job(snakemake) as current:
     provenance = current.provenance(checkpoint.provenance, record.provenance)
     limit = current.settings(FarJob).max_distance
     far = find_far_in(checkpoint, record, limit, provenance, current.device)
-    write_far(current.output.far, far)
+    write_arrays(current.output.far, far)

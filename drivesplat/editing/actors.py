@@ -94,22 +94,16 @@ def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list
 
 
 def warn_of_collisions(
-    actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray, where: str
+    actors: Sequence[EditedActor], sensor_to_world: np.ndarray, seconds: np.ndarray, where: str, sensor: str = "camera"
 ) -> np.ndarray:
-    """The `collisions` of a camera, after a warning that begins with `where` if there are any."""
-    colliding = collisions(actors, camera_to_world, seconds)
-    if colliding.any():
-        first, last = seconds[colliding][[0, -1]]
-        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
-    return colliding
-
-
-def collisions(actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """The frames (n,) bool in which the camera is inside a box enlarged by COLLISION_MARGIN, and so shows the inside of
-    an object."""
+    """The times (n,) bool at which a sensor is inside a box enlarged by COLLISION_MARGIN, and so shows the inside of an
+    object; warns, beginning with `where`, if there are any."""
     inside = np.zeros(len(seconds), dtype=bool)
     for actor in actors:
         to_object = inverse(actor.poses(seconds))
-        camera = (to_object[:, :3, :3] @ camera_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
-        inside |= actor.present(seconds) & (np.abs(camera) < actor.size / 2 + COLLISION_MARGIN).all(axis=1)
+        place = (to_object[:, :3, :3] @ sensor_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
+        inside |= actor.present(seconds) & (np.abs(place) < actor.size / 2 + COLLISION_MARGIN).all(axis=1)
+    if inside.any():
+        first, last = seconds[inside][[0, -1]]
+        log.warning("%s: the %s is inside a vehicle between %.1f and %.1f s", where, sensor, first, last)
     return inside

@@ -1,25 +1,22 @@
 """The stage `drive_folder`: writes a rendered drive as a dataset: images, poses, calibration and boxes."""
 
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import Image
 
+from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
-from drivesplat.editing.render_plan import ImageRenderPlan, image_render_plan
+from drivesplat.editing.render_plan import image_render_plan
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.storage import Provenance, atomic_write, write_json
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
-from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import View
 from drivesplat.readers.drive.write import write_record
-from drivesplat.readers.nuscenes.write import Labels, write_nuscenes
+from drivesplat.readers.nuscenes.write import write_nuscenes
 from drivesplat.rendering.frames import film_frames
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import last_training_timestamp
@@ -53,42 +50,34 @@ def write_rendered_drive(
     drive = image_render_plan(scene, model, job, folder, what)
     try:
         with explain_out_of_memory(lambda: len(model)):
-            pictures = prefetch_items(_pictures(model, drive, drive.views(device)))
-            for frame, pixels in zip(drive.scene.frames, pictures, strict=True):
-                _write_jpeg(Path(frame.image_path), pixels)
+            views = drive.views(device)
+            if drive.edited:
+                pictures = edited_frames(model, views, actor_placements(drive.objects.actors, drive.seconds))
+            else:
+                model.precompute(drive.seconds.tolist())
+                pictures = film_frames(model, ((view, None) for view in views))
+            for frame, pixels in zip(drive.scene.frames, prefetch_items(pictures), strict=True):
+                with atomic_write(Path(frame.image_path)) as file:
+                    Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)
             trained_until = last_training_timestamp(scene, job.eval_camera, job.holdout)
             drive, labels = labelled(scene, drive, trained_until, device, what)
-        _write_records(drive, labels, job, path, what, source, provenance)
+        marked = replace(
+            drive.scene,
+            name=f"{source['scene']}_{source.get('edit') or source.get('trajectory')}",
+            description=f"Rendered by drivesplat, not recorded ({what}). {drive.scene.description}".strip(),
+            provenance=provenance,
+        )
+        steps = None if job.edit is None else job.edit.model_dump(mode="json", exclude_none=True)["steps"]
+        rendered: dict[str, Any] = {
+            **source, "steps": steps, "trained_until": labels.trained_until, "shown_by": labels.shown_by
+        }  # fmt: skip
+        log = {"logfile": "rendered-by-drivesplat", "vehicle": "rendered", "date_captured": "", "location": what}
+        write_nuscenes(marked, labels, folder / TABLES, VERSION, log)
+        write_json(folder / TABLES / "provenance.json", {"rendered": rendered, "provenance": provenance})
+        write_record(path, replace(marked, tracks=drive.tracks), {**rendered, "provenance": provenance})
     except BaseException:
         _remove(folder)
         raise
-
-
-def _write_records(
-    drive: ImageRenderPlan,
-    labels: Labels,
-    job: DriveJob,
-    path: Path,
-    what: str,
-    source: dict[str, str],
-    provenance: Provenance,
-) -> None:
-    """Writes the nuScenes tables of a rendered drive, and last its drive.json; `what` is `source` in words."""
-    folder = path.parent
-    marked = replace(
-        drive.scene,
-        name=f"{source['scene']}_{source.get('edit') or source.get('trajectory')}",
-        description=f"Rendered by drivesplat, not recorded ({what}). {drive.scene.description}".strip(),
-        provenance=provenance,
-    )
-    steps = None if job.edit is None else job.edit.model_dump(mode="json", exclude_none=True)["steps"]
-    rendered: dict[str, Any] = {
-        **source, "steps": steps, "trained_until": labels.trained_until, "shown_by": labels.shown_by
-    }  # fmt: skip
-    log = {"logfile": "rendered-by-drivesplat", "vehicle": "rendered", "date_captured": "", "location": what}
-    write_nuscenes(marked, labels, folder / TABLES, VERSION, log)
-    write_json(folder / TABLES / "provenance.json", {"rendered": rendered, "provenance": provenance})
-    write_record(path, replace(marked, tracks=drive.tracks), {**rendered, "provenance": provenance})
 
 
 def _remove(folder: Path) -> None:
@@ -96,17 +85,3 @@ def _remove(folder: Path) -> None:
     for part in (folder / "images", folder / TABLES):
         if part.exists():
             shutil.rmtree(part)
-
-
-def _pictures(model: SplatModel, drive: ImageRenderPlan, views: Iterator[View]) -> Iterator[np.ndarray]:
-    """The rendering of each view, (h, w, 3) uint8."""
-    placements = drive.placements()
-    if placements is not None:
-        return edited_frames(model, views, placements)
-    model.precompute(drive.seconds.tolist())
-    return film_frames(model, ((view, None) for view in views))
-
-
-def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
-    with atomic_write(path) as file:
-        Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)

@@ -65,11 +65,17 @@ def render_edit(
     still = Still(panels, avoided=colliding | (seconds > after.trained_until))
     shown = recorded_shot(model, drive.before, device)
     changed = edited_frames(model, after.views(device), actor_placements(drive.actors, seconds))
-    remove_frames(files.frames)
+    for file in files.frames.glob("[0-9]" * 6 + ".png"):  # of an earlier run
+        file.unlink()
+    if files.frames.is_dir() and not any(files.frames.iterdir()):
+        files.frames.rmdir()
     if job.frames:
         changed = written_frames(files.frames, changed)
     write_film(files.film, still.pairs(shown, changed), after, model, panels, drive.notes)
     write_png(files.still, still.picture)
+    dynamic = {track.id for track in scene.tracks if track.object_class.is_dynamic}
+    others = [item for item in other_objects(scene, drive.recorded) if item.id in dynamic]
+    objects = ShownObjects.of_scene(scene, model, drive.actors, others)
     apart = max(1, round(SHOWN_EVERY_S * job.fps))
     images = [frame_name(files.frames, number) for number in range(len(after.cameras))] if job.frames else []
     return {
@@ -78,7 +84,7 @@ def render_edit(
         "edit": job.edit.model_dump(mode="json"),
         "still_frame": still.number,
         "images": images,
-        "tracks": track_labels(drive.objects(scene, model), seconds, islice(after.views(device), 0, None, apart)),
+        "tracks": track_labels(objects, seconds, islice(after.views(device), 0, None, apart)),
     }
 
 
@@ -96,12 +102,6 @@ class EditedShots:
     def notes(self) -> list[str]:
         """The note in the caption of each edited frame."""
         return [UNSEEN if unseen else "" for unseen in unseen_sides(self.recorded, self.actors, self.after)]
-
-    def objects(self, scene: Scene, model: SplatModel) -> ShownObjects:
-        """The actors after the edit, and the other annotated movable objects, which stay as recorded."""
-        dynamic = {track.id for track in scene.tracks if track.object_class.is_dynamic}
-        others = [item for item in other_objects(scene, self.recorded) if item.id in dynamic]
-        return ShownObjects.of_scene(scene, model, self.actors, others)
 
 
 def edited_shots(scene: Scene, model: SplatModel, job: EditJob, where: str) -> EditedShots:
@@ -184,11 +184,3 @@ def track_labels(objects: ShownObjects, seconds: np.ndarray, views: Iterable[Vie
             }
         )
     return labels
-
-
-def remove_frames(folder: Path) -> None:
-    """Removes the frames of an earlier run from `folder`, and the folder if it is then empty."""
-    for file in folder.glob("[0-9]" * 6 + ".png"):
-        file.unlink()
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()

@@ -36,27 +36,29 @@ def render_quad(
     model, device = open_model(checkpoint, device_settings)
     drive = edited_shots(scene, model, job, f"scene {scene.name}, edit {path.stem!r}")
     smooth, after = drive.before, drive.after
-    frames, last = recorded_frames(scene, job.camera), last_images(scene, smooth)
+    frames = recorded_frames(scene, job.camera)
+    times = np.array([frame.timestamp for frame in frames])
+    last = np.searchsorted(times, smooth.cameras.timestamps, side="right") - 1
     taken = [frames[number] for number in np.unique(last)]
+    poses = [torch.from_numpy(frame.camera_to_world).float().to(device) for frame in taken]
+    K = torch.from_numpy(smooth.K).float().to(device)
+    views = (
+        View(K, pose, *smooth.size, time=scene.seconds(frame.timestamp))
+        for frame, pose in zip(taken, poses, strict=True)
+    )
     model.precompute([*smooth.seconds, *(scene.seconds(frame.timestamp) for frame in taken)])
     placed = actor_placements(drive.actors, np.array(after.seconds))
     columns = (
         repeated(last, (recorded_picture(frame, smooth) for frame in taken)),
-        repeated(last, film_frames(model, ((view_at(frame, smooth, device), None) for frame in taken))),
+        repeated(last, film_frames(model, ((view, None) for view in views))),
         film_frames(model, ((view, None) for view in smooth.views(device))),
         edited_frames(model, after.views(device), placed),
     )
-    rate = f"{image_rate(frames):.2g} Hz"
+    rate = f"{1e6 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0:.2g} Hz"
     labels = (f"recorded, {rate}", f"reconstructed, {rate}", f"smooth, {job.fps} fps", f"edited: {path.stem}")
     panels = Panels(labels, smooth.size)
     figures = write_film(path, map(panels.assembled, zip(*columns, strict=True)), after, model, panels, drive.notes)
     return {**after.record(), "film": panels.record(), "edit": job.edit.model_dump(mode="json"), **figures}
-
-
-def last_images(scene: Scene, shot: Shot) -> np.ndarray:
-    """The index (n,) of the camera's last image up to the time of each frame of a shot."""
-    times = np.array([frame.timestamp for frame in recorded_frames(scene, shot.format.camera)])
-    return np.searchsorted(times, shot.cameras.timestamps, side="right") - 1
 
 
 def repeated(last: np.ndarray, pictures: Iterable[T]) -> Iterator[T]:
@@ -76,15 +78,3 @@ def recorded_picture(frame: Frame, shot: Shot) -> np.ndarray:
     image = read_image(frame.image_path, size)
     offset = shot.K[:2, 2] - continuous_intrinsics(frame, size)[:2, 2]
     return cv2.warpAffine(image, np.column_stack([np.eye(2), offset]), shot.size)
-
-
-def view_at(frame: Frame, shot: Shot, device: torch.device) -> View:
-    """The camera of a recorded image with the intrinsics of a shot."""
-    K, pose = (torch.from_numpy(matrix).float().to(device) for matrix in (shot.K, frame.camera_to_world))
-    return View(K, pose, *shot.size, time=shot.scene.seconds(frame.timestamp))
-
-
-def image_rate(frames: list[Frame]) -> float:
-    """The images a second of a camera."""
-    times = np.array([frame.timestamp for frame in frames])
-    return 1e6 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from drivesplat.editing.actors import (
-    actor_placements,
     other_objects,
     recorded_and_edited,
     trained_actors,
@@ -16,7 +15,6 @@ from drivesplat.editing.actors import (
 )
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.shown_objects import ShownObjects
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.images import continuous_intrinsics, target_size
@@ -60,10 +58,6 @@ class ImageRenderPlan:
                 time=seconds,
             )
 
-    def placements(self) -> list[list[ActorPlacement]] | None:
-        """The actors in each image and where they are; None where all are as trained."""
-        return actor_placements(self.objects.actors, self.seconds) if self.edited else None
-
 
 def image_render_plan(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> ImageRenderPlan:
     """The drive of `job`; its images are to lie in `folder`/images.
@@ -78,76 +72,26 @@ def image_render_plan(scene: Scene, model: SplatModel, job: DriveJob, folder: Pa
     else:
         trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
         ego = EgoEdit.of(scene, job.eval_camera, job.edit, where)
-    frames = [
-        replace(_resized(frame, job), image_path=str(folder / "images" / camera / f"{frame.timestamp}{IMAGE_SUFFIX}"))
-        for camera in job.cameras
-        for frame in _moved_frames(scene, camera, ego, job.trajectory)
-    ]
+    frames = [frame for camera in job.cameras for frame in _rendered_frames(scene, camera, ego, job, folder)]
     last = max((frame.sample_index for frame in frames if frame.is_key_frame), default=0)
     frames = [replace(frame, sample_index=min(frame.sample_index, last)) for frame in frames]
-    rendered = _with_frames(scene, frames, scene.key_frame_timestamps[: last + 1])
     seconds = _seconds(scene, frames)
-    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
-    warn_of_collisions(actors, camera_to_world, seconds, where)
-    others, key_times = other_objects(scene, trained), rendered.key_frame_timestamps
+    warn_of_collisions(actors, np.stack([frame.camera_to_world for frame in frames]), seconds, where)
+    others, key_times = other_objects(scene, trained), scene.key_frame_timestamps[: last + 1]
     objects = [*actors, *others]
     times = [*key_times.tolist(), *(frame.timestamp for frame in frames)]
     label_times = np.union1d(key_times, np.arange(min(times), max(times) + 1, LABEL_INTERVAL))
-    return ImageRenderPlan(
-        replace(rendered, tracks=_tracks(scene, objects, key_times)),
-        seconds,
-        _tracks(scene, objects, label_times),
-        ShownObjects.of_scene(scene, model, actors, others),
-        job.edit is not None,
-    )
-
-
-def _moved_frames(
-    scene: Scene, camera: str, change: EgoEdit | None, trajectory: TrajectorySettings | None
-) -> list[Frame]:
-    """The images of a camera with the poses after a change of the ego vehicle's path, or beside the recorded path."""
-    frames = recorded_frames(scene, camera)
-    if change is not None:
-        seconds = _seconds(scene, frames)
-        within = change.within(frames, seconds)
-        kept = [frame for frame, inside in zip(frames, within, strict=True) if inside]
-        return _posed(kept, *change.poses(frames, seconds[within]))
-    if trajectory is None or trajectory == TrajectorySettings():
-        return frames
-    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
-    ego_to_world = np.stack([frame.ego_to_world for frame in frames])
-    moved = displaced(camera_to_world, ego_to_world, trajectory)
-    aside = TrajectorySettings(lateral=trajectory.lateral)
-    return _posed(frames, moved, displaced(ego_to_world, ego_to_world, aside))
-
-
-def _posed(frames: Sequence[Frame], camera_to_world: np.ndarray, ego_to_world: np.ndarray) -> list[Frame]:
-    return [
-        replace(frame, camera_to_world=camera, ego_to_world=ego)
-        for frame, camera, ego in zip(frames, camera_to_world, ego_to_world, strict=True)
-    ]
-
-
-def _resized(frame: Frame, job: DriveJob) -> Frame:
-    """The image at the width of the job, its intrinsics in OpenCV's convention."""
-    size = target_size(frame, job.images if job.width is None else ImageSettings(width=job.width))
-    intrinsics = continuous_intrinsics(frame, size)
-    intrinsics[:2, 2] -= 0.5
-    return replace(frame, width=size[0], height=size[1], intrinsics=intrinsics)
-
-
-def _with_frames(scene: Scene, frames: Sequence[Frame], key_times: np.ndarray) -> Scene:
-    """The scene with other images and no LiDAR. Its cameras record all pixels at once, without distortion."""
     first = {frame.camera: frame for frame in reversed(frames)}
-    return replace(
+    rendered = replace(
         scene,
         key_frame_timestamps=key_times,
         frames=tuple(frames),
         sweeps=(),
-        tracks=(),
+        tracks=_tracks(scene, objects, key_times),
         poses=RENDERED,
         key_frame_range=None,
         missing_images=0,
+        # they record all pixels at once, without distortion
         cameras=tuple(
             Camera(name, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5), readout_s=0.0)
             for name, frame in sorted(first.items())
@@ -155,6 +99,42 @@ def _with_frames(scene: Scene, frames: Sequence[Frame], key_times: np.ndarray) -
         lidars=(),
         provenance={},
     )
+    shown = ShownObjects.of_scene(scene, model, actors, others)
+    return ImageRenderPlan(rendered, seconds, _tracks(scene, objects, label_times), shown, job.edit is not None)
+
+
+def _rendered_frames(scene: Scene, camera: str, change: EgoEdit | None, job: DriveJob, folder: Path) -> list[Frame]:
+    """The images of a camera at the width of the job, with the poses after a change of the ego vehicle's path, or
+    beside the recorded path, and intrinsics in OpenCV's convention."""
+    frames = recorded_frames(scene, camera)
+    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
+    ego_to_world = np.stack([frame.ego_to_world for frame in frames])
+    trajectory = job.trajectory
+    if change is not None:
+        seconds = _seconds(scene, frames)
+        within = change.within(frames, seconds)
+        camera_to_world, ego_to_world = change.poses(frames, seconds[within])
+        frames = [frame for frame, inside in zip(frames, within, strict=True) if inside]
+    elif trajectory is not None and trajectory != TrajectorySettings():
+        aside = TrajectorySettings(lateral=trajectory.lateral)
+        camera_to_world = displaced(camera_to_world, ego_to_world, trajectory)
+        ego_to_world = displaced(ego_to_world, ego_to_world, aside)
+    rendered = []
+    for frame, camera_pose, ego_pose in zip(frames, camera_to_world, ego_to_world, strict=True):
+        size = target_size(frame, job.images if job.width is None else ImageSettings(width=job.width))
+        intrinsics = continuous_intrinsics(frame, size)
+        intrinsics[:2, 2] -= 0.5
+        moved = replace(
+            frame,
+            image_path=str(folder / "images" / camera / f"{frame.timestamp}{IMAGE_SUFFIX}"),
+            width=size[0],
+            height=size[1],
+            intrinsics=intrinsics,
+            camera_to_world=camera_pose,
+            ego_to_world=ego_pose,
+        )
+        rendered.append(moved)
+    return rendered
 
 
 def _tracks(scene: Scene, objects: Sequence[EditedActor], times: np.ndarray) -> tuple[Track, ...]:

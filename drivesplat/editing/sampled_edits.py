@@ -9,11 +9,11 @@ from drivesplat.editing.actors import recorded_and_edited
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.camera_path import sampled_path
-from drivesplat.trajectories.sampled_edit import CameraMotion, Instance, SampledEdit, sampled_actor
+from drivesplat.trajectories.edited_actors import EditedActor
+from drivesplat.trajectories.sampled_edit import CameraMotion, Instance, InstanceMotion, SampledEdit
 
 log = logging.getLogger(__name__)
 
@@ -29,33 +29,37 @@ def sampled_edits(
         return []
     drives, model = [], trained_model(checkpoint)
     for name, edit in edits.items():
-        where = f"scene {scene.name}, edit {name!r}"
+        where, moved = f"scene {scene.name}, edit {name!r}", None
         try:
-            drives.append(_edited_drive(model, scene, camera, name, edit, rate, where))
+            _, edited = recorded_and_edited(model, scene, camera, edit, where)
+            if any(step.kind == "ego" for step in edit.steps):
+                path = edited_camera_path(scene, camera, rate, edit, where)
+                times = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])
+                moved = CameraMotion(times, path.camera_to_world)
         except ConfigError as error:
             log.warning("an edit is left out: %s", error)
+            continue
+        timestamps, _ = sampled_path(scene, camera, rate)
+        seconds = np.array([scene.seconds(timestamp) for timestamp in timestamps])
+        instances = tuple(
+            Instance(
+                actor.id, actor.source, actor.category, actor.size, actor.scale,
+                _sampled_actor(actor, seconds) if actor.edited else None,
+                actor.color_matrix, actor.phase,
+            )
+            for actor in edited
+        )  # fmt: skip
+        drives.append(SampledEdit(name, instances, moved))
     return drives
 
 
-def _edited_drive(
-    model: SplatModel, scene: Scene, camera: str, name: str, edit: Edit, rate: int, where: str
-) -> SampledEdit:
-    _, edited = recorded_and_edited(model, scene, camera, edit, where)
-    timestamps, _ = sampled_path(scene, camera, rate)
-    seconds = np.array([scene.seconds(timestamp) for timestamp in timestamps])
-    instances = tuple(
-        Instance(
-            actor.id, actor.source, actor.category, actor.size, actor.scale,
-            sampled_actor(actor, seconds) if actor.edited else None,
-            actor.color_matrix, actor.phase,
-        )
-        for actor in edited
-    )  # fmt: skip
-    return SampledEdit(name, instances, _edited_camera(scene, camera, edit, rate, where))
-
-
-def _edited_camera(scene: Scene, camera: str, edit: Edit, rate: int, where: str) -> CameraMotion | None:
-    if not any(step.kind == "ego" for step in edit.steps):
-        return None
-    path = edited_camera_path(scene, camera, rate, edit, where)
-    return CameraMotion(np.array([scene.seconds(timestamp) for timestamp in path.timestamps]), path.camera_to_world)
+def _sampled_actor(actor: EditedActor, seconds: np.ndarray) -> InstanceMotion:
+    """The motion of an edited actor at those of `seconds` (n,) at which it is present. Its spans run from the first to
+    the last of neighbouring ones."""
+    present = actor.present(seconds)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
+    spans = tuple((float(seconds[first]), float(seconds[after - 1])) for first, after in edges.reshape(-1, 2))
+    shown = seconds[present]
+    if not len(shown):
+        return InstanceMotion(shown, np.zeros((0, 4, 4)), np.zeros(0), spans)
+    return InstanceMotion(shown, actor.poses(shown), actor.walked(shown), spans)

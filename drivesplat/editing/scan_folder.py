@@ -45,7 +45,11 @@ def write_scan_folder(
     try:
         with explain_out_of_memory(lambda: len(model)):
             for found in drive.simulated(model, checkpoint.job.train.scans.beam_spread_rad, device):
-                _require_finite(found, what)
+                values = (found.rendered.ranges, found.rendered.drops, found.rendered.intensities)
+                if not all(np.isfinite(array).all() for array in values):
+                    raise ResultError(
+                        f"{what}: a rendered scan contains NaN or Inf; delete checkpoint.npz and train again"
+                    )
                 listed.append(_written(folder, found, job.formats, [item["id"] for item in objects]))
         steps = None if job.edit is None else job.edit.model_dump(mode="json", exclude_none=True)["steps"]
         offset = None if job.trajectory is None else job.trajectory.model_dump(exclude={"parts"})
@@ -54,12 +58,6 @@ def write_scan_folder(
     except BaseException:
         _remove_scans(folder)
         raise
-
-
-def _require_finite(found: SimulatedScan, what: str) -> None:
-    rendered = found.rendered
-    if not all(np.isfinite(values).all() for values in (rendered.ranges, rendered.drops, rendered.intensities)):
-        raise ResultError(f"{what}: a rendered scan contains NaN or Inf; delete checkpoint.npz and train again")
 
 
 def _remove_scans(folder: Path) -> None:

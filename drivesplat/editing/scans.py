@@ -1,34 +1,30 @@
 """LiDAR scans of an edited drive, or of one beside the recorded path: the recorded rays, fired from where the sensor
 now is."""
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int, Int16
+from jaxtyping import Bool, Float64, Int16
 
-from drivesplat.editing.actors import actor_placements, collisions, recorded_and_edited, trained_actors
+from drivesplat.editing.actors import actor_placements, recorded_and_edited, trained_actors, warn_of_collisions
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.sensor_path import beside, carried, recorded_ego
 from drivesplat.editing.shown_objects import parts_that_may_show
 from drivesplat.errors import ConfigError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.objects_met import TrackedBoxes
-from drivesplat.model.scans import ScanView, group_met, view_of_scan
+from drivesplat.model.scans import group_met, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.scene import Scene, Track
-from drivesplat.settings.edit import Edit
 from drivesplat.settings.export import ScanFolderJob
 from drivesplat.trajectories.camera_path import recorded_frames
 from drivesplat.trajectories.edited_actors import EditedActor
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -79,36 +75,30 @@ class ScanRenderPlan:
             for name, source, size in found
         ]  # fmt: skip
 
+    @torch.no_grad()
     def simulated(
         self, model: SplatModel, beam_spread: tuple[float, float], device: torch.device
     ) -> Iterator[SimulatedScan]:
         """The scans in order. `beam_spread` in radians."""
+        of_boxes = np.full(max([*self.boxes.indices, -1]) + 2, NO_OBJECT)  # the last is what NO_OBJECT finds
+        of_boxes[self.boxes.indices] = len(self.actors) + np.arange(len(self.others))
         for sensor in self.sensors:
-            yield self._simulated(model, sensor, view_of_scan(sensor, beam_spread, device))
-
-    @torch.no_grad()
-    def _simulated(self, model: SplatModel, sensor: RecordedScan, view: ScanView) -> SimulatedScan:
-        time = np.array([sensor.seconds])
-        present = [i for i, actor in enumerate(self.actors) if actor.present(time)[0]]
-        (placed,) = actor_placements([self.actors[i] for i in present], time)
-        gaussians = model.at(sensor.seconds, replace(SCAN, placements=tuple(placed)))
-        rendered = model.scan(view, gaussians=gaussians).rendered()
-        objects = np.full(rendered.ranges.shape, NO_OBJECT, dtype=np.int16)
-        found = SimulatedScan(sensor, rendered, objects)
-        if placed:
-            numbers = np.array([*present, NO_OBJECT], dtype=np.int16)  # the last is what -1 finds
-            met = group_met(gaussians, view, gaussians.placement).cpu().numpy()
-            objects[found.returned] = numbers[met[found.returned]]
-        static = objects[found.returned] == NO_OBJECT
-        objects[found.returned] = np.where(static, self._boxes_met(found), objects[found.returned])
-        return found
-
-    def _boxes_met(self, found: SimulatedScan) -> Int[np.ndarray, " n"]:
-        """The objects in whose boxes the returns lie, of those that the static part shows."""
-        numbers = np.full(max([*self.boxes.indices, -1]) + 2, NO_OBJECT)  # the last is what NO_OBJECT finds
-        numbers[self.boxes.indices] = len(self.actors) + np.arange(len(self.others))
-        seconds = found.sensor.seconds + found.sensor.scan.rays.offsets_s[found.returned].astype(np.float64)
-        return numbers[self.boxes.met(*found.places(), seconds)]
+            view, time = view_of_scan(sensor, beam_spread, device), np.array([sensor.seconds])
+            present = [i for i, actor in enumerate(self.actors) if actor.present(time)[0]]
+            (placed,) = actor_placements([self.actors[i] for i in present], time)
+            gaussians = model.at(sensor.seconds, replace(SCAN, placements=tuple(placed)))
+            rendered = model.scan(view, gaussians=gaussians).rendered()
+            objects = np.full(rendered.ranges.shape, NO_OBJECT, dtype=np.int16)
+            found = SimulatedScan(sensor, rendered, objects)
+            returned = found.returned
+            if placed:
+                of_groups = np.array([*present, NO_OBJECT], dtype=np.int16)  # the last is what -1 finds
+                objects[returned] = of_groups[group_met(gaussians, view, gaussians.placement).cpu().numpy()[returned]]
+            # the static part shows what is in the boxes of the others
+            seconds = sensor.seconds + sensor.scan.rays.offsets_s[returned].astype(np.float64)
+            static = of_boxes[self.boxes.met(*found.places(), seconds)]
+            objects[returned] = np.where(objects[returned] == NO_OBJECT, static, objects[returned])
+            yield found
 
 
 def scan_render_plan(
@@ -122,42 +112,24 @@ def scan_render_plan(
     """
     if job.edit is None:
         trained = actors = trained_actors(model, scene, where)
-        sensors = _beside(scene, scans, job)
+        sensors, offset = list(scans), job.trajectory
+        if offset is not None and (offset.lateral or offset.vertical or offset.yaw):
+            recorded = recorded_ego(scene, job.eval_camera)
+            sensors = [beside(scan, recorded, offset) for scan in scans]
     else:
         if job.eval_camera is None:
             raise ConfigError(f"{where}: scans of edits need images, and the scene has no camera")
         trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
-        sensors = _carried(scene, scans, job.eval_camera, job.edit, where)
+        sensors, change = list(scans), EgoEdit.of(scene, job.eval_camera, job.edit, where)
+        if change is not None and scans:
+            frames, recorded = recorded_frames(scene, job.eval_camera), recorded_ego(scene, job.eval_camera)
+            seconds = np.array([scan.seconds for scan in scans])
+            within = change.within(frames, seconds, until=float(seconds.max()))
+            kept = (scan for scan, inside in zip(scans, within, strict=True) if inside)
+            sensors = [carried(scan, recorded, lambda times: change.poses(frames, times)[1]) for scan in kept]
     unseen = {track.id for track in scene.tracks if not parts_that_may_show(track, model)}
     boxes = TrackedBoxes.of_scene(scene, without=unseen | {actor.id for actor in trained})
     if sensors:
         poses, seconds = np.stack([s.sensor_to_world for s in sensors]), np.array([s.seconds for s in sensors])
-        colliding = collisions(actors, poses, seconds)
-        if colliding.any():
-            first, last = seconds[colliding][[0, -1]]
-            log.warning("%s: the LiDAR is inside a vehicle between %.1f and %.1f s", where, first, last)
+        warn_of_collisions(actors, poses, seconds, where, "LiDAR")
     return ScanRenderPlan(sensors, actors, [scene.tracks[i] for i in boxes.indices], boxes)
-
-
-def _beside(scene: Scene, scans: Sequence[RecordedScan], job: ScanFolderJob) -> list[RecordedScan]:
-    """The scans from beside the recorded path."""
-    offset = job.trajectory
-    if offset is None or not (offset.lateral or offset.vertical or offset.yaw):
-        return list(scans)
-    ego = recorded_ego(scene, job.eval_camera)
-    return [beside(scan, ego, offset) for scan in scans]
-
-
-def _carried(scene: Scene, scans: Sequence[RecordedScan], camera: str, edit: Edit, where: str) -> list[RecordedScan]:
-    """The scans of a sensor on the edited ego vehicle."""
-    change = EgoEdit.of(scene, camera, edit, where)
-    if change is None or not scans:
-        return list(scans)
-    frames, ego = recorded_frames(scene, camera), recorded_ego(scene, camera)
-    seconds = np.array([scan.seconds for scan in scans])
-    within = change.within(frames, seconds, until=float(seconds.max()))
-    return [
-        carried(scan, ego, lambda times: change.poses(frames, times)[1])
-        for scan, inside in zip(scans, within, strict=True)
-        if inside
-    ]

@@ -9,7 +9,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.lidar.moved_sensor import moved, sensor_poses_of
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scan_record import RecordedScan
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.render import TrajectorySettings
 from drivesplat.trajectories.camera_path import displaced, recorded_frames, smooth_poses
 
@@ -26,16 +26,11 @@ def recorded_ego(scene: Scene, camera: str | None) -> EgoPoses:
     """
     if camera is None or not scene.frames:
         seconds, poses = _ego_of_sweeps(scene)
-        return lambda times: smooth_poses(seconds * 1e6, poses, times * 1e6)
-    frames = recorded_frames(scene, camera)
-    return lambda times: ego_of_frames(scene, frames, times)
-
-
-def ego_of_frames(scene: Scene, frames: list[Frame], times: np.ndarray) -> np.ndarray:
-    """Ego to world (n, 4, 4) at `times` (n,) in seconds, by images at increasing times."""
-    seconds = np.array([scene.seconds(frame.timestamp) for frame in frames])
-    poses = np.stack([frame.ego_to_world for frame in frames])
-    return smooth_poses(seconds * 1e6, poses, times * 1e6)
+    else:
+        frames = recorded_frames(scene, camera)
+        seconds = np.array([scene.seconds(frame.timestamp) for frame in frames])
+        poses = np.stack([frame.ego_to_world for frame in frames])
+    return lambda times: smooth_poses(seconds * 1e6, poses, times * 1e6)
 
 
 def _ego_of_sweeps(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -62,8 +57,6 @@ def _ego_of_sweeps(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def beside(recorded: RecordedScan, ego: EgoPoses, offset: TrajectorySettings) -> RecordedScan:
     """The scan's rays from a sensor displaced as cameras are (`drivesplat.trajectories.camera_path.displaced`)."""
-    if (offset.lateral, offset.vertical, offset.yaw) == (0.0, 0.0, 0.0):
-        return recorded
     sensor = sensor_poses_of(recorded)
     return moved(recorded, lambda offsets: displaced(sensor(offsets), ego(recorded.seconds + offsets), offset))
 

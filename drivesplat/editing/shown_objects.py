@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from drivesplat.editing.actors import actor_placements
@@ -74,15 +74,12 @@ class ShownObjects:
         for view in views:
             wanted = [i for i, item in enumerate(self.others) if self.parts[i] and item.id not in seen]
             rest = replace(self, others=[self.others[i] for i in wanted], parts=[self.parts[i] for i in wanted])
-            seen |= {found.id for found in rest._seen(view, with_actors=False)} if wanted else set()
+            seen |= {found.id for found in rest.seen_in(view, with_actors=False)} if wanted else set()
         return seen
 
-    def seen_in(self, view: View) -> list[SeenObject]:
-        """The objects that a view shows."""
-        return self._seen(view, with_actors=True)
-
     @torch.no_grad()
-    def _seen(self, view: View, with_actors: bool) -> list[SeenObject]:
+    def seen_in(self, view: View, with_actors: bool = True) -> list[SeenObject]:
+        """The objects that a view shows."""
         now = np.array([view.time])
         present = [actor for actor in self.actors if actor.present(now)[0]]
         (placements,) = actor_placements(present, now)
@@ -91,18 +88,21 @@ class ShownObjects:
         gaussians, found = concatenate(sets), []
         if with_actors:
             rows = [gaussians.placement == i for i in range(len(present))]
-            found += [_seen_object(self, gaussians, *one, view) for one in zip(rows, present, strict=True)]
-        device = gaussians.means.device
-        part_of_row = torch.cat([torch.full((len(own),), i, device=device) for i, own in enumerate(sets)])
+            found += [_seen_object(self.model, gaussians, *one, view) for one in zip(rows, present, strict=True)]
+        means, names = gaussians.means, [part.name for part in self.model.parts]
+        part_of_row = torch.cat([torch.full((len(own),), i, device=means.device) for i, own in enumerate(sets)])
         for item, parts in zip(self.others, self.parts, strict=True):
-            if parts and item.present(now)[0]:
-                rows = _in_box(gaussians, item.poses(now)[0], item.size) & self._rows_of(parts, part_of_row)
-                found.append(_seen_object(self, gaussians, rows, item, view))
+            if not parts or not item.present(now)[0]:
+                continue
+            # of the Gaussians of these parts those whose centres lie in the box
+            to_object, half = torch.from_numpy(inverse(item.poses(now)[0])).to(means), item.size / 2
+            local = means @ to_object[:3, :3].T + to_object[:3, 3]
+            floor = [MARGIN, MARGIN, -FLOOR_SHARE * item.size[2]]
+            low, high = (torch.from_numpy(corner).to(means) for corner in (-half - floor, half + MARGIN))
+            of_parts = torch.tensor([name in parts for name in names], device=means.device)[part_of_row]
+            rows = ((local > low) & (local < high)).all(dim=1) & of_parts
+            found.append(_seen_object(self.model, gaussians, rows, item, view))
         return [item for item in found if item is not None]
-
-    def _rows_of(self, parts: frozenset[str], part_of_row: Int[Tensor, " n"]) -> Bool[Tensor, " n"]:
-        wanted = torch.tensor([part.name in parts for part in self.model.parts], device=part_of_row.device)
-        return wanted[part_of_row]
 
 
 def parts_that_may_show(track: Track, model: SplatModel) -> frozenset[str]:
@@ -115,7 +115,7 @@ def parts_that_may_show(track: Track, model: SplatModel) -> frozenset[str]:
 
 
 def _seen_object(
-    shown: ShownObjects, gaussians: Gaussians, rows: Bool[Tensor, " n"], item: EditedActor, view: View
+    model: SplatModel, gaussians: Gaussians, rows: Bool[Tensor, " n"], item: EditedActor, view: View
 ) -> SeenObject | None:
     """An object in a view that the `rows` of the Gaussians show; None where the image does not show it."""
     pose = item.poses(np.array([view.time]))[0]
@@ -131,11 +131,11 @@ def _seen_object(
         return None
     inside = _cropped(view, corners[:2], corners[2:])
     whole = _cropped(view, low.clip(-size, 2 * size), high.clip(-size, 2 * size))
-    share = shown.model.composited(gaussians, rows.to(gaussians.means)[:, None], inside).image.sum()
+    share = model.composited(gaussians, rows.to(gaussians.means)[:, None], inside).image.sum()
     if share < MIN_SEEN * pixels:
         return None
     own = gaussians[rows]
-    alone = shown.model.composited(own, own.means.new_ones(len(own), 1), whole).alpha.sum()
+    alone = model.composited(own, own.means.new_ones(len(own), 1), whole).alpha.sum()
     return SeenObject(item.id, tuple(corners.tolist()), min(1.0, float(share / alone)))
 
 
@@ -147,12 +147,3 @@ def _cropped(view: View, low: np.ndarray, high: np.ndarray) -> View:
     shifted[0, 2] -= left
     shifted[1, 2] -= top
     return replace(view, K=shifted, width=max(1, right - left), height=max(1, bottom - top))
-
-
-def _in_box(gaussians: Gaussians, pose: np.ndarray, size: Float[np.ndarray, "3"]) -> Bool[Tensor, " n"]:
-    """The Gaussians whose centres lie in a box of the background."""
-    means, half = gaussians.means, size / 2
-    to_object = torch.from_numpy(inverse(pose)).to(means)
-    local = means @ to_object[:3, :3].T + to_object[:3, 3]
-    low, high = -half - [MARGIN, MARGIN, -FLOOR_SHARE * size[2]], half + MARGIN
-    return ((local > torch.from_numpy(low).to(means)) & (local < torch.from_numpy(high).to(means))).all(dim=1)

@@ -45,33 +45,21 @@ class _Cameras:
 def unseen_sides(recorded: Sequence[EditedActor], edited: Sequence[EditedActor], shot: Shot) -> np.ndarray:
     """The frames (n,) bool of a shot that show one of the `edited` actors from a side that no training image shows;
     `recorded` are the actors before the edit. Objects that hide each other are not accounted for."""
-    trained, filmed = _training_cameras(shot), _film_cameras(shot)
-    known = {actor.id: _without_nan(trained.azimuths(actor, MIN_SHARE_TRAINED)) for actor in recorded}
-    found = np.zeros(len(shot.cameras), dtype=bool)
-    for actor in edited:
-        azimuths = filmed.azimuths(actor, MIN_SHARE_SHOWN)
-        turns = np.abs(np.angle(np.exp(1j * (azimuths[:, None] - known[actor.source]))))
-        found |= ~np.isnan(azimuths) & (turns.min(axis=1, initial=np.pi) > MAX_TURN)
-    return found
-
-
-def _training_cameras(shot: Shot) -> _Cameras:
-    scene = shot.scene
+    scene, count = shot.scene, len(shot.cameras)
     frames = [scene.frames[i] for i in training_images(scene, shot.format.holdout)]
     sizes = [(frame.width, frame.height) for frame in frames]
-    return _Cameras(
+    trained = _Cameras(
         np.array([scene.seconds(frame.timestamp) for frame in frames]),
         np.array([frame.camera_to_world for frame in frames]).reshape(-1, 4, 4),
         np.array([continuous_intrinsics(f, size) for f, size in zip(frames, sizes, strict=True)]).reshape(-1, 3, 3),
         np.array(sizes).reshape(-1, 2),
     )
-
-
-def _film_cameras(shot: Shot) -> _Cameras:
-    count = len(shot.cameras)
     repeated = np.tile(shot.K, (count, 1, 1)), np.tile(shot.size, (count, 1))
-    return _Cameras(np.array(shot.seconds), shot.cameras.camera_to_world, *repeated)
-
-
-def _without_nan(values: np.ndarray) -> np.ndarray:
-    return values[~np.isnan(values)]
+    filmed = _Cameras(np.array(shot.seconds), shot.cameras.camera_to_world, *repeated)
+    known = {actor.id: trained.azimuths(actor, MIN_SHARE_TRAINED) for actor in recorded}
+    found = np.zeros(count, dtype=bool)
+    for actor in edited:
+        azimuths, seen = filmed.azimuths(actor, MIN_SHARE_SHOWN), known[actor.source]
+        turns = np.abs(np.angle(np.exp(1j * (azimuths[:, None] - seen[~np.isnan(seen)]))))
+        found |= ~np.isnan(azimuths) & (turns.min(axis=1, initial=np.pi) > MAX_TURN)
+    return found

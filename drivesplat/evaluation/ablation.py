@@ -1,6 +1,5 @@
 """The stage `ablation`: the contribution of each component of a method, from trainings without it."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,50 +20,43 @@ from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.ablation import AblationJob
 
 COSTS = ("gaussians", "train_seconds")
+_SPREAD = {"": "mean", "_min": "min", "_max": "max"}
 
 
 def ablation(evals: dict[str, dict[str, Any]], job: AblationJob) -> dict[str, Any]:
     """The content of ablation.json, without provenance, from the eval.json of every method of the ablation by name.
 
-    The first row is the complete method (`without` is null); one row follows for every variant. Raises ResultError if
-    two methods were measured under different protocols.
+    The first row is the complete method (`without` is null); one row follows for every variant, with the figures of its
+    runs, one per seed, compared with those of the complete method. Raises ResultError if two methods were measured
+    under different protocols.
     """
     measured = side_by_side(evals)
     results = measured.pop("methods")
     runs_of = {without: [results[job.method(without, s)] for s in job.seeds] for without in (None, *job.without)}
-    rows = [
-        {"variant": job.variant(without), "without": without, **_row(runs, None if without is None else runs_of[None])}
-        for without, runs in runs_of.items()
-    ]
+    rows = []
+    for without, runs in runs_of.items():
+        figures = compare_runs(runs, None if without is None else runs_of[None], PSNRS)
+        costs = {name: summarize(values_at(runs, name)) for name in COSTS}
+        variant = {"variant": job.variant(without), "without": without}
+        rows.append({**variant, "seeds": len(runs), **figures, **costs})
     return {**measured, **job.model_dump(mode="json", include={"of", "seeds"}), "rows": rows}
-
-
-def _row(runs: list[dict[str, Any]], complete: list[dict[str, Any]] | None) -> dict[str, Any]:
-    """The figures of a variant's runs, one per seed, compared with those of the complete method (None for itself)."""
-    costs = {name: summarize(values_at(runs, name)) for name in COSTS}
-    return {"seeds": len(runs), **compare_runs(runs, complete, PSNRS), **costs}
 
 
 def write_csv(path: str | Path, record: dict[str, Any]) -> None:
     """Writes the rows of an ablation as CSV; null figures are empty cells."""
-    lines = [dict(_cells(row, record)) for row in record["rows"]]
+    lines = []
+    for row in record["rows"]:
+        line = {"scene": record["scene"], "variant": row["variant"], "seeds": row["seeds"]}
+        for group in HELD_OUT_GROUPS:
+            for name in PSNRS:
+                figure, difference = row[group][name] or {}, row[group]["difference"][name] or {}
+                line |= {f"{group}_{name}{suffix}": figure.get(key) for suffix, key in _SPREAD.items()}
+                line[f"{group}_{name}_difference"] = difference.get("mean")
+                line[f"{group}_{name}_difference_standard_error"] = difference.get("standard_error")
+        for name in COSTS:
+            line |= {f"{name}{suffix}": (row[name] or {}).get(key) for suffix, key in _SPREAD.items()}
+        lines.append(line)
     storage.write_csv(path, list(lines[0]), lines)
-
-
-def _cells(row: dict[str, Any], record: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """The columns of a row with their values."""
-    yield from (("scene", record["scene"]), ("variant", row["variant"]), ("seeds", row["seeds"]))
-    for group in HELD_OUT_GROUPS:
-        for name in PSNRS:
-            figure, difference = row[group][name] or {}, row[group]["difference"][name] or {}
-            yield from ((f"{group}_{name}{suffix}", figure.get(key)) for suffix, key in _SPREAD.items())
-            yield f"{group}_{name}_difference", difference.get("mean")
-            yield f"{group}_{name}_difference_standard_error", difference.get("standard_error")
-    for name in COSTS:
-        yield from ((f"{name}{suffix}", (row[name] or {}).get(key)) for suffix, key in _SPREAD.items())
-
-
-_SPREAD = {"": "mean", "_min": "min", "_max": "max"}
 
 
 def markdown(record: dict[str, Any]) -> str:
@@ -75,17 +67,16 @@ def markdown(record: dict[str, Any]) -> str:
         "to maximum).\nDifference from the complete method: mean of the paired differences ± its standard error."
     )
     header = ("without", *PSNR_COLUMNS, "Gaussians", "training")
-    tables = [group_table(group, header, _lines(rows, group)) for group in measured_groups(rows, PSNRS)]
-    return "\n\n".join([legend, *tables])
-
-
-def _lines(rows: list[dict[str, Any]], group: str) -> list[list[str]]:
-    return [
-        [
-            f"`{row['without']}`" if row["without"] else "nothing",
-            *psnr_cells(row, group),
-            format_mean(row["gaussians"], "{:,.0f}"),
-            format_mean(row["train_seconds"], "{:.0f} s"),
+    tables = []
+    for group in measured_groups(rows, PSNRS):
+        lines = [
+            [
+                f"`{row['without']}`" if row["without"] else "nothing",
+                *psnr_cells(row, group),
+                format_mean(row["gaussians"], "{:,.0f}"),
+                format_mean(row["train_seconds"], "{:.0f} s"),
+            ]
+            for row in rows
         ]
-        for row in rows
-    ]
+        tables.append(group_table(group, header, lines))
+    return "\n\n".join([legend, *tables])

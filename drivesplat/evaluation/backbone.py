@@ -24,7 +24,18 @@ def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
     Raises nothing for a missing network or a wrong file: LPIPS is then null, with the reason. A user's file with
     another checksum is reported and stays; a downloaded one is not kept.
     """
-    reason = None if path.is_file() else _fetch(settings, path)
+    reason = None
+    if not path.is_file():
+        try:
+            content = _download(settings)
+            with atomic_write(path) as file:
+                file.write(content)
+        except (OSError, ValueError, http.client.HTTPException, DriveSplatError) as error:
+            why = " ".join(str(getattr(error, "reason", None) or error or type(error).__name__).split())
+            reason = (
+                f"the AlexNet backbone could not be fetched from {settings.url} ({why}); "
+                f"put the file at {path} yourself, then run again"
+            )
     digest = sha256_file(path) if path.is_file() else None
     if digest is not None and not digest.startswith(settings.sha256):
         reason = f"{path} has SHA-256 {digest[:16]}…, lpips.sha256 says {settings.sha256}: replace the file"
@@ -36,21 +47,6 @@ def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
 def read_backbone(path: str | Path) -> dict[str, Any]:
     """Reads the record of `provide_backbone`. Raises ResultError if it is invalid."""
     return read_record(path, "lpips_backbone", "file", "sha256", "unavailable")
-
-
-def _fetch(settings: LpipsSettings, path: Path) -> str | None:
-    """Downloads the backbone to `path`. Returns None, or why that failed in one line."""
-    try:
-        content = _download(settings)
-        with atomic_write(path) as file:
-            file.write(content)
-    except (OSError, ValueError, http.client.HTTPException, DriveSplatError) as error:
-        reason = " ".join(str(getattr(error, "reason", None) or error or type(error).__name__).split())
-        return (
-            f"the AlexNet backbone could not be fetched from {settings.url} ({reason}); "
-            f"put the file at {path} yourself, then run again"
-        )
-    return None
 
 
 def _download(settings: LpipsSettings) -> bytes:

@@ -61,15 +61,12 @@ def compare_runs(runs: Sequence[Run], reference: Sequence[Run] | None, figures: 
 
 def values_at(runs: Sequence[Run], *keys: str) -> list[Any]:
     """The value below `keys` in every run; None where it, or a record above it, is null or missing."""
-    return [_value_at(run, keys) for run in runs]
-
-
-def _value_at(record: Any, keys: Sequence[str]) -> Any:
-    for key in keys:
-        if record is None:
-            return None
-        record = record.get(key)
-    return record
+    found: list[Any] = []
+    for value in runs:
+        for key in keys:
+            value = None if value is None else value.get(key)
+        found.append(value)
+    return found
 
 
 def measured_groups(rows: Sequence[dict[str, Any]], figures: Figures) -> list[str]:
@@ -78,17 +75,11 @@ def measured_groups(rows: Sequence[dict[str, Any]], figures: Figures) -> list[st
 
 
 def psnr_cells(row: dict[str, Any], group: str) -> list[str]:
-    """The cells of a row for the columns `PSNR_COLUMNS`."""
-    return [*figure_cells(row[group], "static", "moving_vehicle"), format_mean(row[group]["gap_db"], "{:.1f}")]
-
-
-def figure_cells(figures: dict[str, Any], *names: str) -> list[str]:
-    """Two cells for each figure of a group: its spread, and its difference from the reference."""
-    return [
-        cell
-        for name in names
-        for cell in (format_spread(figures[name]), format_difference(figures["difference"][name]))
-    ]
+    """The cells of a row for the columns `PSNR_COLUMNS`: spreads, and differences from the reference."""
+    figures, cells = row[group], []
+    for name in ("static", "moving_vehicle"):
+        cells += [format_spread(figures[name]), format_difference(figures["difference"][name])]
+    return [*cells, format_mean(figures["gap_db"], "{:.1f}")]
 
 
 def format_spread(figure: dict[str, Any] | None, digits: int = 1) -> str:
@@ -98,12 +89,12 @@ def format_spread(figure: dict[str, Any] | None, digits: int = 1) -> str:
     return f"{figure['mean']:.{digits}f} ({figure['min']:.{digits}f} to {figure['max']:.{digits}f})"
 
 
-def format_difference(difference: dict[str, Any] | None, digits: int = 2) -> str:
+def format_difference(difference: dict[str, Any] | None) -> str:
     """A signed mean with its standard error, if there is one; a dash for null."""
     if difference is None:
         return "-"
     error = difference["standard_error"]
-    return f"{difference['mean']:+.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
+    return f"{difference['mean']:+.2f}" + ("" if error is None else f" ± {error:.2f}")
 
 
 def format_mean(figure: dict[str, Any] | None, template: str) -> str:

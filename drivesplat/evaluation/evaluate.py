@@ -184,11 +184,7 @@ def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob
 
 def findings(group: dict[str, Any]) -> dict[str, bool | None]:
     """Whether a static model behaves as expected: findings, never gates; None if a region is null."""
-
-    def of(region: str) -> float | None:
-        return group[region]["psnr"] if group[region] else None
-
-    static, vehicle = of("static"), of("vehicle")
+    static, vehicle = ((group[region] or {}).get("psnr") for region in ("static", "vehicle"))
     return {
         "static_above_22_db": None if static is None else static > STATIC_FINDING_DB,
         "vehicle_below_18_db": None if vehicle is None else vehicle < VEHICLE_FINDING_DB,
@@ -198,16 +194,13 @@ def findings(group: dict[str, Any]) -> dict[str, bool | None]:
 def render_sample_pair(model: SplatModel, recording: EvaluationData, camera: str, device: torch.device) -> SamplePair:
     """The held-out key frame of `camera` with the most pixels of moving vehicles, from the first group with held-out
     frames; a training key frame if nothing is held out."""
-    group, images = _candidates(recording, camera)
+    for group in (*HELD_OUT_GROUPS, "train"):
+        images = held_out_images(recording.record, group, camera)
+        if images:
+            break
+    else:
+        raise ValueError(f"no key frame of {camera} takes part")
     moving = [int(region_mask(recording.labels(index), "moving_vehicle").sum()) for index in images]
     index = images[int(np.argmax(moving))] if any(moving) else images[len(images) // 2]
     picture = rendered(model, view_of(recording.record, index, device))
     return SamplePair(group, index, recording.image(index), picture.clip(0.0, 1.0))
-
-
-def _candidates(recording: EvaluationData, camera: str) -> tuple[str, list[int]]:
-    for group in (*HELD_OUT_GROUPS, "train"):
-        images = held_out_images(recording.record, group, camera)
-        if images:
-            return group, images
-    raise ValueError(f"no key frame of {camera} takes part")

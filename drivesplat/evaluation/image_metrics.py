@@ -10,10 +10,10 @@ import torch
 
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import (
-    DepthErrors,
     FrameErrors,
     LpipsMap,
     RegionMetrics,
+    depth_summary,
     measuring_threads,
     relative_depth_errors,
     with_gap,
@@ -70,7 +70,8 @@ def _group_metrics(
     """The metrics of a held-out group of `images`."""
     record = recording.record
     several_cameras = len(record.camera_names) > 1
-    metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if several_cameras else ()))), DepthErrors()
+    metrics = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if several_cameras else ())))
+    depth_errors: list[np.ndarray] = []
 
     def renderings() -> Iterator[tuple[int, np.ndarray]]:
         for index in images:
@@ -79,7 +80,7 @@ def _group_metrics(
                 yield index, rendered(model, view)
                 continue
             image, metres = rendered_with_depth(model, view)
-            depth.add(relative_depth_errors(metres, depths[index]))
+            depth_errors.append(relative_depth_errors(metres, depths[index]))
             yield index, image
 
     def measure(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:
@@ -91,7 +92,7 @@ def _group_metrics(
 
     for frame in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(frame)
-    return {**with_gap(metrics.summary()), **depth.summary()}
+    return {**with_gap(metrics.summary()), **depth_summary(depth_errors)}
 
 
 def held_out_depths(recording: EvaluationData, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
@@ -131,7 +132,8 @@ def seen_by_others(record: TrainingRecord, index: int) -> np.ndarray:
     columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
     to_world = record.camtoworlds[index][:3, :3] @ np.linalg.inv(record.Ks[index])
     seen = np.zeros((height, width), dtype=bool)
-    for other in _simultaneous(record, index):
+    simultaneous = record.is_key_frame & (record.sample_indices == record.sample_indices[index])
+    for other in np.flatnonzero(simultaneous & (record.camera_indices != record.camera_indices[index])).tolist():
         homography = record.Ks[other] @ record.camtoworlds[other][:3, :3].T @ to_world
         x, y, depth = (of_column * columns + (of_row * rows + constant) for of_column, of_row, constant in homography)
         other_width, other_height = record.image_size(other)
@@ -144,9 +146,3 @@ def overlap_masks(record: TrainingRecord, index: int, static: np.ndarray) -> dic
     """The `static` pixels (h, w) bool of an image, split into those that other cameras see as well and the others."""
     seen = seen_by_others(record, index)
     return {"overlap": static & seen, "no_overlap": static & ~seen}
-
-
-def _simultaneous(record: TrainingRecord, index: int) -> list[int]:
-    """The images of the other cameras at the key frame of image `index`."""
-    same = record.is_key_frame & (record.sample_indices == record.sample_indices[index])
-    return [int(i) for i in np.flatnonzero(same) if record.camera_indices[i] != record.camera_indices[index]]

@@ -4,7 +4,7 @@ Maps are computed per frame and summed per region, so memory hardly grows with t
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -115,12 +115,12 @@ class RegionMetrics:
         maps = [_channel_mean((image - truth) ** 2), ssim_map(image, truth)]
         if self._lpips_map:
             maps.append(self._lpips_map(image, truth))
-
-        def errors_in(mask: np.ndarray) -> FrameErrors:
+        found = {}
+        for region in self._frames:
+            mask = masks[region]
             sums = [float(values[mask].sum(dtype=np.float64)) for values in maps]
-            return FrameErrors(np.count_nonzero(mask), *sums)
-
-        return {region: errors_in(masks[region]) for region in self._frames}
+            found[region] = FrameErrors(np.count_nonzero(mask), *sums)
+        return found
 
     def add(self, frame: Mapping[str, FrameErrors]) -> None:
         """Adds the errors of a frame. Add frames in a fixed order: the sums are then reproducible to the last bit."""
@@ -129,45 +129,37 @@ class RegionMetrics:
 
     def summary(self) -> dict[str, dict[str, Any] | None]:
         """A record per region; None for a region with too few pixels."""
-        return {region: self._record(frames) for region, frames in self._frames.items()}
-
-    def _record(self, frames: list[FrameErrors]) -> dict[str, Any] | None:
-        one_by_one = np.cumsum([FrameErrors(0, 0.0, 0.0, 0.0), *frames], axis=0)
-        pixels, squared_error, ssim, lpips = one_by_one[-1].tolist()
-        if pixels < MIN_REGION_PIXELS:
-            return None
-        pooled = psnr(squared_error / pixels)
-        of_frames = [psnr(frame.squared_error / frame.pixels) for frame in frames if frame.pixels >= MIN_FRAME_PIXELS]
-        known = [value for value in of_frames if value is not None]
-        return {
-            "psnr": pooled,
-            **({"identical": True} if pooled is None else {}),
-            "psnr_frame_mean": float(np.mean(known)) if known else None,
-            "ssim": ssim / pixels,
-            "lpips": lpips / pixels if self._lpips_map else None,
-            "pixels": int(pixels),
-        }
+        records: dict[str, dict[str, Any] | None] = {}
+        for region, frames in self._frames.items():
+            one_by_one = np.cumsum([FrameErrors(0, 0.0, 0.0, 0.0), *frames], axis=0)
+            pixels, squared_error, ssim, lpips = one_by_one[-1].tolist()
+            records[region] = None
+            if pixels < MIN_REGION_PIXELS:
+                continue
+            pooled = psnr(squared_error / pixels)
+            of_frames = [psnr(one.squared_error / one.pixels) for one in frames if one.pixels >= MIN_FRAME_PIXELS]
+            known = [value for value in of_frames if value is not None]
+            records[region] = {
+                "psnr": pooled,
+                **({"identical": True} if pooled is None else {}),
+                "psnr_frame_mean": float(np.mean(known)) if known else None,
+                "ssim": ssim / pixels,
+                "lpips": lpips / pixels if self._lpips_map else None,
+                "pixels": int(pixels),
+            }
+        return records
 
 
 def with_gap(regions: dict[str, dict[str, Any] | None]) -> dict[str, Any]:
-    """The record of a group of held-out frames: `gap_db` and `human_gap_db`, then its regions."""
-    return {"gap_db": gap_db(regions), "human_gap_db": human_gap_db(regions), **regions}
-
-
-def gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
-    """PSNR of static minus that of moving vehicles in dB, or of all vehicles if none moves; None if there are none."""
-    return _difference(regions["static"], regions["moving_vehicle"] or regions["vehicle"])
-
-
-def human_gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
-    """PSNR of static minus that of moving people in dB; None if there are none."""
-    return _difference(regions["static"], regions["moving_human"])
-
-
-def _difference(static: dict[str, Any] | None, moving: dict[str, Any] | None) -> float | None:
-    if static is None or moving is None or static["psnr"] is None or moving["psnr"] is None:
-        return None
-    return static["psnr"] - moving["psnr"]
+    """The record of a group of held-out frames: `gap_db`, the PSNR of static minus that of moving vehicles in dB, or of
+    all vehicles if none moves, and `human_gap_db`, the same with moving people, None without one of the two; then its
+    regions."""
+    static, gaps = regions["static"], {}
+    dynamic = {"gap_db": regions["moving_vehicle"] or regions["vehicle"], "human_gap_db": regions["moving_human"]}
+    for name, moving in dynamic.items():
+        known = static and moving and static["psnr"] is not None and moving["psnr"] is not None
+        gaps[name] = static["psnr"] - moving["psnr"] if known else None
+    return {**gaps, **regions}
 
 
 def relative_depth_errors(rendered: np.ndarray, known: PixelDepths) -> np.ndarray:
@@ -176,22 +168,12 @@ def relative_depth_errors(rendered: np.ndarray, known: PixelDepths) -> np.ndarra
     return (np.abs(found - known.depth) / known.depth).astype(np.float32)
 
 
-class DepthErrors:
-    """Relative errors of rendered depth over a group of images: `add` those of each, then `summary`."""
-
-    def __init__(self) -> None:
-        self._errors: list[np.ndarray] = []
-
-    def add(self, errors: np.ndarray) -> None:
-        """Adds the errors of an image (`relative_depth_errors`)."""
-        self._errors.append(errors)
-
-    def summary(self) -> dict[str, Any]:
-        """`depth`: the median of |rendered - known| / known over all `pixels` of the group with known depth, None if
-        there are too few; an empty record if no image has known depth."""
-        if not self._errors:
-            return {}
-        errors = np.concatenate(self._errors)
-        if len(errors) < MIN_REGION_PIXELS:
-            return {"depth": None}
-        return {"depth": {"median_relative_error": float(np.median(errors)), "pixels": len(errors)}}
+def depth_summary(errors: Sequence[np.ndarray]) -> dict[str, Any]:
+    """`depth` of a group of images by the errors of each (`relative_depth_errors`): the median over all `pixels` of the
+    group with known depth, None if there are too few; an empty record if no image has known depth."""
+    if not errors:
+        return {}
+    pooled = np.concatenate(errors)
+    if len(pooled) < MIN_REGION_PIXELS:
+        return {"depth": None}
+    return {"depth": {"median_relative_error": float(np.median(pooled)), "pixels": len(pooled)}}

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from drivesplat.evaluation.scan_metrics import scan_metrics
-from drivesplat.scene.rigid import rigid
-from drivesplat.scene.scan import RenderedScan, ScanRays
+from drivesplat.lidar.moved_sensor import sensor_poses_of
+from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import RecordedScan, ScanRecords
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import HELD_OUT_GROUPS
@@ -56,17 +55,11 @@ def fused(scans: Sequence[RecordedScan], target: RecordedScan) -> RenderedScan:
     return RenderedScan(out.reshape(shape), drops, intensities.reshape(shape) if known else None)
 
 
-def sensor_to_world(scan: RecordedScan, offsets_s: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-    """The poses of the sensor at offsets from the scan's timestamp, with its mean velocities."""
-    rotations = Rotation.from_rotvec(offsets_s[:, None] * scan.angular).as_matrix()
-    return scan.sensor_to_world @ rigid(rotations, offsets_s[:, None] * scan.linear)
-
-
 def measured_points(scan: RecordedScan) -> Float[np.ndarray, "n 3"]:
     """The returns of measured rays in world coordinates, beam by beam."""
     rays, chosen = scan.scan.rays, scan.scan.returned & scan.measured
     local = rays.directions()[chosen].astype(np.float64) * scan.scan.ranges[chosen, None]
-    poses = sensor_to_world(scan, rays.offsets_s[chosen].astype(np.float64))
+    poses = sensor_poses_of(scan)(rays.offsets_s[chosen].astype(np.float64))
     return np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3]
 
 
@@ -82,23 +75,19 @@ def _met(points: Float[np.ndarray, "n 3"], target: RecordedScan) -> tuple[np.nda
     rays = target.scan.rays
     offsets = rays.offsets_s.astype(np.float64).ravel()
     tree = cKDTree(rays.directions().reshape(-1, 3).astype(np.float64))
-    limit = REACH * _spacing(rays)
+    beams = np.sort(rays.beam_elevations)
+    between_beams = float(np.diff(beams).max()) if len(beams) > 1 else 0.0
+    limit = REACH * max(between_beams, 2.0 * np.pi / rays.shape[1])
+    sensor = sensor_poses_of(target)
     at = np.full(len(points), float(np.median(offsets)))
     for _ in range(STEPS):
-        poses = sensor_to_world(target, at)
+        poses = sensor(at)
         local = np.einsum("nji,nj->ni", poses[:, :3, :3], points - poses[:, :3, 3])
         ranges = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
         _, cells = tree.query(local / ranges[:, None], distance_upper_bound=limit)
         inside = cells < len(offsets)
         at = np.where(inside, offsets[np.where(inside, cells, 0)], at)
     return np.where(inside, cells, -1), ranges
-
-
-def _spacing(rays: ScanRays) -> float:
-    """The angle between neighbouring beams or firings, whichever is wider, in radians."""
-    beams = np.sort(rays.beam_elevations)
-    between = float(np.diff(beams).max()) if len(beams) > 1 else 0.0
-    return max(between, 2.0 * np.pi / rays.shape[1])
 
 
 Baseline = Callable[[RecordedScan, Sequence[RecordedScan]], RenderedScan]

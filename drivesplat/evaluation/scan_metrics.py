@@ -87,15 +87,12 @@ class ScanPool:
             error = rendered.intensities[both].astype(np.float64) - scan.intensities[both]
             self.squared_intensity += float((error**2).sum())
             self.intensities += int(both.sum())
-        if self.chamfer:
-            self._add_distances(recorded, rendered, rays)
-
-    def _add_distances(self, recorded: RecordedScan, rendered: RenderedScan, rays: np.ndarray) -> None:
-        scan = recorded.scan
+        if not self.chamfer:
+            return
         directions = scan.rays.directions().astype(np.float64)
         clouds = [
             directions[rays & there] * ranges[rays & there, None]
-            for there, ranges in ((scan.returned, scan.ranges), (rendered.returned, rendered.ranges))
+            for there, ranges in ((returned, scan.ranges), (rendered.returned, rendered.ranges))
         ]
         if all(map(len, clouds)):
             for i, (cloud, other) in enumerate((clouds, clouds[::-1])):

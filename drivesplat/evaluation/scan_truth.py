@@ -22,7 +22,7 @@ from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan import Scan, ScanRays, wrapped
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan, ScanRecords
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.tracks import Box, box_at
+from drivesplat.scene.tracks import box_at
 
 REMOVAL_RAYS = ("box", "outside")
 """The rays of a scan that the removed car has changed, since they met it, and the others."""
@@ -57,33 +57,35 @@ class ScanTruth:
         return cls(truth, path, scene, recorded, rays, order, own_car_radius)
 
     def scans(self, left_m: float = 0.0, without: str | None = None) -> Iterator[tuple[RecordedScan, TruthScan]]:
-        """The true scans from so far to the left, or without an instance, each with its own record of the drive as it
-        was: those of recorded key frames.
+        """The true scans from so far to the left, or without an instance, as recorded ones, each with its own record of
+        the drive as it was: those of recorded key frames.
 
         The offset from the recorded pose is that between the true poses, so that errors of recorded poses do not shift
         the rays against their truth.
         """
-        true_scans = self.truth.scans_of()
-        for token, other in self.truth.scans_of(left_m, without).items():
-            recorded, true_scan = self.recorded.get(token), true_scans.get(token)
-            if recorded is not None and true_scan is not None:
-                offset = inverse(np.array(true_scan.sensor_to_global)) @ np.array(other.sensor_to_global)
-                yield self._as_recorded(_displaced(recorded, offset), other), true_scan
-
-    def _as_recorded(self, sensor: RecordedScan, found: TruthScan) -> RecordedScan:
-        """A true scan as a recorded one with the pose and the velocities of `sensor`."""
-        ranges, shades, instances, returned = self._arrays(found, "range", "intensity", "instance", "returned")
         indices = {track.id: i for i, track in enumerate(self.scene.tracks) if track.object_class.is_dynamic}
         numbers = np.full(256, NO_OBJECT, dtype=np.int16)
         for number, token in self.truth.instances.items():
             numbers[int(number)] = indices.get(token, NO_OBJECT)
-        scan = Scan(
-            self.rays, returned, np.where(returned, ranges, 0.0).astype(np.float32),
-            np.where(returned, shades, 0.0).astype(np.float32),
-        )  # fmt: skip
-        objects = np.where(returned, numbers[instances], NO_OBJECT).astype(np.int16)
-        measured, blocked = ranges >= self.own_car_radius, np.zeros(ranges.shape, dtype=bool)
-        return replace(sensor, scan=scan, measured=measured, objects=objects, blocked=blocked)
+        true_scans = self.truth.scans_of()
+        for token, found in self.truth.scans_of(left_m, without).items():
+            recorded, true_scan = self.recorded.get(token), true_scans.get(token)
+            if recorded is None or true_scan is None:
+                continue
+            offset = inverse(np.array(true_scan.sensor_to_global)) @ np.array(found.sensor_to_global)
+            ranges, shades, instances, returned = self._arrays(found, "range", "intensity", "instance", "returned")
+            scan = Scan(
+                self.rays, returned, np.where(returned, ranges, 0.0).astype(np.float32),
+                np.where(returned, shades, 0.0).astype(np.float32),
+            )  # fmt: skip
+            known = replace(
+                _displaced(recorded, offset),
+                scan=scan,
+                measured=ranges >= self.own_car_radius,
+                objects=np.where(returned, numbers[instances], NO_OBJECT).astype(np.int16),
+                blocked=np.zeros(ranges.shape, dtype=bool),
+            )
+            yield known, true_scan
 
     def met(self, found: TruthScan, instance: str) -> np.ndarray:
         """The rays (b, a) bool of a true scan that met an instance."""
@@ -142,8 +144,9 @@ def removal_scan_metrics(
         return None
     pools = {key: {rays: ScanPool() for rays in REMOVAL_RAYS} for key in ("removed", "not_removed")}
     measured = False
+    track, interval = known.scene.track(leading), known.scene.key_frame_interval
     for scan, before in known.scans(without=leading):
-        shadow, box = known.met(before, leading), _box(known.scene, leading, scan)
+        shadow, box = known.met(before, leading), box_at(track, scan.timestamp, interval) if track else None
         if box is None or not shadow.any():
             continue
         measured = True
@@ -158,9 +161,3 @@ def removal_scan_metrics(
         return None
     figures = {key: {name: pool.figures() for name, pool in of_rays.items()} for key, of_rays in pools.items()}
     return {**figures["removed"], "not_removed": figures["not_removed"]}
-
-
-def _box(scene: Scene, track_id: str, scan: RecordedScan) -> Box | None:
-    """The box of a track at a scan's timestamp."""
-    track = scene.track(track_id)
-    return box_at(track, scan.timestamp, scene.key_frame_interval) if track else None

@@ -23,34 +23,28 @@ MIN_NOVEL_DISTANCE = 0.1
 
 
 def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
-    """A sentence for each method and group of held-out frames, for comparisons with truth, and for output files."""
-    lines = _caveats(metrics["drive"]) if "drive" in metrics else []
+    """A sentence for each property of the drive that limits what the figures mean, for each method and group of
+    held-out frames, for comparisons with truth, and for output files."""
+    lines = []
+    for group, where in GROUP_PLACES.items():
+        held_out = metrics.get("drive", {}).get(group) or {}
+        distance, flat = held_out.get("from_training_m"), held_out.get("flat_psnr")
+        if distance is not None and distance < MIN_NOVEL_DISTANCE:
+            lines.append(
+                f"Frames {where} were taken {distance:.2f} m from training frames: their PSNR measures memorised "
+                "views, not novel ones"
+            )
+        if flat is not None and held_out["luminance"] < DARK:
+            lines.append(
+                f"Frames {where} are dark (mean luminance {held_out['luminance']:.2f}): the trivial baseline, their "
+                f"mean colour, has {flat:.1f} dB static"
+            )
     if not metrics.get("protocol", {"cameras": True})["cameras"]:
         lines.append("The scene has no camera, so there are figures of LiDAR alone")
     elif not any(_psnr(method[group], "static") for method in metrics["methods"].values() for group in GROUP_PLACES):
         lines.append("No image is held out (holdout), so there are no figures of held-out images")
     for name, method in metrics["methods"].items():
-        for group, where in GROUP_PLACES.items():
-            gap = method[group].get("gap_db")
-            if (static := _psnr(method[group], "static")) is not None:
-                people = _people(method[group])
-                lines.append(f"{name}, frames {where}: {_with_moving_vehicles(static, method[group], gap)}{people}")
-            if regions := method[group].get("lidar"):
-                others = {other: groups[group] for other, groups in metrics.get("lidar_baselines", {}).items()}
-                lines.append(f"{name}, LiDAR scans {where}: {_scans_with_baselines(regions, others)}")
-        for kind, key in views_aside([method]):
-            if found := _figures_of_view(method[kind][key]):
-                against = "truth" if kind == LATERAL else "images left out of training"
-                lines.append(f"{name}, from {place_of_view((kind, key))}, against {against}: {', '.join(found)}")
-        removal = method.get("removal", {})
-        removed, before = (_psnr(regions, "box") for regions in (removal, removal.get("not_removed", {})))
-        if removed is not None and before is not None:
-            lines.append(
-                f"{name}, the car ahead removed, against the empty street: {removed:.1f} dB in its box "
-                f"({before:.1f} dB before)"
-            )
-        seconds, device = method["train_seconds"], method["device"]
-        lines.append(f"{name}: {method['gaussians']:,} Gaussians, trained in {seconds:.0f} s on {device}")
+        lines += [f"{name}{text}" for text in _of_method(method, metrics.get("lidar_baselines", {}))]
     folder = Path(path).parent
     lines.append(f"All figures: {path}; training curves and pictures: tensorboard --logdir {folder}")
     if (folder / COMPARE_FILM).is_file():
@@ -63,47 +57,49 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
     return lines
 
 
-def _caveats(drive: dict[str, Any]) -> list[str]:
-    """A sentence for each property of the drive that limits what the figures mean."""
+def _of_method(method: dict[str, Any], baselines: dict[str, Any]) -> list[str]:
+    """The sentences of a method, without its name at their beginnings."""
     lines = []
     for group, where in GROUP_PLACES.items():
-        held_out = drive[group] or {}
-        distance, flat = held_out.get("from_training_m"), held_out.get("flat_psnr")
-        if distance is not None and distance < MIN_NOVEL_DISTANCE:
-            lines.append(
-                f"Frames {where} were taken {distance:.2f} m from training frames: their PSNR measures memorised "
-                "views, not novel ones"
-            )
-        if flat is not None and held_out["luminance"] < DARK:
-            lines.append(
-                f"Frames {where} are dark (mean luminance {held_out['luminance']:.2f}): the trivial baseline, their "
-                f"mean colour, has {flat:.1f} dB static"
-            )
-    return lines
+        found = method[group]
+        if (static := _psnr(found, "static")) is not None:
+            gap, moving = found.get("gap_db"), _psnr(found, "moving_vehicle")
+            text = f"static {static:.1f} dB, no moving vehicle to compare with"
+            if gap is not None and moving is not None:
+                text = f"moving vehicles {moving:.1f} dB, static {static:.1f} dB: a gap of {gap:.1f} dB"
+            people, gap = _psnr(found, "moving_human"), found.get("human_gap_db")
+            if people is not None and gap is not None:
+                text += f"; moving people {people:.1f} dB: a gap of {gap:.1f} dB"
+            lines.append(f", frames {where}: {text}")
+        if regions := found.get("lidar"):
+            forms = "range off by {:.1f} cm in the median", "intensity by {:.3f}", "{:.1f} % of returns and drops right"
+            own = _scan_figures(regions, forms) or f"no figures, {regions['all'].get('unavailable')}"
+            short = ("{:.1f} cm", "{:.3f}", "{:.1f} %")
+            others = {name: _scan_figures(groups[group], short) for name, groups in baselines.items()}
+            beside = "; ".join(f"{name.replace('_', ' ')}: {figures}" for name, figures in others.items() if figures)
+            lines.append(f", LiDAR scans {where}: {own}" + (f" ({beside})" if beside else ""))
+    for kind, key in views_aside([method]):
+        view = method[kind][key]
+        psnrs = {"static": _psnr(view, "static"), "moving vehicles": _psnr(view, "moving_vehicle")}
+        figures = [f"{name} {psnr:.1f} dB" for name, psnr in psnrs.items() if psnr is not None]
+        if depth := view.get("depth"):
+            figures.append(f"depth off by {depth['median_relative_error']:.1%} in the median".replace("%", " %"))
+        if figures:
+            against = "truth" if kind == LATERAL else "images left out of training"
+            lines.append(f", from {place_of_view((kind, key))}, against {against}: {', '.join(figures)}")
+    removal = method.get("removal", {})
+    removed, before = (_psnr(regions, "box") for regions in (removal, removal.get("not_removed", {})))
+    if removed is not None and before is not None:
+        lines.append(
+            f", the car ahead removed, against the empty street: {removed:.1f} dB in its box ({before:.1f} dB before)"
+        )
+    seconds, device = method["train_seconds"], method["device"]
+    return [*lines, f": {method['gaussians']:,} Gaussians, trained in {seconds:.0f} s on {device}"]
 
 
 def _psnr(regions: dict[str, Any], region: str) -> float | None:
     """The PSNR of a region, None if it is null or missing."""
     return (regions.get(region) or {}).get("psnr")
-
-
-def _figures_of_view(view: dict[str, Any]) -> list[str]:
-    """The figures of a view from beside the path that are not null."""
-    names = {"static": "static", "moving_vehicle": "moving vehicles"}
-    psnrs = {name: _psnr(view, region) for region, name in names.items()}
-    found = [f"{name} {psnr:.1f} dB" for name, psnr in psnrs.items() if psnr is not None]
-    if depth := view.get("depth"):
-        found.append(f"depth off by {depth['median_relative_error']:.1%} in the median".replace("%", " %"))
-    return found
-
-
-def _scans_with_baselines(regions: dict[str, Any], others: dict[str, dict[str, Any]]) -> str:
-    """The figures of all rays of held-out scans, and those of the baselines `others` in brackets."""
-    forms = "range off by {:.1f} cm in the median", "intensity by {:.3f}", "{:.1f} % of returns and drops right"
-    own = _scan_figures(regions, forms)
-    compared = {name: _scan_figures(other, ("{:.1f} cm", "{:.3f}", "{:.1f} %")) for name, other in others.items()}
-    beside = "; ".join(f"{name.replace('_', ' ')}: {figures}" for name, figures in compared.items() if figures)
-    return (own or f"no figures, {regions['all'].get('unavailable')}") + (f" ({beside})" if beside else "")
 
 
 def _scan_figures(regions: dict[str, Any], forms: Iterable[str]) -> str:
@@ -114,19 +110,6 @@ def _scan_figures(regions: dict[str, Any], forms: Iterable[str]) -> str:
         for form, scale, value in zip(forms, (100.0, 1.0, 100.0), values, strict=True)
         if value is not None
     )
-
-
-def _with_moving_vehicles(static: float, group: dict[str, Any], gap: float | None) -> str:
-    moving = _psnr(group, "moving_vehicle")
-    if gap is None or moving is None:
-        return f"static {static:.1f} dB, no moving vehicle to compare with"
-    return f"moving vehicles {moving:.1f} dB, static {static:.1f} dB: a gap of {gap:.1f} dB"
-
-
-def _people(group: dict[str, Any]) -> str:
-    """The figures of moving people, if any."""
-    people, gap = _psnr(group, "moving_human"), group.get("human_gap_db")
-    return "" if people is None or gap is None else f"; moving people {people:.1f} dB: a gap of {gap:.1f} dB"
 
 
 def print_summary(path: str | Path) -> None:

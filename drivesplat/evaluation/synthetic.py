@@ -1,9 +1,8 @@
 """Renderings compared with the truth of a synthetic world: images and depth from beside the recorded path, and the
 street without the leading car."""
 
-import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,10 @@ import torch
 from PIL import Image, UnidentifiedImageError
 
 from drivesplat.evaluation.metrics import (
-    DepthErrors,
     FrameErrors,
     LpipsMap,
     RegionMetrics,
+    depth_summary,
     measuring_threads,
     relative_depth_errors,
 )  # fmt: skip
@@ -81,12 +80,12 @@ class DriveTruth:
             if truth.token in true_poses:
                 frame, true_pose = self.recording.frame(index), np.array(true_poses[truth.token])
                 offset = inverse(true_pose) @ np.array(truth.camera_to_global)
-                yield index, dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ offset), truth
+                yield index, replace(frame, camera_to_world=frame.camera_to_world @ offset), truth
 
     def view(self, index: int, frame: Frame, device: torch.device) -> View:
         """The view of a recorded image as if taken from the pose of `frame`."""
         pose = torch.from_numpy(frame.camera_to_world).float().to(device)
-        return dataclasses.replace(view_of(self.recording.record, index, device), camera_to_world=pose)
+        return replace(view_of(self.recording.record, index, device), camera_to_world=pose)
 
     def image(self, name: str, size: tuple[int, int]) -> np.ndarray:
         """A true image (h, w, 3) in [0, 1] at `size` (width, height)."""
@@ -122,30 +121,6 @@ class DriveTruth:
         return (box, inside) if inside.any() else None
 
 
-@dataclass(frozen=True)
-class LateralRendering:
-    """The rendering `image` (h, w, 3) and its `depth` (h, w) in metres from beside recorded image `index`: from the
-    camera of `frame`, with the `truth` of that view."""
-
-    index: int
-    frame: Frame
-    truth: TruthFrame
-    image: np.ndarray
-    depth: np.ndarray
-
-
-@dataclass(frozen=True)
-class RemovalRenderings:
-    """Renderings (h, w, 3) of image `index` with the leading car `removed` and `untouched`, the name of the true image
-    of the empty `street`, and the pixels `inside` (h, w) bool of the car's hull."""
-
-    index: int
-    street: str
-    inside: np.ndarray
-    removed: np.ndarray
-    untouched: np.ndarray
-
-
 @torch.no_grad()
 def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
     """The rendering (h, w, 3) float32, not clamped; of `gaussians` in place of the model's own if given."""
@@ -175,24 +150,25 @@ def _lateral_view_metrics(
 ) -> dict[str, Any] | None:
     """The metrics of a lateral view over all its key frames by region, and `depth`, over static pixels; None without
     key frames. Moving objects are known from boxes, whatever masks the user supplies for recorded images."""
-    metrics, depth, recording = RegionMetrics(lpips_map, LATERAL_REGIONS), DepthErrors(), known.recording
-    frames = list(known.lateral_frames(view))
+    metrics, recording = RegionMetrics(lpips_map, LATERAL_REGIONS), known.recording
+    frames, depth_errors = list(known.lateral_frames(view)), []
+    Rendering = tuple[int, Frame, TruthFrame, np.ndarray, np.ndarray]
 
-    def renderings() -> Iterator[LateralRendering]:
+    def renderings() -> Iterator[Rendering]:
         for index, frame, truth in frames:
-            seen = known.view(index, frame, device)
-            yield LateralRendering(index, frame, truth, *rendered_with_depth(model, seen))
+            yield index, frame, truth, *rendered_with_depth(model, known.view(index, frame, device))
 
-    def measure(one: LateralRendering) -> tuple[dict[str, FrameErrors], np.ndarray]:
-        size = recording.size(one.index)
-        masks = region_masks(label_image(recording.scene, one.frame, size))
-        errors = metrics.measure(one.image, known.image(one.truth.image, size), masks)
-        return errors, relative_depth_errors(one.depth, known.depth(one.truth.depth, size, masks["static"]))
+    def measure(one: Rendering) -> tuple[dict[str, FrameErrors], np.ndarray]:
+        index, frame, truth, image, depth = one
+        size = recording.size(index)
+        masks = region_masks(label_image(recording.scene, frame, size))
+        errors = metrics.measure(image, known.image(truth.image, size), masks)
+        return errors, relative_depth_errors(depth, known.depth(truth.depth, size, masks["static"]))
 
-    for errors, depth_errors in prefetch(measure, renderings(), measuring_threads()):
+    for errors, of_depth in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(errors)
-        depth.add(depth_errors)
-    return {**metrics.summary(), **depth.summary()} if frames else None
+        depth_errors.append(of_depth)
+    return {**metrics.summary(), **depth_summary(depth_errors)} if frames else None
 
 
 def removal_metrics(
@@ -206,7 +182,9 @@ def removal_metrics(
         return None
     removed, untouched = RegionMetrics(lpips_map, REMOVAL_REGIONS), RegionMetrics(lpips_map, REMOVAL_REGIONS)
 
-    def renderings() -> Iterator[RemovalRenderings]:
+    Rendering = tuple[int, str, np.ndarray, np.ndarray, np.ndarray]
+
+    def renderings() -> Iterator[Rendering]:
         for index, truth in known.frames(empty):
             seen = known.leading_in(index)
             if seen is None:
@@ -216,13 +194,13 @@ def removal_metrics(
             with torch.no_grad():
                 gaussians = model.gaussians_in(view)
                 kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
-            pictures = rendered(model, view, kept), rendered(model, view, gaussians)
-            yield RemovalRenderings(index, truth.image, inside, *pictures)
+            yield index, truth.image, inside, rendered(model, view, kept), rendered(model, view, gaussians)
 
-    def measure(one: RemovalRenderings) -> tuple[dict[str, FrameErrors], dict[str, FrameErrors]]:
-        street, ego_mask = known.image(one.street, recording.size(one.index)), recording.ego_mask(one.index)
-        masks = {"box": one.inside & ~ego_mask, "outside": ~one.inside & ~ego_mask}
-        return removed.measure(one.removed, street, masks), untouched.measure(one.untouched, street, masks)
+    def measure(one: Rendering) -> tuple[dict[str, FrameErrors], dict[str, FrameErrors]]:
+        index, name, inside, without_car, with_car = one
+        street, ego_mask = known.image(name, recording.size(index)), recording.ego_mask(index)
+        masks = {"box": inside & ~ego_mask, "outside": ~inside & ~ego_mask}
+        return removed.measure(without_car, street, masks), untouched.measure(with_car, street, masks)
 
     frames = list(prefetch(measure, renderings(), measuring_threads()))
     for without, with_it in frames:

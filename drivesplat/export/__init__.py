@@ -1,2 +1,2 @@
-"""Trained models and recorded cameras as files of other programs, a module per format: PLY, SPZ, SOG, USD, viewer page,
-COLMAP, nerfstudio."""
+"""Trained models and recorded cameras as files of other programs, by format: PLY, SPZ and SOG, USD, viewer page; and
+cameras for COLMAP and nerfstudio."""

@@ -18,11 +18,6 @@ SH_C0 = 0.28209479177387814
 """The constant spherical harmonic."""
 
 
-def is_compressed(data: PlyData) -> bool:
-    """Whether a PLY file is of this format."""
-    return "vertex" in data and "packed_position" in data["vertex"]
-
-
 def unpacked(data: PlyData) -> Gaussians:
     """The Gaussians of a file of this format, on the CPU. Raises KeyError or ValueError for a damaged one."""
     vertices = data["vertex"]

@@ -22,13 +22,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from drivesplat.io.array_file import read_typed_arrays, write_arrays
+from drivesplat.io.array_file import read_typed_arrays
 from drivesplat.io.storage import Provenance
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, trained_model
-from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.reach import INSIDE, reach_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
@@ -96,7 +95,12 @@ def find_far(model: SplatModel, views: Sequence[View], max_distance: float, prov
         log.info("%s: left out, a change of %.2f/255 at most", summary, 255 * changes.largest_change)
         return changes
     visibility, centers = _visibility(model, rows, views)
-    seen = ~model.moving()[rows] & ~_negligible(visibility)
+    # Of the least visible, as many are negligible as together contribute at most MAX_CHANGE to any view. Removing them
+    # changes no pixel by more: what they leave goes to what lies behind, whose colours are in [0, 1] as theirs.
+    order = torch.argsort(visibility)
+    negligible = torch.empty_like(visibility, dtype=torch.bool)
+    negligible[order] = visibility[order].cumsum(dim=0) <= MAX_CHANGE
+    seen = ~model.moving()[rows] & ~negligible
     means, shrink = _nearer(torch.cat([part.params["means"] for part in model.parts])[rows[seen]], centers[seen], reach)
     changes = replace(
         _changes(rows[~seen], provenance, views=len(views)), moved=_array(rows[seen]), means=means, shrink=shrink
@@ -145,25 +149,9 @@ def within_reach(checkpoint: TrainedCheckpoint, far: FarGaussians) -> TrainedChe
     return replace(checkpoint, model=state)
 
 
-def write_far(path: str | Path, far: FarGaussians) -> None:
-    """Writes far.npz. Raises ResultError naming `path` where the disk is full."""
-    write_arrays(path, far)
-
-
 def read_far(path: str | Path) -> FarGaussians:
     """Reads far.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
     return read_typed_arrays(path, RULE, FarGaussians, "far Gaussians")
-
-
-def _changed(gaussians: Gaussians, far: FarGaussians) -> Gaussians:
-    """The Gaussians of a model at one time with the changes of `far`."""
-    device = gaussians.means.device
-    moved, kept = torch.from_numpy(far.moved).to(device), torch.ones(len(gaussians), dtype=torch.bool, device=device)
-    kept[torch.from_numpy(far.removed).to(device)] = False
-    means, scales = gaussians.means.clone(), gaussians.scales.clone()
-    means[moved] = torch.from_numpy(far.means).to(means)
-    scales[moved] *= torch.from_numpy(far.shrink).to(scales)[:, None]
-    return replace(gaussians, means=means, scales=scales)[kept]
 
 
 def _largest_change(model: SplatModel, far: FarGaussians, views: Sequence[View]) -> float:
@@ -171,8 +159,15 @@ def _largest_change(model: SplatModel, far: FarGaussians, views: Sequence[View])
     largest = 0.0
     for view in views:
         shown = model.gaussians_in(view)
+        means, scales = shown.means.clone(), shown.scales.clone()
+        moved = torch.from_numpy(far.moved).to(means.device)
+        means[moved] = torch.from_numpy(far.means).to(means)
+        scales[moved] *= torch.from_numpy(far.shrink).to(scales)[:, None]
+        kept = torch.ones(len(shown), dtype=torch.bool, device=means.device)
+        kept[torch.from_numpy(far.removed).to(means.device)] = False
         before = model.render(view, gaussians=shown).image.clamp(0.0, 1.0)
-        after = model.render(view, gaussians=_changed(shown, far)).image.clamp(0.0, 1.0)
+        changed = replace(shown, means=means, scales=scales)[kept]
+        after = model.render(view, gaussians=changed).image.clamp(0.0, 1.0)
         largest = max(largest, float((after - before).abs().max()))
     return largest
 
@@ -185,30 +180,16 @@ def _visibility(
     largest, total = rows.new_zeros(len(rows), dtype=torch.float64), rows.new_zeros(len(rows), 1, dtype=torch.float64)
     weighted = rows.new_zeros(len(rows), 3, dtype=torch.float64)
     for view in views:
-        contributions = _contributions(model, view)[rows].double()
+        shown = model.gaussians_in(view)
+        # a Gaussian's weight in the compositing is the gradient of the image by its value
+        values = shown.means.new_zeros(len(shown), 1).requires_grad_()
+        with torch.enable_grad():
+            (gradient,) = torch.autograd.grad(model.composited(shown, values, view).image.sum(), values)
+        contributions = gradient[rows, 0].double()
         largest = torch.maximum(largest, contributions)
         total += contributions[:, None]
         weighted += contributions[:, None] * view.camera_to_world[:3, 3]
     return largest, weighted / total.clamp_min(1e-30)
-
-
-def _contributions(model: SplatModel, view: View) -> Float[Tensor, " n"]:
-    """The sum over a view's pixels of each Gaussian's weight in the compositing: the gradient of the summed image by
-    the Gaussians' values."""
-    shown = model.gaussians_in(view)
-    values = shown.means.new_zeros(len(shown), 1).requires_grad_()
-    with torch.enable_grad():
-        (gradient,) = torch.autograd.grad(model.composited(shown, values, view).image.sum(), values)
-    return gradient[:, 0]
-
-
-def _negligible(visibility: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
-    """The mask of the least visible Gaussians, as many as together contribute at most MAX_CHANGE to any view. Removing
-    them changes no pixel by more: what they leave goes to what lies behind, whose colours are in [0, 1] as theirs."""
-    order = torch.argsort(visibility)
-    chosen = torch.empty_like(visibility, dtype=torch.bool)
-    chosen[order] = visibility[order].cumsum(dim=0) <= MAX_CHANGE
-    return chosen
 
 
 def _nearer(

@@ -46,10 +46,6 @@ class Modes:
     turns: Float[np.ndarray, "m n 3"]
     weights: Callable[[Gait], Float[np.ndarray, "t m"]]
 
-    @property
-    def count(self) -> int:
-        return len(self.shifts)
-
 
 def fitted_modes(model: SplatModel, groups: Mapping[str, SampledGroup]) -> dict[str, Modes]:
     """The modes of the groups that deform and have Gaussians, by name, fitted to their sampled shapes."""
@@ -66,7 +62,11 @@ def _fitted(model: SplatModel, name: str, shown: Gaussians, shapes: SampledShape
     kept = sizes > MIN_SHARE * sizes[0]
     combined = functions[kept].T * (np.sqrt(len(sampled)) / sizes[kept])  # (k, m): weights of mean square 1
     shifts = shapes.means - shown.means.detach().cpu().numpy()
-    turns = _turns(shapes.quats, torch.nn.functional.normalize(shown.quats, dim=-1).detach().cpu().numpy())
+    unturned = torch.nn.functional.normalize(shown.quats, dim=-1).detach().cpu().numpy()
+    before = Rotation.from_quat(np.broadcast_to(unturned, shapes.quats.shape).reshape(-1, 4), scalar_first=True)
+    after = Rotation.from_quat(shapes.quats.reshape(-1, 4), scalar_first=True)
+    found = (after * before.inv()).as_quat(scalar_first=True, canonical=True)
+    turns = (found[:, 1:] / np.maximum(found[:, :1], MIN_COSINE)).reshape(shifts.shape)
     both = np.concatenate([shifts, turns], axis=2)
     fitted = np.linalg.lstsq(sampled @ combined, both.reshape(len(both), -1), rcond=None)[0]
     of_modes = fitted.reshape(int(kept.sum()), *both.shape[1:])
@@ -78,12 +78,3 @@ def _model_weights(model: SplatModel, track_id: str, gait: Gait) -> Float[np.nda
     placements = [ActorPlacement(track_id, scale=gait.scale, walked=way, phase=gait.phase) for way in walked]
     of_parts = (part.shape_weights(gait.seconds.tolist(), placements) for part in model.parts)
     return next(found for found in of_parts if found is not None).cpu().numpy()
-
-
-def _turns(quats: Float[np.ndarray, "t n 4"], shown: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "t n 3"]:
-    """The rotations from `shown` to `quats` as vectors v: those of the quaternions (1, v)."""
-    before = Rotation.from_quat(np.broadcast_to(shown, quats.shape).reshape(-1, 4), scalar_first=True)
-    after = Rotation.from_quat(quats.reshape(-1, 4), scalar_first=True)
-    found = (after * before.inv()).as_quat(scalar_first=True, canonical=True)
-    turned = found[:, 1:] / np.maximum(found[:, :1], MIN_COSINE)
-    return turned.reshape(*quats.shape[:2], 3)

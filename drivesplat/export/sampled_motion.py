@@ -5,7 +5,7 @@ entry; with this spacing points of a vehicle deviate by about a millimetre. Shap
 fifteen times a second: interpolated linearly, a swing of 1 Hz loses 2 % of its width, and one of 2 Hz 9 %.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -48,10 +48,6 @@ class SampledShapes:
     means: np.ndarray
     quats: np.ndarray
 
-    def of_rows(self, chosen: np.ndarray) -> "SampledShapes":
-        """Those of a part of the Gaussians, by mask (n,)."""
-        return replace(self, means=self.means[:, chosen], quats=self.quats[:, chosen])
-
 
 def shape_seconds(motion: SampledMotion) -> np.ndarray:
     """The seconds (t,) at which shapes are sampled: evenly within the spans of presence, and at their ends."""
@@ -64,22 +60,16 @@ def shape_seconds(motion: SampledMotion) -> np.ndarray:
 
 def sample_motion(motion: Motion, recorded: np.ndarray, default_time: float) -> SampledMotion:
     """Samples a motion while the object is present, among others at the seconds `recorded` (m,) and `default_time`."""
+    spans: list[tuple[float, float]] = []
+    for start, stop in motion.runs:
+        begin, end = float(motion.times[start] - motion.reach), float(motion.times[stop] + motion.reach)
+        if spans and begin <= spans[-1][1]:
+            begin = spans.pop()[0]
+        spans.append((begin, end))
     first, last = motion.span
     regular = np.arange(np.ceil(first * SAMPLES_PER_SECOND), last * SAMPLES_PER_SECOND) / SAMPLES_PER_SECOND
-    spans = presence_spans(motion)
     times = np.concatenate([regular, motion.times, recorded, [default_time], np.ravel(spans)])
     seconds = np.unique(np.round(times, 6))
     near = [(low - _MICROSECOND < seconds) & (seconds < high + _MICROSECOND) for low, high in spans]
     seconds = seconds[np.any(near, axis=0)]
-    return SampledMotion(seconds, motion.poses(seconds), spans, default_time)
-
-
-def presence_spans(motion: Motion) -> tuple[tuple[float, float], ...]:
-    """The disjoint intervals (seconds) in which the object is present, in order."""
-    spans: list[tuple[float, float]] = []
-    for first, last in motion.runs:
-        begin, end = float(motion.times[first] - motion.reach), float(motion.times[last] + motion.reach)
-        if spans and begin <= spans[-1][1]:
-            begin = spans.pop()[0]
-        spans.append((begin, end))
-    return tuple(spans)
+    return SampledMotion(seconds, motion.poses(seconds), tuple(spans), default_time)

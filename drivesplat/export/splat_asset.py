@@ -15,15 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.export.nerfstudio import transforms_record
-from drivesplat.export.sampled_motion import SampledMotion
+from drivesplat.export.camera_files import transforms_record
 from drivesplat.export.splat_ply import note_of, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, digests, shown_timestamp, trained_gaussians, trained_groups
 from drivesplat.export.unique_names import unique_names
 from drivesplat.io.storage import Provenance, write_json
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.gaussians import with_sh_degree
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.export import SplatJob
 
@@ -108,25 +107,21 @@ def cameras_record(scene: Scene, record: TrainingRecord) -> dict[str, Any]:
         **_scene_header(scene, CAMERA_CONVENTIONS),
         "key_frame_timestamps": scene.key_frame_timestamps.tolist(),
         "images": [
-            _image(frame, record.image_names[i], record.image_size(i), record.Ks[i], split_of[i])
+            {
+                "camera": frame.camera,
+                "timestamp": frame.timestamp,
+                "image": record.image_names[i],
+                "width": record.image_size(i)[0],
+                "height": record.image_size(i)[1],
+                "K": record.Ks[i].tolist(),
+                "camera_to_world": frame.camera_to_world.tolist(),
+                "ego_to_world": frame.ego_to_world.tolist(),
+                "is_key_frame": frame.is_key_frame,
+                "sample_index": frame.sample_index,
+                "split": split_of[i],
+            }
             for i, frame in enumerate(scene.frames)
         ],
-    }
-
-
-def _image(frame: Frame, name: str, size: tuple[int, int], K: np.ndarray, split: str) -> dict[str, Any]:
-    return {
-        "camera": frame.camera,
-        "timestamp": frame.timestamp,
-        "image": name,
-        "width": size[0],
-        "height": size[1],
-        "K": K.tolist(),
-        "camera_to_world": frame.camera_to_world.tolist(),
-        "ego_to_world": frame.ego_to_world.tolist(),
-        "is_key_frame": frame.is_key_frame,
-        "sample_index": frame.sample_index,
-        "split": split,
     }
 
 
@@ -141,63 +136,37 @@ def write_parts(
 
     PLYs of groups of earlier calls that are not written again are removed; other files stay.
     """
-    folder = Path(path).parent
-    files = {name: f"{stem}.ply" for name, stem in unique_names(groups, _stem).items()}
+    folder, first_image = Path(path).parent, min(frame.timestamp for frame in scene.frames)
+    stems = unique_names(groups, lambda name: re.sub(r"[^A-Za-z0-9_-]", "_", name) or "_")  # valid on every system
+    files, parts = {name: f"{stem}.ply" for name, stem in stems.items()}, []
     for name, group in groups.items():
-        note = {"scene": scene.name, "piece": name, "frame": _frame(group), **digests(provenance)}
+        motion, frame, moves = group.motion, "object" if group.motion else "world", None
+        note = {"scene": scene.name, "piece": name, "frame": frame, **digests(provenance)}
         write_splat_ply(folder / files[name], group.gaussians, note)
-    _remove_others(folder, set(files.values()))
-    write_json(path, {**_parts_record(groups, files, scene, time_s), "provenance": provenance})
-
-
-def _parts_record(
-    groups: Mapping[str, SampledGroup], files: Mapping[str, str], scene: Scene, time_s: float | None
-) -> dict[str, Any]:
-    first_image = min(frame.timestamp for frame in scene.frames)
-    return {
-        **_scene_header(scene, PART_CONVENTIONS),
-        "first_image": first_image,
-        "colors_timestamp": shown_timestamp(scene, time_s),
-        "parts": [
-            {
-                "name": name,
-                "file": files[name],
-                "gaussians": len(group.gaussians),
-                "sh_degree": group.gaussians.sh_degree,
-                "frame": _frame(group),
-                "deforms": group.shapes is not None,
-                "category": group.track.category if group.track else None,
-                "size": group.track.size.tolist() if group.track else None,
-                "motion": _motion(group.motion, first_image) if group.motion else None,
+        if motion is not None:
+            moves = {
+                "present": [list(span) for span in motion.spans],
+                "seconds": motion.seconds.tolist(),
+                "timestamps": (first_image + np.rint(motion.seconds * 1e6).astype(np.int64)).tolist(),
+                "object_to_world": motion.object_to_world.tolist(),
             }
-            for name, group in groups.items()
-        ],
-    }
-
-
-def _motion(motion: SampledMotion, first_image: int) -> dict[str, Any]:
-    return {
-        "present": [list(span) for span in motion.spans],
-        "seconds": motion.seconds.tolist(),
-        "timestamps": (first_image + np.rint(motion.seconds * 1e6).astype(np.int64)).tolist(),
-        "object_to_world": motion.object_to_world.tolist(),
-    }
-
-
-def _frame(group: SampledGroup) -> str:
-    return "object" if group.motion else "world"
-
-
-def _stem(name: str) -> str:
-    """A name as a file name that is valid on every system."""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name) or "_"
-
-
-def _remove_others(folder: Path, kept: set[str]) -> None:
-    """Removes PLYs of groups whose file names are not in `kept`."""
+        record = {
+            "name": name,
+            "file": files[name],
+            "gaussians": len(group.gaussians),
+            "sh_degree": group.gaussians.sh_degree,
+            "frame": frame,
+            "deforms": group.shapes is not None,
+            "category": group.track.category if group.track else None,
+            "size": group.track.size.tolist() if group.track else None,
+            "motion": moves,
+        }
+        parts.append(record)
     for file in folder.glob("*.ply"):
-        if file.name not in kept and "piece" in note_of(file):
+        if file.name not in files.values() and "piece" in note_of(file):
             file.unlink()
+    about = {"first_image": first_image, "colors_timestamp": shown_timestamp(scene, time_s), "parts": parts}
+    write_json(path, {**_scene_header(scene, PART_CONVENTIONS), **about, "provenance": provenance})
 
 
 def _scene_header(scene: Scene, conventions: Mapping[str, str]) -> dict[str, Any]:

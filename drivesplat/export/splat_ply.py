@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
-from torch import Tensor
 
 from drivesplat.errors import ResultError
-from drivesplat.export.compressed_ply import is_compressed, unpacked
+from drivesplat.export.compressed_ply import unpacked
 from drivesplat.io.point_cloud import read_ply_data
 from drivesplat.io.storage import atomic_write, canonical_json, unreadable
 from drivesplat.model.gaussians import Gaussians
@@ -37,8 +35,20 @@ def write_splat_ply(path: str | Path, gaussians: Gaussians, note: dict[str, Any]
     Opacities are clamped to values with a finite logit, quaternions are normalised. The note should not exceed 8 kB:
     antimatter15's viewer searches for the end of the header in the first 10 kB. Raises ResultError naming `path`.
     """
+    count, coefficients = gaussians.shN.shape[:2]
+    columns = [
+        gaussians.means,
+        torch.zeros(count, 3),
+        gaussians.sh0[:, 0],
+        gaussians.shN.transpose(1, 2).reshape(count, 3 * coefficients),
+        torch.logit(gaussians.opacities.double().clamp(TINY, ALMOST_ONE))[:, None],
+        torch.log(gaussians.scales.clamp_min(TINY)),
+        torch.nn.functional.normalize(gaussians.quats, dim=-1),
+    ]
+    values = torch.cat([column.detach().cpu().float() for column in columns], dim=1)
+    vertices = values.numpy().view([(name, "<f4") for name in _property_names(coefficients)])[:, 0]
     # SIBR expects "element vertex" in the header's third line: the comment stands after it, as the element's own.
-    element = PlyElement.describe(_vertices(gaussians), "vertex", comments=[_NOTE + canonical_json(note)])
+    element = PlyElement.describe(vertices, "vertex", comments=[_NOTE + canonical_json(note)])
     with atomic_write(path) as file:
         PlyData([element], byte_order="<").write(file)
 
@@ -63,17 +73,23 @@ def read_splat_ply(path: str | Path, rule: str | None = None) -> Gaussians:
     """
     try:
         data = read_ply_data(path)
-        if is_compressed(data):
+        if "vertex" in data and "packed_position" in data["vertex"]:
             return unpacked(data)
         vertices = data["vertex"]
-        coefficients = _coefficients([p.name for p in vertices.properties])
+        count = sum(p.name.startswith("f_rest_") for p in vertices.properties)
+        coefficients = count // 3
+        if count % 3 or math.isqrt(coefficients + 1) ** 2 != coefficients + 1:
+            raise ValueError(f"{count} f_rest properties match no degree of spherical harmonics")
         names = _property_names(coefficients)
         columns = {name: np.asarray(vertices[name], dtype=np.float32) for name in names if name[0] != "n"}
         for name, column in columns.items():
             wrong = np.isnan(column) if name == "opacity" else ~np.isfinite(column)
             if wrong.any():
                 raise ValueError(f"{name} is NaN or Inf in {wrong.sum()} of {len(column)} Gaussians")
-        return _gaussians(torch.from_numpy(np.stack(list(columns.values()), axis=1)), coefficients)
+        values = torch.from_numpy(np.stack(list(columns.values()), axis=1))
+        means, sh0, rest, opacity, scales, quats = values.split([3, 3, count, 1, 3, 4], dim=1)
+        shN = rest.reshape(len(values), 3, coefficients).transpose(1, 2)
+        return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacity[:, 0]), sh0[:, None], shN)
     except (OSError, PlyParseError, KeyError, ValueError, TypeError) as error:
         why = f"not a splat in the 3DGS convention ({error or type(error).__name__})"
         if rule or note_of(path):
@@ -81,41 +97,8 @@ def read_splat_ply(path: str | Path, rule: str | None = None) -> Gaussians:
         raise ResultError(f"{path}: {why}") from error
 
 
-def _coefficients(names: list[str]) -> int:
-    """The number of coefficients per channel beyond the first. Raises ValueError if it matches no degree."""
-    count = sum(name.startswith("f_rest_") for name in names)
-    if count % 3 or math.isqrt(count // 3 + 1) ** 2 != count // 3 + 1:
-        raise ValueError(f"{count} f_rest properties match no degree of spherical harmonics")
-    return count // 3
-
-
 def _property_names(coefficients: int) -> list[str]:
     """The properties in order, for this number of coefficients per channel beyond the first."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(3 * coefficients)]
     return [*names, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-
-
-def _vertices(gaussians: Gaussians) -> np.ndarray:
-    """The Gaussians as structured records (n,) of the convention."""
-    count, coefficients = gaussians.shN.shape[:2]
-    names = _property_names(coefficients)
-    opacities = gaussians.opacities.double().clamp(TINY, ALMOST_ONE)
-    columns = [
-        gaussians.means,
-        torch.zeros(count, 3),
-        gaussians.sh0[:, 0],
-        gaussians.shN.transpose(1, 2).reshape(count, 3 * coefficients),
-        torch.logit(opacities)[:, None],
-        torch.log(gaussians.scales.clamp_min(TINY)),
-        torch.nn.functional.normalize(gaussians.quats, dim=-1),
-    ]
-    values = torch.cat([column.detach().cpu().float() for column in columns], dim=1)
-    return values.numpy().view([(name, "<f4") for name in names])[:, 0]
-
-
-def _gaussians(values: Float[Tensor, "n columns"], coefficients: int) -> Gaussians:
-    """The Gaussians from columns without normals."""
-    means, sh0, rest, opacity, scales, quats = values.split([3, 3, 3 * coefficients, 1, 3, 4], dim=1)
-    shN = rest.reshape(len(values), 3, coefficients).transpose(1, 2)
-    return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacity[:, 0]), sh0[:, None], shN)

@@ -36,7 +36,9 @@ class SampledGroup:
         """The same with a part of its Gaussians, by mask."""
         if chosen.all():
             return self
-        shapes = None if self.shapes is None else self.shapes.of_rows(chosen.cpu().numpy())
+        shapes, rows = self.shapes, chosen.cpu().numpy()
+        if shapes is not None:
+            shapes = replace(shapes, means=shapes.means[:, rows], quats=shapes.quats[:, rows])
         return replace(self, gaussians=self.gaussians[chosen], shapes=shapes)
 
 

@@ -83,8 +83,23 @@ def splat_stage(
     Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
     stage.SetDefaultPrim(world.GetPrim())
     stage.GetRootLayer().customLayerData = {"drivesplat": dict(note)}
-    _define_groups(stage, groups)
-    _define_camera(stage, cameras)
+    static = [name for name, group in groups.items() if group.motion is None]
+    objects = [name for name in groups if name not in static]
+    if objects:
+        Usd.ModelAPI(UsdGeom.Xform.Define(stage, _ACTORS)).SetKind(Kind.Tokens.group)
+    taken = [path.rpartition("/")[2] for path in (_ACTORS, _CAMERA)]
+    paths = {name: f"/World/{word}" for name, word in unique_names(static, _identifier, taken).items()}
+    paths |= {name: f"{_ACTORS}/{word}" for name, word in unique_names(objects, _identifier).items()}
+    for name, group in groups.items():
+        define_group(stage, paths[name], name, group)
+    camera = UsdGeom.Camera.Define(stage, _CAMERA)
+    stage.SetTimeCodesPerSecond(TIME_CODES_PER_SECOND)
+    stage.SetFramesPerSecond(TIME_CODES_PER_SECOND)
+    codes = [seconds * TIME_CODES_PER_SECOND for seconds, _ in cameras]
+    stage.SetStartTimeCode(min(codes))
+    stage.SetEndTimeCode(max(codes))
+    for code, (_, recorded) in zip(codes, cameras, strict=True):
+        camera.SetFromCamera(recorded, code)
     return stage
 
 
@@ -123,29 +138,6 @@ def write_usdz(path: str | Path, stage: Usd.Stage) -> None:
             raise unwritable(path, "OpenUSD gives no reason")
 
 
-def _define_groups(stage: Usd.Stage, groups: Mapping[str, SampledGroup]) -> None:
-    static = [name for name, group in groups.items() if group.motion is None]
-    objects = [name for name in groups if name not in static]
-    if objects:
-        Usd.ModelAPI(UsdGeom.Xform.Define(stage, _ACTORS)).SetKind(Kind.Tokens.group)
-    taken = [path.rpartition("/")[2] for path in (_ACTORS, _CAMERA)]
-    paths = {name: f"/World/{word}" for name, word in unique_names(static, _identifier, taken).items()}
-    paths |= {name: f"{_ACTORS}/{word}" for name, word in unique_names(objects, _identifier).items()}
-    for name, group in groups.items():
-        define_group(stage, paths[name], name, group)
-
-
 def _identifier(name: str) -> str:
     """A name as a USD identifier; a leading digit gets an underscore before it instead of being replaced by one."""
     return Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
-
-
-def _define_camera(stage: Usd.Stage, cameras: Sequence[tuple[float, Gf.Camera]]) -> None:
-    camera = UsdGeom.Camera.Define(stage, _CAMERA)
-    stage.SetTimeCodesPerSecond(TIME_CODES_PER_SECOND)
-    stage.SetFramesPerSecond(TIME_CODES_PER_SECOND)
-    codes = [seconds * TIME_CODES_PER_SECOND for seconds, _ in cameras]
-    stage.SetStartTimeCode(min(codes))
-    stage.SetEndTimeCode(max(codes))
-    for code, (_, recorded) in zip(codes, cameras, strict=True):
-        camera.SetFromCamera(recorded, code)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pxr import Gf, Kind, Usd, UsdGeom, UsdVol, Vt
 from torch import Tensor
 
-from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion, SampledShapes
+from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledShapes
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians
 
@@ -22,32 +22,12 @@ EXTENT_SIGMAS = 3.0
 
 
 def define_group(stage: Usd.Stage, prim_path: str, name: str, group: SampledGroup) -> None:
-    """Defines a ParticleField3DGaussianSplat at `prim_path`; a moving one also has its track, class and size."""
-    splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, prim_path)
+    """Defines a ParticleField3DGaussianSplat at `prim_path`; a moving one also has its track, class and size, and its
+    transform (object to world) and visibility over time."""
+    splat, gaussians = UsdVol.ParticleField3DGaussianSplat.Define(stage, prim_path), group.gaussians
     Usd.ModelAPI(splat).SetKind(Kind.Tokens.component)
-    _set_gaussians(splat, group.gaussians)
-    if group.motion is None:
-        return
-    about = {"track": name}
-    if group.track is not None:
-        about |= {"category": group.track.category, "size": Gf.Vec3d(*group.track.size)}
-    splat.GetPrim().SetCustomDataByKey("drivesplat", about)
-    splat.GetPrim().SetDisplayName(" ".join([about.get("category", "object"), name]))
-    _set_transforms(splat, group.motion)
-    _set_visibility(splat, group.motion)
-    if group.shapes is not None and len(group.gaussians):
-        _set_shapes(splat, group.gaussians, group.shapes)
-
-
-def usd_matrix(transform: np.ndarray) -> Gf.Matrix4d:
-    """A transform (4, 4) for column vectors as a USD matrix, which is for row vectors."""
-    return Gf.Matrix4d(transform.T.tolist())
-
-
-def _set_gaussians(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussians) -> None:
-    quats = torch.nn.functional.normalize(gaussians.quats, dim=-1)
     splat.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.means)))
-    splat.CreateOrientationsAttr(_orientations(quats))
+    splat.CreateOrientationsAttr(_orientations(torch.nn.functional.normalize(gaussians.quats, dim=-1)))
     splat.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.scales)))
     splat.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(_numpy(gaussians.opacities)))
     splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
@@ -57,6 +37,31 @@ def _set_gaussians(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussi
     splat.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)
     if len(gaussians):
         splat.CreateExtentAttr(_extent(gaussians.means, gaussians.scales))
+    motion = group.motion
+    if motion is None:
+        return
+    about = {"track": name}
+    if group.track is not None:
+        about |= {"category": group.track.category, "size": Gf.Vec3d(*group.track.size)}
+    splat.GetPrim().SetCustomDataByKey("drivesplat", about)
+    splat.GetPrim().SetDisplayName(" ".join([about.get("category", "object"), name]))
+    transform = splat.AddTransformOp()
+    transform.Set(usd_matrix(motion.default_pose))
+    for code, pose in zip(motion.seconds * TIME_CODES_PER_SECOND, motion.object_to_world, strict=True):
+        transform.Set(usd_matrix(pose), float(code))
+    # USD holds a token until the next sample, and the first also before it
+    visibility = splat.CreateVisibilityAttr(_visibility(motion.present_by_default))
+    visibility.Set(_visibility(False), motion.spans[0][0] * TIME_CODES_PER_SECOND - 1.0)
+    for first, last in motion.spans:
+        visibility.Set(_visibility(True), first * TIME_CODES_PER_SECOND)
+        visibility.Set(_visibility(False), float(np.nextafter(last * TIME_CODES_PER_SECOND, np.inf)))
+    if group.shapes is not None and len(gaussians):
+        _set_shapes(splat, gaussians, group.shapes)
+
+
+def usd_matrix(transform: np.ndarray) -> Gf.Matrix4d:
+    """A transform (4, 4) for column vectors as a USD matrix, which is for row vectors."""
+    return Gf.Matrix4d(transform.T.tolist())
 
 
 def _set_shapes(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussians, shapes: SampledShapes) -> None:
@@ -79,23 +84,6 @@ def _extent(means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Vt.Vec
     reach = EXTENT_SIGMAS * scales.amax(dim=-1, keepdim=True)
     corners = torch.stack([(means - reach).amin(dim=0), (means + reach).amax(dim=0)])
     return Vt.Vec3fArray.FromNumpy(_numpy(corners))
-
-
-def _set_transforms(xformable: UsdGeom.Xformable, motion: SampledMotion) -> None:
-    """Object to world over time; the default value is the pose at the default time."""
-    transform = xformable.AddTransformOp()
-    transform.Set(usd_matrix(motion.default_pose))
-    for code, pose in zip(motion.seconds * TIME_CODES_PER_SECOND, motion.object_to_world, strict=True):
-        transform.Set(usd_matrix(pose), float(code))
-
-
-def _set_visibility(imageable: UsdGeom.Imageable, motion: SampledMotion) -> None:
-    """Visible while the object is present. USD holds a token until the next sample, and the first also before it."""
-    visibility = imageable.CreateVisibilityAttr(_visibility(motion.present_by_default))
-    visibility.Set(_visibility(False), motion.spans[0][0] * TIME_CODES_PER_SECOND - 1.0)
-    for first, last in motion.spans:
-        visibility.Set(_visibility(True), first * TIME_CODES_PER_SECOND)
-        visibility.Set(_visibility(False), float(np.nextafter(last * TIME_CODES_PER_SECOND, np.inf)))
 
 
 def _visibility(present: bool) -> str:

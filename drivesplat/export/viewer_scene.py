@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from drivesplat.export.modes import Gait, Modes
 from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
@@ -23,7 +21,7 @@ from drivesplat.rendering.color_bytes import to_uint8
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.trajectories.camera_path import recorded_frames, sampled_path
-from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit
+from drivesplat.trajectories.sampled_edit import InstanceMotion, SampledEdit
 
 
 @dataclass(frozen=True)
@@ -149,26 +147,23 @@ class MotionRecords:
     def edits(self, drives: Sequence[SampledEdit], groups: Sequence[str]) -> list[dict[str, Any]]:
         """A record for each edited drive: its `instances`, each with the number of its `group` and what differs from
         it, and the range of rows of its `camera`; null: as recorded."""
-        return [
-            {
-                "name": drive.name,
-                "instances": [self._instance(instance, groups) for instance in drive.instances],
-                "camera": drive.camera and self.camera_rows.add(drive.camera.seconds, drive.camera.camera_to_world),
-            }
-            for drive in drives
-        ]
-
-    def _instance(self, instance: Instance, groups: Sequence[str]) -> dict[str, Any]:
-        record: dict[str, Any] = {"id": instance.id, "group": groups.index(instance.source)}
-        if instance.motion is None:
-            return record
-        moved = instance.motion
-        colors = None if instance.color_matrix is None else instance.color_matrix.ravel().tolist()
-        gait = Gait(moved.seconds, moved.walked, instance.scale, instance.phase)
-        return {
-            **record, "category": instance.category, "size": instance.size.tolist(), "scale": instance.scale,
-            "colors": colors, **self._motion(moved, instance.source, gait),
-        }  # fmt: skip
+        records = []
+        for drive in drives:
+            instances = []
+            for instance in drive.instances:
+                record: dict[str, Any] = {"id": instance.id, "group": groups.index(instance.source)}
+                moved = instance.motion
+                if moved is not None:
+                    colors = None if instance.color_matrix is None else instance.color_matrix.ravel().tolist()
+                    gait = Gait(moved.seconds, moved.walked, instance.scale, instance.phase)
+                    record |= {
+                        "category": instance.category, "size": instance.size.tolist(), "scale": instance.scale,
+                        "colors": colors, **self._motion(moved, instance.source, gait),
+                    }  # fmt: skip
+                instances.append(record)
+            camera = drive.camera and self.camera_rows.add(drive.camera.seconds, drive.camera.camera_to_world)
+            records.append({"name": drive.name, "instances": instances, "camera": camera})
+        return records
 
     def _motion(self, motion: SampledMotion | InstanceMotion | None, group: str, gait: Gait | None) -> dict[str, Any]:
         """The intervals `present` (seconds) and the range `samples` of rows of a motion; null for a static group."""
@@ -185,16 +180,16 @@ def modes_array(groups: Sequence[str], modes: Mapping[str, Modes], count: int) -
     found = [np.zeros((0, count, 2, 3))]
     for own in (modes[name] for name in groups if name in modes):
         stacked = np.stack([own.shifts, own.turns], axis=2).transpose(1, 0, 2, 3)  # (n, m, 2, 3)
-        found.append(np.pad(stacked, ((0, 0), (0, count - own.count), (0, 0), (0, 0))))
+        found.append(np.pad(stacked, ((0, 0), (0, count - len(own.shifts)), (0, 0), (0, 0))))
     return _roots(np.concatenate(found))
 
 
 def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any], bytes]:
     """What the page's scripts read, and the compressed arrays that it lists."""
-    groups, path = content.groups, content.path
+    groups, path, start = content.groups, content.path, content.path.start
     gaussians = concatenate([group.gaussians for group in groups.values()])
     arrays, sh_range = splat_arrays(gaussians)
-    count = max((modes.count for modes in content.modes.values()), default=0)
+    count = max((len(modes.shifts) for modes in content.modes.values()), default=0)
     modes, modes_range = modes_array([*groups], content.modes, count)
     motions, cameras = SampleRows(count), SampleRows()
     made = MotionRecords(motions, cameras, content.modes)
@@ -211,7 +206,13 @@ def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any],
         "modes_range": modes_range,
         "sky_size": sky_size,
         "has_sky": content.sky is not None,
-        "start": {**start_pose(path.start), "second": path.start_second},
+        "start": {
+            "width": start.width,
+            "height": start.height,
+            "K": continuous_intrinsics(start, (start.width, start.height)).tolist(),
+            "camera_to_world": start.camera_to_world.tolist(),
+            "second": path.start_second,
+        },
         "key_frames": list(path.key_frames),
         "camera": camera,
         "groups": records,
@@ -229,26 +230,13 @@ def sky_faces(sky: Sky | None, size: int) -> np.ndarray:
     """The sky (6, size, size, 3) uint8 as an OpenGL cube map in world directions: faces +x -x +y -y +z -z."""
     if sky is None:
         return np.zeros((6, size, size, 3), np.uint8)
-    return torch.stack([to_uint8(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
-
-
-def cube_rays(size: int) -> Float[Tensor, "6 size size 3"]:
-    """Unit directions of a cube map's texels (face, t, s): OpenGL 4.5 specification, table of section 8.13."""
+    # the directions of its texels (t, s): OpenGL 4.5 specification, table of section 8.13
     line = (torch.arange(size) + 0.5) * (2.0 / size) - 1.0
     t, s = torch.meshgrid(line, line, indexing="ij")
     one = torch.ones_like(s)
     faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
-    return torch.nn.functional.normalize(torch.stack([torch.stack(face, dim=-1) for face in faces]), dim=-1)
-
-
-def start_pose(frame: Frame) -> dict[str, Any]:
-    """The camera of a recorded frame: `K` in continuous pixels of width x height, OpenCV `camera_to_world` (4, 4)."""
-    return {
-        "width": frame.width,
-        "height": frame.height,
-        "K": continuous_intrinsics(frame, (frame.width, frame.height)).tolist(),
-        "camera_to_world": frame.camera_to_world.tolist(),
-    }
+    rays = torch.nn.functional.normalize(torch.stack([torch.stack(face, dim=-1) for face in faces]), dim=-1)
+    return torch.stack([to_uint8(sky.colors(face)) for face in rays]).numpy()
 
 
 def packed(arrays: dict[str, np.ndarray]) -> tuple[list[dict[str, Any]], bytes]:

@@ -67,19 +67,10 @@ class Halves:
     places: Int[Tensor, " a"] | None
 
     @property
-    def firings(self) -> Sequence[Int[Tensor, " _"]]:
-        """The firings that each half has in the scan."""
-        return self.order.split([part.azimuths.shape[1] for part in self.parts])
-
-    @property
     def tensors(self) -> list[Tensor]:
         """All tensors, in a fixed order."""
         places = [] if self.places is None else [self.places]
         return [*(values for part in self.parts for values in part.tensors), self.order, *places]
-
-    def revolutions(self, motion: "ScanMotion") -> list[Revolution]:
-        """The motion during each half."""
-        return [Revolution(part.firings, motion.linear, motion.angular, motion.velocities) for part in self.parts]
 
     def joined(self, parts: Sequence[CompositedScan]) -> CompositedScan:
         """What the rays of the scan measure, by that of the parts."""
@@ -201,15 +192,19 @@ def rasterize_scan(
     """
     if rays.azimuths.numel() == 0:
         raise ValueError(f"a scan needs rays; this one has {rays.azimuths.shape[0]} beams x {rays.azimuths.shape[1]}")
-    revolutions = None if motion is None else rays.halves.revolutions(motion)
+    revolutions, halves = None, None if motion is None else rays.halves
+    if halves is not None:
+        during = (motion.linear, motion.angular, motion.velocities)
+        revolutions = [Revolution(part.firings, *during) for part in halves.parts]
     projected = scanned(means, quats, scales, opacities, world_to_sensor, revolutions, beam_spread, max_range)
-    if motion is None:
+    if halves is None:
         met = [MetPart(rays.whole, projected[0], before)]
         (composited,) = composite_scan(met, values)
     else:
-        borders = [None if before is None else before[:, firings] for firings in rays.halves.firings]
-        met = [MetPart(*part) for part in zip(rays.halves.parts, projected, borders, strict=True)]
-        composited = rays.halves.joined(composite_scan(met, values))
+        own = halves.order.split([part.azimuths.shape[1] for part in halves.parts])
+        borders = [None if before is None else before[:, firings] for firings in own]
+        met = [MetPart(*part) for part in zip(halves.parts, projected, borders, strict=True)]
+        composited = halves.joined(composite_scan(met, values))
     range_sum, alpha, nearer, out, median = composited
     expected = range_sum / alpha.clamp(min=1e-10)
     gaussians_met = tuple(part.gaussians for part in met)

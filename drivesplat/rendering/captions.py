@@ -8,21 +8,12 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.scene import Scene
-from drivesplat.scene.splits import last_training_timestamp
-from drivesplat.settings.images import HoldoutSettings
 
 BEYOND = "beyond the last training image"
 HEIGHT_SHARE = 0.04
 """Height of the letters as a share of a panel's height."""
 MIN_HEIGHT = 9
 """Pixels; smaller letters cannot be read."""
-
-
-def last_training_second(scene: Scene, camera: str, holdout: HoldoutSettings) -> float:
-    """The second of a camera's last training image, since the scene's first image; infinite if there is none."""
-    last = last_training_timestamp(scene, camera, holdout)
-    return np.inf if last is None else scene.seconds(last)
 
 
 @dataclass(frozen=True)

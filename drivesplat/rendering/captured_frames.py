@@ -84,8 +84,12 @@ class GpuFrameRenderer:
         # of a camera of the rig, Python looks up its pose, exposure and rolling shutter: such frames are not captured
         captured = self._captures and gaussians is None and view.camera is None and view.shutter is None
         states = self._model.states(view.time) if captured else ()
-        if captured and (frame_graph := self._graph_for(view, states)) is not None:
-            graph = frame_graph.replay(view, states)
+        if captured and (self._graph is None or not self._graph.fits(view)):
+            self._graph = None  # frees its memory for the next one
+            self._graph = _FrameGraph.capture(self._model, view, states, self._needs)
+            self._captures = self._graph is not None  # not where the GPU or its driver refuses
+        if captured and self._graph is not None:
+            graph = self._graph.replay(view, states)
             return self._pending(graph.result, graph.needed, graph.capacities, wanted)
         with capacity.planned(self._needs) as lists:
             frame = _render(self._model, view, gaussians)
@@ -101,14 +105,6 @@ class GpuFrameRenderer:
         if self._graph is not None and _overflowed(needs, self._graph.graph.capacities):
             self._graph = None
         return self._pending(frame, torch.empty(0, dtype=torch.int32), [], wanted)
-
-    def _graph_for(self, view: View, states: ModelStates) -> "_FrameGraph | None":
-        """The graph for a view, captured now unless there is one; None where the GPU or its driver refuses."""
-        if self._graph is None or not self._graph.fits(view):
-            self._graph = None  # frees its memory for the next one
-            self._graph = _FrameGraph.capture(self._model, view, states, self._needs)
-            self._captures = self._graph is not None
-        return self._graph
 
     def _pending(
         self, frame: RenderedFrame, needed: Tensor, capacities: Sequence[int], wanted: FrameInput

@@ -20,11 +20,12 @@ from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.captions import Caption, captioned, drive_captions, last_training_second
+from drivesplat.rendering.captions import Caption, captioned, drive_captions
 from drivesplat.rendering.frames import film_frame, film_frames, uint8_image
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.images import target_size
 from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import last_training_timestamp
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmEncoding, FilmFormat, FilmJob, ShownParts, TrajectorySettings
 from drivesplat.trajectories.camera_path import CameraPath, film_intrinsics, film_path, recorded_frames
@@ -69,7 +70,8 @@ class Shot:
     @cached_property
     def trained_until(self) -> float:
         """The second of the camera's last training image; infinite if there is none."""
-        return last_training_second(self.scene, self.format.camera, self.format.holdout)
+        last = last_training_timestamp(self.scene, self.format.camera, self.format.holdout)
+        return np.inf if last is None else self.scene.seconds(last)
 
     def record(self) -> dict[str, Any]:
         """The cameras of the film, for other programs.
@@ -114,7 +116,11 @@ def render_film(
     model, device = open_model(checkpoint, device_settings)
     panels = Panels((f"{path.parent.name}: {path.stem}",), shot.size)
     parts = job.trajectory.parts
-    pictures = recorded_shot(model, shot, device) if parts == "all" else _shot_of_parts(model, shot, device, parts)
+    if parts == "all":
+        pictures = recorded_shot(model, shot, device)
+    else:
+        model.precompute(shot.seconds)
+        pictures = (frames_of_parts(model, view, [parts])[0] for view in shot.views(device))
     figures = write_film(path, pictures, shot, model, panels)
     return {**shot.record(), "offset": job.trajectory.model_dump(exclude={"parts"}), "parts": parts, **figures}
 
@@ -180,12 +186,6 @@ def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterat
     """The frames of a shot of a model without edits, (h, w, 3) uint8 RGB."""
     model.precompute(shot.seconds)
     return film_frames(model, ((view, None) for view in shot.views(device)))
-
-
-def _shot_of_parts(model: SplatModel, shot: Shot, device: torch.device, parts: ShownParts) -> Iterator[np.ndarray]:
-    """As `recorded_shot`, of the static or the dynamic parts alone."""
-    model.precompute(shot.seconds)
-    return (frames_of_parts(model, view, [parts])[0] for view in shot.views(device))
 
 
 @torch.no_grad()

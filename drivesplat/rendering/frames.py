@@ -28,7 +28,10 @@ def film_frames(model: SplatModel, inputs: Iterable[FrameInput]) -> Iterator[np.
     if model.parts[0].params["means"].is_cuda:
         yield from _pipelined(GpuFrameRenderer(model).submit, inputs)
     else:
-        yield from (_rendered(model, *one) for one in inputs)
+        for view, gaussians in inputs:
+            with torch.no_grad():
+                image = model.render(view, gaussians=gaussians).image
+            yield uint8_image(image)
 
 
 def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
@@ -41,11 +44,6 @@ def uint8_image(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     if not torch.isfinite(image).all():
         raise ResultError(NOT_FINITE)
     return to_uint8(image).cpu().numpy()
-
-
-@torch.no_grad()
-def _rendered(model: SplatModel, view: View, gaussians: Gaussians | None) -> np.ndarray:
-    return uint8_image(model.render(view, gaussians=gaussians).image)
 
 
 def _pipelined(submit: Callable[[T], PendingFrame], inputs: Iterable[T]) -> Iterator[np.ndarray]:

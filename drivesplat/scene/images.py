@@ -86,11 +86,13 @@ def read_mask(path: str | Path, size: tuple[int, int], of_image: tuple[int, int]
     if labels is None:
         raise DatasetError(f"mask {path} has colours or more than 8 bits; save its labels as one channel of 8 bits")
     found = (labels.shape[1], labels.shape[0])
-    if of_image is not None and not _same_aspect(found, of_image):
-        raise DatasetError(
-            f"mask {path} is {found[0]}x{found[1]}, and its image {of_image[0]}x{of_image[1]}: masks may have another "
-            "size, but must have the image's aspect ratio"
-        )
+    if of_image is not None:
+        (small_w, small_h), (large_w, large_h) = sorted((found, of_image))  # sides may be rounded to whole pixels
+        if abs(small_h - large_h * small_w / large_w) > 1.0 and abs(small_w - large_w * small_h / large_h) > 1.0:
+            raise DatasetError(
+                f"mask {path} is {found[0]}x{found[1]}, and its image {of_image[0]}x{of_image[1]}: masks may have "
+                "another size, but must have the image's aspect ratio"
+            )
     if size == found:
         return labels
     return cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
@@ -106,12 +108,6 @@ def _labels(image: Image.Image) -> np.ndarray | None:
         return None
     red, green, blue = (np.asarray(image)[..., i] for i in range(3))
     return red.copy() if (red == green).all() and (red == blue).all() else None
-
-
-def _same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size is the other one, scaled, with its sides rounded to whole pixels."""
-    (small_w, small_h), (large_w, large_h) = sorted((size, other))
-    return abs(small_h - large_h * small_w / large_w) <= 1.0 or abs(small_w - large_w * small_h / large_h) <= 1.0
 
 
 def project(points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -53,13 +53,6 @@ class ObjectClass(StrEnum):
         """Whether its boxes are left out of the region `static`, moving or not."""
         return self is not ObjectClass.OTHER_MOVABLE
 
-    @property
-    def moving_speed(self) -> float | None:
-        """The horizontal speed in m/s above which it counts as moving; None if it never does."""
-        if self.is_vehicle:
-            return MOVING_VEHICLE
-        return MOVING_HUMAN if self.is_human else None
-
     def moves_at(self, speed: float) -> bool:
-        """Whether it counts as moving at a horizontal `speed` in m/s."""
-        return self.moving_speed is not None and speed > self.moving_speed
+        """Whether it counts as moving at a horizontal `speed` in m/s; animals and other objects never do."""
+        return (self.is_vehicle and speed > MOVING_VEHICLE) or (self.is_human and speed > MOVING_HUMAN)

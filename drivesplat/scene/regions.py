@@ -132,14 +132,6 @@ def owner_image(hulls: list[Hull], size: tuple[int, int]) -> tuple[np.ndarray, l
     return owners, covered
 
 
-def hidden_shares(hulls: list[Hull], size: tuple[int, int]) -> list[float]:
-    """The share of each hull's pixels in the image that nearer ones of `hulls` (farthest first) cover; 0 for a hull
-    outside the image."""
-    owners, covered = owner_image(hulls, size)
-    visible = np.bincount(owners[owners >= 0], minlength=len(hulls)).tolist()
-    return [1.0 - seen / pixels if pixels else 0.0 for seen, pixels in zip(visible, covered, strict=True)]
-
-
 def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     """The label (h, w) uint8 of every pixel of a frame at `size` (width, height), from the scene's boxes.
 
@@ -152,18 +144,30 @@ def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray
 def labelled_hulls(scene: Scene, frame: Frame, size: tuple[int, int]) -> tuple[list[Hull], np.ndarray, list[str]]:
     """The projected boxes of dynamic classes in a frame at `size` (width, height), farthest first; the index (h, w) of
     the nearest one at every pixel, -1 without one; and their labels."""
-    hulls = hulls_in(scene, frame, size)
+    hulls, hidden, names = hulls_in(scene, frame, size), set(), []
     owners, covered = owner_image(hulls, size)
-    hidden = _hidden_tracks(scene, frame, size) if any(hull.box.visibility == UNKNOWN for hull in hulls) else set()
-    names = [_label(hull, pixels, hull.box.track_id in hidden) for hull, pixels in zip(hulls, covered, strict=True)]
+    if any(hull.box.visibility == UNKNOWN for hull in hulls):
+        # nearer boxes of any class hide them
+        of_all = hulls_in(scene, frame, size, all_classes=True)
+        nearest, counts = owner_image(of_all, size)
+        visible = np.bincount(nearest[nearest >= 0], minlength=len(of_all)).tolist()
+        for hull, seen, count in zip(of_all, visible, counts, strict=True):
+            if hull.box.visibility == UNKNOWN and count and 1.0 - seen / count > MAX_HIDDEN:
+                hidden.add(hull.box.track_id)
+    for hull, pixels in zip(hulls, covered, strict=True):
+        box = hull.box
+        unseen = box.track_id in hidden or UNKNOWN < box.visibility < MIN_VISIBILITY
+        if unseen or hull.distance > MAX_DISTANCE or pixels < MIN_PIXELS:
+            name = "left_out"
+        elif box.object_class.is_vehicle:
+            kind = "car" if box.object_class is ObjectClass.CAR else "other_vehicle"
+            name = f"moving_{kind}" if box.moves else f"parked_{kind}"
+        elif box.object_class.is_human:
+            name = "moving_human" if box.moves else "still_human"
+        else:
+            name = "other"
+        names.append(name)
     return hulls, owners, names
-
-
-def _hidden_tracks(scene: Scene, frame: Frame, size: tuple[int, int]) -> set[str]:
-    """The tracks of unknown visibility of which nearer boxes, of any class, hide more than MAX_HIDDEN."""
-    hulls = hulls_in(scene, frame, size, all_classes=True)
-    shares = zip(hulls, hidden_shares(hulls, size), strict=True)
-    return {hull.box.track_id for hull, share in shares if hull.box.visibility == UNKNOWN and share > MAX_HIDDEN}
 
 
 def visibility_source(tracks: Iterable[Track]) -> Literal["annotated", "estimated"] | None:
@@ -173,17 +177,3 @@ def visibility_source(tracks: Iterable[Track]) -> Literal["annotated", "estimate
     if not levels:
         return None
     return "estimated" if any((level == UNKNOWN).any() for level in levels) else "annotated"
-
-
-def _label(hull: Hull, pixels: int, hidden: bool) -> str:
-    """The label of a hull that covers `pixels` pixels; `hidden`: by nearer boxes, with unknown visibility."""
-    box = hull.box
-    hidden |= UNKNOWN < box.visibility < MIN_VISIBILITY
-    if hidden or hull.distance > MAX_DISTANCE or pixels < MIN_PIXELS:
-        return "left_out"
-    if box.object_class.is_vehicle:
-        kind = "car" if box.object_class is ObjectClass.CAR else "other_vehicle"
-        return f"moving_{kind}" if box.moves else f"parked_{kind}"
-    if box.object_class.is_human:
-        return "moving_human" if box.moves else "still_human"
-    return "other"

@@ -66,13 +66,12 @@ def luminance(scene: Scene) -> float | None:
     if not scene.frames:
         return None
     chosen = np.unique(np.linspace(0, len(scene.frames) - 1, SAMPLED_IMAGES).round().astype(int))
-    return float(np.mean([_luma(scene.frames[i].image_path) for i in chosen]))
-
-
-def _luma(path: str) -> float:
-    with Image.open(path) as image:
-        image.draft("RGB", (image.width // REDUCTION, image.height // REDUCTION))
-        return float((np.asarray(image.convert("RGB")) @ REC_709).mean() / 255.0)
+    lumas = []
+    for i in chosen:
+        with Image.open(scene.frames[i].image_path) as image:
+            image.draft("RGB", (image.width // REDUCTION, image.height // REDUCTION))
+            lumas.append(float((np.asarray(image.convert("RGB")) @ REC_709).mean() / 255.0))
+    return float(np.mean(lumas))
 
 
 def scene_warnings(scene: Scene, brightness: float | None) -> list[str]:

@@ -65,10 +65,12 @@ def shutters(scene: Scene, frames: Sequence[Frame] | None = None) -> list[Shutte
     images are near enough in time to give a velocity."""
     readouts = {camera.name: readout_of(camera) for camera in scene.cameras}
     rolling = {name: readout for name, readout in readouts.items() if readout.any()}
-    path = _ego_path(scene) if rolling else None
+    if rolling:
+        times, first = np.unique([frame.timestamp for frame in scene.frames], return_index=True)
+        ego_to_world = np.stack([scene.frames[i].ego_to_world for i in first])
     found: list[Shutter | None] = []
     for frame in scene.frames if frames is None else frames:
-        velocity = _velocity(frame, *path) if path is not None and frame.camera in rolling else None
+        velocity = _velocity(frame, times, ego_to_world) if frame.camera in rolling else None
         if velocity is None:
             found.append(None)
         else:
@@ -81,14 +83,9 @@ def shutter_of(scene: Scene, frame: Frame) -> Shutter | None:
     return shutters(scene, [frame])[0]
 
 
-def _ego_path(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The times (n,) in microseconds, increasing, and the ego poses (n, 4, 4) of all images."""
-    times, first = np.unique([frame.timestamp for frame in scene.frames], return_index=True)
-    return times, np.stack([scene.frames[i].ego_to_world for i in first])
-
-
 def _velocity(frame: Frame, times: np.ndarray, ego_to_world: np.ndarray) -> np.ndarray | None:
-    """`Shutter.velocity` (6,) by the ego poses around an image; None where there are none."""
+    """`Shutter.velocity` (6,) by the ego poses (n, 4, 4) at increasing `times` (n,) in microseconds around an image;
+    None where there are none."""
     from scipy.spatial.transform import Rotation  # here: planning imports this module, and scipy takes long
 
     least, most = APART_US
@@ -124,14 +121,10 @@ def displaced(
         moving = moving + own
     depth = points[:, 2]
     deep, limit = depth.clip(NEAR), 0.5 * OUTSIDE * abs(readout_s[:2]).sum() + abs(readout_s[2])
-    time = _limited(points @ across / deep, limit)  # seconds from the timestamp until the point's line is read
-    rate = _limited((moving @ across - time * moving[:, 2]) / deep, MAX_RATE)
-    time = _limited(time / (1.0 - rate), limit) * (depth > NEAR)
+    time = (points @ across / deep).clip(-limit, limit)  # seconds from the timestamp until the point's line is read
+    rate = ((moving @ across - time * moving[:, 2]) / deep).clip(-MAX_RATE, MAX_RATE)
+    time = (time / (1.0 - rate)).clip(-limit, limit) * (depth > NEAR)
     return points + time[:, None] * moving
-
-
-def _limited(values: Array, limit: Array | float) -> Array:
-    return values.clip(-limit, limit)
 
 
 def where_seen(

@@ -56,12 +56,11 @@ def _groups(scene: Scene, records: Sequence[Frame | Sweep], holdout: HoldoutSett
     held_out_times = scene.key_frame_timestamps[sorted(group_of_key_frame)]
     dense = scene.key_frame_hz >= NEIGHBOURHOOD_HZ
     neighbourhood = holdout.neighbourhood_s * 1e6 if dense else scene.key_frame_interval / 2.0
-
-    def group_of(record: Frame | Sweep) -> Group:
-        if record.is_key_frame and record.sample_index in group_of_key_frame:
-            return group_of_key_frame[record.sample_index]
-        if record.is_key_frame and not dense:
-            return "train"
-        return "excluded" if np.any(np.abs(held_out_times - record.timestamp) < neighbourhood) else "train"
-
-    return [group_of(record) for record in records]
+    groups: list[Group] = []
+    for record in records:
+        held = group_of_key_frame.get(record.sample_index) if record.is_key_frame else None
+        may_be_near = not record.is_key_frame or dense
+        if held is None and may_be_near and np.any(np.abs(held_out_times - record.timestamp) < neighbourhood):
+            held = "excluded"
+        groups.append(held or "train")
+    return groups

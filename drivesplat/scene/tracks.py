@@ -69,20 +69,16 @@ def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
         if not times[0] - reach <= timestamp <= times[-1] + reach:
             continue
         nearest = first + int(np.argmin(np.abs(times - timestamp)))
+        pose, speed = track.object_to_world[first], 0.0
+        if first < last:
+            segment = first + int(np.clip(np.searchsorted(times, timestamp, side="right") - 1, 0, last - first - 1))
+            start, end = track.object_to_world[segment], track.object_to_world[segment + 1]
+            duration = float(track.timestamps[segment + 1] - track.timestamps[segment])
+            pose = interpolate(start, end, (timestamp - track.timestamps[segment]) / duration)
+            speed = float(np.linalg.norm((end - start)[:2, 3])) / duration * 1e6
         visibility = int(track.visibility[nearest])
-        if first == last:
-            return _box(track, track.object_to_world[first], 0.0, visibility)
-        segment = first + int(np.clip(np.searchsorted(times, timestamp, side="right") - 1, 0, last - first - 1))
-        start, end = track.object_to_world[segment], track.object_to_world[segment + 1]
-        duration = float(track.timestamps[segment + 1] - track.timestamps[segment])
-        pose = interpolate(start, end, (timestamp - track.timestamps[segment]) / duration)
-        speed = float(np.linalg.norm((end - start)[:2, 3])) / duration * 1e6
-        return _box(track, pose, speed, visibility)
+        return Box(track.id, track.object_class, track.category, track.size, pose, speed, visibility)
     return None
-
-
-def _box(track: Track, object_to_world: np.ndarray, speed: float, visibility: int) -> Box:
-    return Box(track.id, track.object_class, track.category, track.size, object_to_world, speed, visibility)
 
 
 def boxes_of(tracks: Iterable[Track], timestamp: int, interval: float) -> list[Box]:

@@ -89,28 +89,22 @@ class ActorPath:
         """The poses (n, 4, 4) without lateral offset and yaw."""
         position, longitudinal = self.position(times), self.offsets(times).longitudinal
         distances = self.trajectory.distance(position.clock) + position.advance + longitudinal
-        deviation = _scaled(self.trajectory.deviation(position.clock), position.deviation_weight)
+        deviation, weight = self.trajectory.deviation(position.clock), position.deviation_weight[:, None]
+        turns = Rotation.from_matrix(deviation[:, :3, :3]).as_rotvec()
+        deviation[:, :3, :3] = Rotation.from_rotvec(weight * turns).as_matrix()
+        deviation[:, :3, 3] *= weight
         return self.trajectory.poses_at_distance(distances) @ deviation
 
 
 def recorded_path(motion: Motion, height: float) -> ActorPath:
     """The recorded path of an object `height` metres high."""
     begin, end = motion.span
-    return ActorPath(ObjectTrajectory(motion), height, _recorded_position, _no_offsets, motion.present, begin, end)
-
-
-def _recorded_position(times: np.ndarray) -> PathPosition:
-    return PathPosition(times, np.zeros(len(times)), np.ones(len(times)))
-
-
-def _no_offsets(times: np.ndarray) -> PathOffsets:
-    return PathOffsets(*np.zeros((4, len(times))))
-
-
-def _scaled(transforms: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Transforms (n, 4, 4) with translations and rotation vectors multiplied by `weights` (n,)."""
-    result = transforms.copy()
-    rotations = Rotation.from_matrix(transforms[:, :3, :3]).as_rotvec()
-    result[:, :3, :3] = Rotation.from_rotvec(weights[:, None] * rotations).as_matrix()
-    result[:, :3, 3] *= weights[:, None]
-    return result
+    return ActorPath(
+        trajectory=ObjectTrajectory(motion),
+        height=height,
+        position=lambda times: PathPosition(times, np.zeros(len(times)), np.ones(len(times))),
+        offsets=lambda times: PathOffsets(*np.zeros((4, len(times)))),
+        recorded=motion.present,
+        begin=begin,
+        end=end,
+    )

@@ -12,8 +12,14 @@ from drivesplat.scene.tracks import short_ids
 from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 from drivesplat.trajectories.actor_path import ActorPath, recorded_path
 from drivesplat.trajectories.motion import Motion
-from drivesplat.trajectories.placed_path import placed_motion
-from drivesplat.trajectories.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
+from drivesplat.trajectories.steps import (
+    apply_duplicate,
+    apply_reverse,
+    apply_shift,
+    apply_speed,
+    apply_stop,
+    placed_motion,
+)
 
 MIN_DISTANCE = 0.5
 """Metres; an actor that moves less counts as standing, since annotations are noisy."""
@@ -135,7 +141,11 @@ def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
     actor = state.find(change.track, also_removed=step.kind == "place")
     match change:
         case Swap():
-            return _swapped(state, actor, change)
+            other = state.find(change.other)
+            if other.id == actor.id:
+                raise _StepError(f"{change.track!r} and {change.other!r} are the same track; name two tracks")
+            here, there = replace(actor, path=other.path, edited=True), replace(other, path=actor.path, edited=True)
+            return state.with_actors(here, there)
         case Duplicate():
             return _copied(state, actor, change, apply_duplicate(actor.path, change))
         case Place():
@@ -159,8 +169,11 @@ def _changed_path(path: ActorPath, change: Speed | Stop | Reverse | Shift) -> Ac
     match change:
         case Speed():
             _require_present(path, change.start, "start", may_precede=True)
+            begin = max(path.begin, change.start or 0.0)
             if change.factor is not None:
-                _require_moving(path, change.start)
+                first, last = path.distance(np.array([begin, max(begin, path.end) + LOOKAHEAD]))
+                if abs(last - first) < MIN_DISTANCE:
+                    raise _StepError(f"the track stands from {begin:.2f} s on, where 'factor' has no effect; use 'to'")
             return apply_speed(path, change)
         case Stop():
             _require_present(path, change.at, "at", may_precede=False)
@@ -182,21 +195,6 @@ def _require_present(path: ActorPath, second: float | None, key: str, may_preced
     raise _StepError(
         f"the track {problem} {key!r} ({second:g} s): it was recorded from {path.begin:.2f} to {path.end:.2f} s"
     )
-
-
-def _require_moving(path: ActorPath, start: float | None) -> None:
-    """A speed factor has no effect on a standing actor."""
-    begin = max(path.begin, start or 0.0)
-    first, last = path.distance(np.array([begin, max(begin, path.end) + LOOKAHEAD]))
-    if abs(last - first) < MIN_DISTANCE:
-        raise _StepError(f"the track stands from {begin:.2f} s on, where 'factor' has no effect; use 'to'")
-
-
-def _swapped(state: _EditState, actor: EditedActor, swap: Swap) -> _EditState:
-    other = state.find(swap.other)
-    if other.id == actor.id:
-        raise _StepError(f"{swap.track!r} and {swap.other!r} are the same track; name two tracks")
-    return state.with_actors(replace(actor, path=other.path, edited=True), replace(other, path=actor.path, edited=True))
 
 
 def _copied(state: _EditState, actor: EditedActor, copy: Duplicate | Place, path: ActorPath) -> _EditState:

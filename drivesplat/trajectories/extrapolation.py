@@ -30,23 +30,12 @@ class EndState:
     direction: np.ndarray
     speed: float
 
-    @property
-    def velocity(self) -> np.ndarray:
-        """(3,) m/s."""
-        return self.speed * self.direction
-
-    def continuation(self, tangent: np.ndarray) -> np.ndarray:
-        """The direction (3,) in which a path with this `tangent` (3,) continues; a standing object may have arrived
-        backwards."""
-        backwards = not self.speed and tangent[:2] @ self.direction[:2] < 0.0
-        return self.direction * [-1.0, -1.0, 1.0] if backwards else self.direction
-
 
 def end_state(motion: Motion, last: bool) -> EndState:
     """The state of a motion at its last annotation, or at its first.
 
     Speed and direction are linear fits to the FITTED_STEPS nearest steps between annotations; a standing object has the
-    direction of its box. The slope is that over SLOPE_DISTANCE.
+    direction of its box. The slope is the height gained per horizontal metre over SLOPE_DISTANCE, 0 on a shorter path.
     """
     first, final = motion.runs[-1 if last else 0]
     indices = np.arange(first, final + 1)
@@ -56,7 +45,10 @@ def end_state(motion: Motion, last: bool) -> EndState:
     if speed < STANDSTILL_SPEED:
         heading = motion.poses(np.array([end]))[0, :2, 0]
         speed, direction = 0.0, heading / np.linalg.norm(heading)
-    slope = _slope(motion.object_to_world[indices if last else indices[::-1], :3, 3])
+    positions = motion.object_to_world[indices if last else indices[::-1], :3, 3]
+    distances = np.linalg.norm(positions[:, :2] - positions[-1, :2], axis=1)
+    far = np.flatnonzero(distances >= SLOPE_DISTANCE)
+    slope = float((positions[-1, 2] - positions[far[-1], 2]) / distances[far[-1]]) if len(far) else 0.0
     return EndState(np.array([*direction, slope if last else -slope]), speed)
 
 
@@ -80,13 +72,6 @@ def _fitted(times: np.ndarray, values: np.ndarray, degree: int, weights: np.ndar
     if len(times) == 1:  # of which numpy 1.26 makes a domain of length 0
         return float(values[0])
     return float(Polynomial.fit(times, values, degree, w=weights)(0.0))
-
-
-def _slope(positions: np.ndarray) -> float:
-    """Height gained per horizontal metre over the last SLOPE_DISTANCE of `positions` (m, 3); 0 if they span less."""
-    distances = np.linalg.norm(positions[:, :2] - positions[-1, :2], axis=1)
-    far = np.flatnonzero(distances >= SLOPE_DISTANCE)
-    return float((positions[-1, 2] - positions[far[-1], 2]) / distances[far[-1]]) if len(far) else 0.0
 
 
 def extrapolate(past: np.ndarray, initial: np.ndarray, steady: np.ndarray, over: float) -> np.ndarray:

@@ -21,11 +21,16 @@ def offset_poses(path: PosesAt, times: np.ndarray, lateral: np.ndarray, lateral_
     `lateral_speed` (n,) is the derivative of `lateral` in m/s. The vehicle points in its direction of motion, as in a
     lane change.
     """
-    poses = path(times).copy()
+    poses, yaw = path(times).copy(), np.zeros(len(times))
     if lateral_speed.any():
-        yaw = _heading_change(path(times - HALF_STEP), poses, path(times + HALF_STEP), lateral, lateral_speed)
-    else:
-        yaw = np.zeros(len(times))
+        before, after = path(times - HALF_STEP), path(times + HALF_STEP)
+        velocity = (after - before)[:, :3, 3] / (2 * HALF_STEP)
+        forward = np.einsum("ni,ni->n", velocity, poses[:, :3, 0])
+        turning = Rotation.from_matrix(before[:, :3, :3]).inv() * Rotation.from_matrix(after[:, :3, :3])
+        forward = forward - lateral * turning.as_rotvec()[:, 2] / (2 * HALF_STEP)  # the inside of a bend is shorter
+        speed = np.abs(forward)
+        weight = np.clip((speed - FIXED_HEADING_SPEED) / (FULL_HEADING_SPEED - FIXED_HEADING_SPEED), 0.0, 1.0)
+        yaw = np.arctan2(np.sign(forward) * lateral_speed, speed) * weight**2 * (3.0 - 2.0 * weight)
     poses[:, :3, 3] += lateral[:, None] * poses[:, :3, 1]
     return rotate_yaw(poses, yaw)
 
@@ -35,16 +40,3 @@ def rotate_yaw(poses: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     result = poses.copy()
     result[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_euler("z", yaw[:, None]).as_matrix()
     return result
-
-
-def _heading_change(
-    before: np.ndarray, now: np.ndarray, after: np.ndarray, lateral: np.ndarray, lateral_speed: np.ndarray
-) -> np.ndarray:
-    """The angle (n,) in radians, to the left, between the direction of motion and that of the path."""
-    velocity = (after - before)[:, :3, 3] / (2 * HALF_STEP)
-    forward = np.einsum("ni,ni->n", velocity, now[:, :3, 0])
-    turning = Rotation.from_matrix(before[:, :3, :3]).inv() * Rotation.from_matrix(after[:, :3, :3])
-    forward = forward - lateral * turning.as_rotvec()[:, 2] / (2 * HALF_STEP)  # the inside of a bend is shorter
-    speed = np.abs(forward)
-    weight = np.clip((speed - FIXED_HEADING_SPEED) / (FULL_HEADING_SPEED - FIXED_HEADING_SPEED), 0.0, 1.0)
-    return np.arctan2(np.sign(forward) * lateral_speed, speed) * weight**2 * (3.0 - 2.0 * weight)

@@ -68,8 +68,13 @@ class Motion:
         at = np.asarray(at, dtype=np.float64)
         poses, weights = np.tile(np.eye(4), (len(at), 1, 1)), self.weights(at)
         poses[:, :3, 3] = weights @ self.object_to_world[:, :3, 3]
-        for run, chosen in self._chosen(at):
-            poses[chosen, :3, :3] = self._rotations(run, at[chosen])
+        for (first, last), chosen in self._chosen(at):
+            if first == last:
+                poses[chosen, :3, :3] = self.object_to_world[first, :3, :3]
+                continue
+            spline, within = self._turns[first, last], at[chosen].clip(self.times[first], self.times[last])
+            turning = spline(within, order=1) * (at[chosen] - within)[:, None]  # constant beyond the ends
+            poses[chosen, :3, :3] = (spline(within) * Rotation.from_rotvec(turning)).as_matrix()
         if self.turns is not None:
             about_vertical = Rotation.from_rotvec((weights @ self.turns)[:, None] * [0.0, 0.0, 1.0])
             poses[:, :3, :3] = poses[:, :3, :3] @ about_vertical.as_matrix()
@@ -100,7 +105,12 @@ class Motion:
         at = np.asarray(at, dtype=np.float64)
         weights = np.zeros((len(at), len(self.times)))
         for (first, last), chosen in self._chosen(at):
-            weights[chosen, first : last + 1] = self._run_weights((first, last), at[chosen])
+            if first == last:
+                weights[chosen, first] = 1.0
+                continue
+            spline, within = self._bases[first, last], at[chosen].clip(self.times[first], self.times[last])
+            beyond = (at[chosen] - within)[:, None] * spline(within, 1)  # linear there
+            weights[chosen, first : last + 1] = spline(within) + beyond
         return weights
 
     def _chosen(self, at: np.ndarray) -> list[tuple[tuple[int, int], np.ndarray]]:
@@ -109,16 +119,6 @@ class Motion:
         outside = np.maximum(ends[:, :1] - at, at - ends[:, 1:])
         nearest = outside.argmin(axis=0)
         return [(run, np.flatnonzero(nearest == i)) for i, run in enumerate(self.runs)]
-
-    def _rotations(self, run: tuple[int, int], at: np.ndarray) -> np.ndarray:
-        """Rotation matrices (n, 3, 3) along a run; beyond its ends the angular velocity is constant."""
-        first, last = run
-        if first == last:
-            return np.tile(self.object_to_world[first, :3, :3], (len(at), 1, 1))
-        spline = self._turns[run]
-        within = at.clip(self.times[first], self.times[last])
-        turning = spline(within, order=1) * (at - within)[:, None]
-        return (spline(within) * Rotation.from_rotvec(turning)).as_matrix()
 
     @cached_property
     def _turns(self) -> dict[tuple[int, int], RotationSpline]:
@@ -129,15 +129,6 @@ class Motion:
             for first, last in self.runs
             if first < last
         }
-
-    def _run_weights(self, run: tuple[int, int], at: np.ndarray) -> np.ndarray:
-        """The weights (n, k) of a run's k annotations in a natural cubic spline, linear beyond its ends."""
-        first, last = run
-        if first == last:
-            return np.ones((len(at), 1))
-        spline = self._bases[run]
-        within = at.clip(self.times[first], self.times[last])
-        return spline(within) + (at - within)[:, None] * spline(within, 1)
 
     @cached_property
     def _bases(self) -> dict[tuple[int, int], CubicSpline]:

@@ -40,14 +40,23 @@ class ObjectTrajectory:
 
     def poses_at_time(self, times: np.ndarray) -> np.ndarray:
         """The recorded poses (n, 4, 4) at recorded `times` (n,) in seconds; exact while the motion is defined."""
-        first, last = self.motion.times[[0, -1]]
-        past = times - times.clip(first, last)
-        poses = self.motion.poses(times)
-        beyond = np.abs(past) > self.motion.reach
+        motion, reach, ends = self.motion, self.motion.reach, self.motion.times[[0, -1]]
+        beyond = np.abs(times - times.clip(*ends)) > reach
+        poses = motion.poses(times)
         if beyond.any():
-            turning = times[beyond] - past[beyond] + self._fading_turn(past[beyond])
-            poses[beyond, :3, :3] = self.motion.poses(turning)[:, :3, :3]
-            poses[beyond, :3, 3] = self._extrapolated(past[beyond])
+            past = (times - times.clip(*ends))[beyond]
+            # turning fades out beyond the reach of the motion and ends at the heading of the end
+            straightening = CubicHermiteSpline([reach, reach + SETTLING_TIME], [reach, 0.0], [1.0, 0.0])
+            turned = np.sign(past) * straightening(np.minimum(np.abs(past), reach + SETTLING_TIME))
+            poses[beyond, :3, :3] = motion.poses(times[beyond] - past + turned)[:, :3, :3]
+            positions = np.empty((len(past), 3))
+            for end, chosen in self._past_ends(past):
+                side = float(np.sign(past[chosen][0]))
+                reached = side * reach
+                known = motion.poses(ends[1 if side > 0 else 0] + np.array([0.0, reached]))[:, :3, 3]
+                velocity, steady = (known[1] - known[0]) / reached, end.speed * end.direction
+                positions[chosen] = known[1] + extrapolate(past[chosen] - reached, velocity, steady, SETTLING_TIME)
+            poses[beyond, :3, 3] = positions
         for (low, high), (positions, rotations) in self._bridges.items():
             within = (times > low) & (times < high)
             poses[within, :3, 3] = positions(times[within])
@@ -56,7 +65,7 @@ class ObjectTrajectory:
 
     def distance(self, times: np.ndarray) -> np.ndarray:
         """The distance (n,) in metres at recorded `times` (n,) in seconds."""
-        spline = self._distance_spline
+        spline, _, _ = self._by_distance
         within = times.clip(spline.x[0], spline.x[-1])
         distances, past = spline(within), times - within
         for end, chosen in self._past_ends(past):
@@ -73,7 +82,7 @@ class ObjectTrajectory:
 
     def poses_at_distance(self, distances: np.ndarray) -> np.ndarray:
         """The poses (n, 4, 4) at `distances` (n,) in metres, without the motion of a standing object."""
-        known, poses = self._knots
+        _, known, poses = self._by_distance
         within = distances.clip(known[0], known[-1])
         past, result = distances - within, np.tile(poses[0], (len(distances), 1, 1))
         if len(known) > 1:
@@ -82,7 +91,9 @@ class ObjectTrajectory:
         for end, chosen in self._past_ends(past):
             tangent = positions(within[chosen][0], 1) if len(known) > 1 else end.direction
             tangent = tangent / np.linalg.norm(tangent[:2])
-            result[chosen, :3, 3] += extrapolate(past[chosen], tangent, end.continuation(tangent), SETTLING_DISTANCE)
+            arrived_backwards = not end.speed and tangent[:2] @ end.direction[:2] < 0.0  # a standing object may have
+            continued = end.direction * [-1.0, -1.0, 1.0] if arrived_backwards else end.direction
+            result[chosen, :3, 3] += extrapolate(past[chosen], tangent, continued, SETTLING_DISTANCE)
         return result
 
     def deviation(self, times: np.ndarray) -> np.ndarray:
@@ -95,28 +106,9 @@ class ObjectTrajectory:
         sides = ((self._ends[0], past < 0.0), (self._ends[1], past > 0.0))
         return [(end, chosen) for end, chosen in sides if chosen.any()]
 
-    def _extrapolated(self, past: np.ndarray) -> np.ndarray:
-        """Positions (n, 3) at seconds `past` (n,) an end, beyond the reach of the motion there."""
-        motion, positions = self.motion, np.empty((len(past), 3))
-        for end, chosen in self._past_ends(past):
-            side = float(np.sign(past[chosen][0]))
-            reached = side * motion.reach
-            times = motion.times[-1 if side > 0 else 0] + np.array([0.0, reached])
-            known = motion.poses(times)[:, :3, 3]
-            velocity = (known[1] - known[0]) / reached
-            positions[chosen] = known[1] + extrapolate(past[chosen] - reached, velocity, end.velocity, SETTLING_TIME)
-        return positions
-
     @cached_property
     def _ends(self) -> tuple[EndState, EndState]:
         return end_state(self.motion, last=False), end_state(self.motion, last=True)
-
-    def _fading_turn(self, past: np.ndarray) -> np.ndarray:
-        """For seconds `past` (n,) an end, the seconds (n,) past it whose rotation holds: turning fades out beyond the
-        reach of the motion and ends at the heading of the end."""
-        reach = self.motion.reach
-        straightening = CubicHermiteSpline([reach, reach + SETTLING_TIME], [reach, 0.0], [1.0, 0.0])
-        return np.sign(past) * straightening(np.minimum(np.abs(past), reach + SETTLING_TIME))
 
     @cached_property
     def _bridges(self) -> dict[tuple[float, float], tuple[CubicHermiteSpline, RotationSpline]]:
@@ -136,8 +128,8 @@ class ObjectTrajectory:
         return bridges
 
     @cached_property
-    def _samples(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Recorded seconds (m,), poses (m, 4, 4) and distances (m,) there, and the indices (k,) of the knots."""
+    def _by_distance(self) -> tuple[PchipInterpolator, np.ndarray, np.ndarray]:
+        """The distance by recorded seconds; distances (k,) and poses (k, 4, 4) of the knots of the path by distance."""
         first, last = self.motion.times[[0, -1]]
         times = np.linspace(first, last, int((last - first) / SAMPLE_INTERVAL) + 1)
         poses = self.poses_at_time(times)
@@ -145,24 +137,15 @@ class ObjectTrajectory:
         if distances[-1] < MIN_PATH_LENGTH:
             heading = poses[0, :2, 0] / np.linalg.norm(poses[0, :2, 0])
             distances, knots = np.maximum.accumulate((poses[:, :2, 3] - poses[0, :2, 3]) @ heading), np.array([0])
-        return times, poses, distances, knots
-
-    @cached_property
-    def _distance_spline(self) -> PchipInterpolator:
-        times, _, distances, _ = self._samples
         if len(times) == 1:
-            return PchipInterpolator([times[0], times[0] + 1.0], [0.0, 0.0])
-        return PchipInterpolator(times, distances)
-
-    @cached_property
-    def _knots(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (k,) and poses (k, 4, 4) of the knots of the path by distance."""
-        _, poses, distances, knots = self._samples
-        return distances[knots], poses[knots]
+            spline = PchipInterpolator([times[0], times[0] + 1.0], [0.0, 0.0])
+        else:
+            spline = PchipInterpolator(times, distances)
+        return spline, distances[knots], poses[knots]
 
     @cached_property
     def _knot_splines(self) -> tuple[CubicSpline, RotationSpline]:
-        distances, poses = self._knots
+        _, distances, poses = self._by_distance
         rotations = Rotation.from_matrix(poses[:, :3, :3])
         return CubicSpline(distances, poses[:, :3, 3], bc_type="natural"), RotationSpline(distances, rotations)
 

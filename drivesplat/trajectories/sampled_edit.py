@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.trajectories.edited_actors import EditedActor
-
 
 @dataclass(frozen=True)
 class InstanceMotion:
@@ -53,15 +51,3 @@ class SampledEdit:
     name: str
     instances: tuple[Instance, ...]
     camera: CameraMotion | None
-
-
-def sampled_actor(actor: EditedActor, seconds: np.ndarray) -> InstanceMotion:
-    """The motion of an edited actor at those of `seconds` (n,) at which it is present. Its spans run from the first to
-    the last of neighbouring ones."""
-    present = actor.present(seconds)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
-    spans = tuple((float(seconds[first]), float(seconds[after - 1])) for first, after in edges.reshape(-1, 2))
-    shown = seconds[present]
-    if not len(shown):
-        return InstanceMotion(shown, np.zeros((0, 4, 4)), np.zeros(0), spans)
-    return InstanceMotion(shown, actor.poses(shown), actor.walked(shown), spans)

@@ -1,7 +1,8 @@
 """The effect of each step of an edit on an actor's path, as pure functions.
 
 `speed` and `reverse` change the position along the path; offsets keep their film seconds. `stop` and a delay act on
-position and offsets, so that a stopped actor does not slide.
+position and offsets, so that a stopped actor does not slide. `place` has a path of its own: through given points, on
+the ground beside the ego vehicle's path.
 """
 
 from collections.abc import Callable
@@ -10,12 +11,19 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from drivesplat.settings.edit import Duplicate, Reverse, Shift, Speed, Stop
+from drivesplat.settings.edit import Duplicate, Place, Reverse, Shift, Speed, Stop
 from drivesplat.trajectories.actor_path import ActorPath, PathOffsets, PathPosition
+from drivesplat.trajectories.motion import Motion
 from drivesplat.trajectories.transition import Transition
 
 INTEGRATION_STEP = 0.005
 """Seconds between the samples of the distance integral during a change of speed."""
+KNOT_HZ = 10.0
+"""Poses a second of the motion of a placed copy."""
+STANDS_S = 3600.0
+"""Seconds for which a copy on a path of one point is present."""
+MIN_STEP = 1e-3
+"""Metres; a shorter step has no direction."""
 
 Clock = Callable[[np.ndarray], np.ndarray]
 """Maps seconds (n,) of the path after a step to seconds (n,) of the path before it."""
@@ -28,9 +36,25 @@ def apply_speed(path: ActorPath, speed: Speed) -> ActorPath:
     beginning = max(path.begin, 0.0)
     transition = Transition.of(speed, beginning)
     transition = Transition(max(transition.start, beginning), transition.duration)
-    if speed.factor is None:
-        return _at_constant_speed(path, transition, path.direction * speed.to)
-    return _paced(path, lambda times: transition.warp_time(times, speed.factor), transition.start)
+    if speed.factor is not None:
+        return _paced(path, lambda times: transition.warp_time(times, speed.factor), transition.start)
+    # By partial integration, the integral of (1 - fraction) times the speed is (1 - fraction) times the distance plus
+    # the integral of the fraction's rate times the distance; distances are smoother than speeds.
+    start, end, velocity = transition.start, transition.start + transition.duration, path.direction * speed.to
+    if transition.duration:
+        during = np.linspace(start, end, max(5, int(transition.duration / INTEGRATION_STEP) + 1))
+        integral = CubicSpline(during, transition.rate(during) * path.distance(during)).antiderivative()
+    else:
+        there = path.distance(np.array([start]))
+
+    def position(times: np.ndarray) -> PathPosition:
+        before, fraction = path.position(times), transition.fraction(times)
+        recorded, remaining = path.trajectory.distance(before.clock), 1.0 - fraction
+        remainder = integral(times.clip(start, end)) if transition.duration else fraction * there
+        distance = remaining * (recorded + before.advance) + remainder + velocity * transition.integral(times)
+        return PathPosition(before.clock, distance - recorded, before.deviation_weight * remaining)
+
+    return replace(path, position=position, paced_from=min(path.paced_from, start))
 
 
 def apply_stop(path: ActorPath, stop: Stop) -> ActorPath:
@@ -92,37 +116,42 @@ def apply_duplicate(path: ActorPath, duplicate: Duplicate) -> ActorPath:
     return apply_shift(delayed, Shift(track=duplicate.name, **offset))
 
 
+def placed_motion(place: Place, ego_to_world: np.ndarray, height: float) -> Motion:
+    """The motion of a box `height` metres high along the path of `place`, a spline through its points.
+
+    `ego_to_world` (n, 4, 4) are the ego poses of the drive: its first is the frame of the points, and the nearest to
+    each place has the ground's height and slope there. The box faces the direction of its path.
+    """
+    points = np.array(place.path)
+    if len(points) == 1:
+        times = points[0, :1] + np.array([0.0, STANDS_S])
+        positions = np.repeat(points[:, 1:], 2, axis=0)
+    else:
+        times = np.linspace(points[0, 0], points[-1, 0], max(2, int(KNOT_HZ * np.ptp(points[:, 0])) + 1))
+        positions = CubicSpline(points[:, 0], points[:, 1:], bc_type="natural")(times)
+    headings, steps = np.zeros(len(positions)), np.gradient(positions, axis=0)
+    moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > MIN_STEP)
+    if len(moving):  # where it stands, the direction of its last motion
+        known = moving[np.maximum(np.searchsorted(moving, np.arange(len(positions)), side="right") - 1, 0)]
+        headings = np.arctan2(steps[known, 1], steps[known, 0])
+    start, poses = ego_to_world[0], np.tile(np.eye(4), (len(positions), 1, 1))
+    for pose, position, heading in zip(poses, positions, headings + np.radians(place.yaw), strict=True):
+        at = start[:3, 3] + start[:3, :3] @ np.array([*position, 0.0])
+        nearest = ego_to_world[np.argmin(np.linalg.norm(ego_to_world[:, :2, 3] - at[:2], axis=1))]
+        up = nearest[:3, 2]
+        forward = start[:3, :3] @ np.array([np.cos(heading), np.sin(heading), 0.0])
+        left = np.cross(up, forward)
+        left /= np.linalg.norm(left)
+        above = at[:2] - nearest[:2, 3]
+        pose[:3, :3] = np.stack([np.cross(left, up), left, up], axis=1)
+        pose[:3, 3] = [*at[:2], nearest[2, 3] - above @ up[:2] / up[2]]
+        pose[:3, 3] += 0.5 * height * up
+    return Motion(times, poses, ((0, len(times) - 1),), 0.5 / KNOT_HZ)
+
+
 def _paced(path: ActorPath, clock: Clock, start: float) -> ActorPath:
     """The path whose position follows `clock`, which differs from film time from second `start` on."""
     return replace(path, position=lambda times: path.position(clock(times)), paced_from=min(path.paced_from, start))
-
-
-def _at_constant_speed(path: ActorPath, transition: Transition, velocity: float) -> ActorPath:
-    """The path along which the speed changes over `transition` to `velocity` (m/s, negative: backwards)."""
-    remainder = _integral(path, transition)
-
-    def position(times: np.ndarray) -> PathPosition:
-        before, remaining = path.position(times), 1.0 - transition.fraction(times)
-        recorded = path.trajectory.distance(before.clock)
-        distance = remaining * (recorded + before.advance) + remainder(times) + velocity * transition.integral(times)
-        return PathPosition(before.clock, distance - recorded, before.deviation_weight * remaining)
-
-    return replace(path, position=position, paced_from=min(path.paced_from, transition.start))
-
-
-def _integral(path: ActorPath, transition: Transition) -> Callable[[np.ndarray], np.ndarray]:
-    """The integral (n,) up to the seconds (n,) of the rate of `transition` times the distance of `path`.
-
-    By partial integration, the integral of (1 - fraction) times the speed is (1 - fraction) times the distance plus
-    this integral; distances are smoother than speeds.
-    """
-    end = transition.start + transition.duration
-    if not transition.duration:
-        distance = path.distance(np.array([transition.start]))
-        return lambda times: transition.fraction(times) * distance
-    during = np.linspace(transition.start, end, max(5, int(transition.duration / INTEGRATION_STEP) + 1))
-    integral = CubicSpline(during, transition.rate(during) * path.distance(during)).antiderivative()
-    return lambda times: integral(times.clip(transition.start, end))
 
 
 def _added_offsets(

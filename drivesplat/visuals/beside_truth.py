@@ -9,7 +9,6 @@ from matplotlib import colormaps
 
 from drivesplat.errors import ResultError
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.settings.render import FilmEncoding
 
 MAX_ERROR = 0.5
@@ -37,7 +36,7 @@ def panel_pictures(
     the last one over the channels, from black to bright at MAX_ERROR."""
     error = colormaps["inferno"](np.abs(renderings[-1] - truth).mean(axis=2) / MAX_ERROR)[..., :3]
     width, height = panels.size
-    return [_to_bytes(image[:height, :width]) for image in (truth, *renderings, error)]
+    return [(image[:height, :width] * 255.0 + 0.5).astype(np.uint8) for image in (truth, *renderings, error)]
 
 
 def film_record(
@@ -62,12 +61,6 @@ def even_size(size: tuple[int, int]) -> tuple[int, int]:
     return max(2, width // 2 * 2), max(2, height // 2 * 2)
 
 
-def image_rate(recording: EvaluationData, images: Sequence[int]) -> int:
-    """Images a second, rounded, at least 1."""
-    times = recording.record.timestamps[list(images)]
-    return max(1, round(1e6 / float(np.median(np.diff(times))))) if len(images) > 1 else 1
-
-
-def _to_bytes(colors: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] as the nearest uint8."""
-    return (colors * 255.0 + 0.5).astype(np.uint8)
+def film_rate(timestamps: Sequence[int] | np.ndarray) -> int:
+    """Recordings a second at these times in microseconds, rounded, at least 1."""
+    return max(1, round(1e6 / float(np.median(np.diff(timestamps))))) if len(timestamps) > 1 else 1

@@ -1,19 +1,16 @@
 """The stage `compare`: recorded images of the evaluated camera beside the renderings of several methods, as a film."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.evaluation.synthetic import rendered
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
-from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.rendering.captions import BEYOND, Caption
 from drivesplat.rendering.film import encode_film
@@ -21,14 +18,7 @@ from drivesplat.rendering.panels import Panels
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import CompareJob, FilmEncoding
-from drivesplat.visuals.beside_truth import (
-    even_size,
-    film_record,
-    finite_image,
-    image_rate,
-    panel_pictures,
-    with_psnr,
-)
+from drivesplat.visuals.beside_truth import even_size, film_rate, film_record, finite_image, panel_pictures, with_psnr
 
 NOTES = {
     "train": "training image",
@@ -37,37 +27,6 @@ NOTES = {
     "excluded": "neither trained on nor measured",
 }
 """What a caption says of the split of an image."""
-
-
-@dataclass(frozen=True)
-class _Comparison:
-    """A recording with the models of several methods, and the figures of each image compared so far."""
-
-    recording: EvaluationData
-    models: Mapping[str, SplatModel]
-    device: torch.device
-    panels: Panels
-    figures: list[dict[str, Any]] = field(default_factory=list)
-
-    def frames(self, images: Sequence[int]) -> Iterator[tuple[np.ndarray, Caption]]:
-        """The picture and the caption of each image."""
-        for index in images:
-            truth, measured = self.recording.image(index), ~self.recording.ego_mask(index)
-            view = view_of(self.recording.record, index, self.device)
-            found = {name: finite_image(rendered(model, view), name) for name, model in self.models.items()}
-            quality = {name: psnr_record(image, truth, measured) for name, image in found.items()}
-            pictures = panel_pictures(truth, *found.values(), panels=self.panels)
-            yield self.panels.assembled(pictures), self._caption(index, quality)
-
-    def _caption(self, index: int, quality: Mapping[str, dict[str, Any] | None]) -> Caption:
-        record, split = self.recording.record, self.recording.split(index)
-        seconds = record.seconds(index)
-        values = {name: found["psnr"] if found else None for name, found in quality.items()}
-        self.figures.append({"second": seconds, "split": split, "psnr": values})
-        first, *methods, last = self.panels.labels
-        texts = [with_psnr(name, found) for name, found in zip(methods, quality.values(), strict=True)]
-        notes = [NOTES.get(split or "", ""), *("" for _ in (*methods, last))]
-        return Caption([first, *texts, last], notes, f"{seconds:.1f} s")
 
 
 def render_comparison(
@@ -84,16 +43,31 @@ def render_comparison(
     Raises DatasetError where the scene lacks the camera, DeviceError, and ResultError where the film cannot be written
     or a rendering contains NaN or Inf.
     """
-    images = images_of(recording, job.eval_camera)
-    labels = ("ground truth", *checkpoints, f"error of {[*checkpoints][-1]}")
-    panels = Panels(labels, even_size(recording.size(images[0])))
+    record, images = recording.record, images_of(recording, job.eval_camera)
+    first, last = "ground truth", f"error of {[*checkpoints][-1]}"
+    panels = Panels((first, *checkpoints, last), even_size(recording.size(images[0])))
     opened = {name: open_model(checkpoint, device_settings) for name, checkpoint in checkpoints.items()}
     models, (_, device) = {name: model for name, (model, _) in opened.items()}, next(iter(opened.values()))
-    encoding = FilmEncoding(fps=image_rate(recording, images), crf=job.crf, captions=job.captions)
-    comparison = _Comparison(recording, models, device, panels)
+    figures: list[dict[str, Any]] = []
+
+    def frames() -> Iterator[tuple[np.ndarray, Caption]]:
+        for index in images:
+            truth, measured = recording.image(index), ~recording.ego_mask(index)
+            view = view_of(record, index, device)
+            shown = {name: finite_image(rendered(model, view), name) for name, model in models.items()}
+            found = {name: psnr_record(image, truth, measured) for name, image in shown.items()}
+            seconds, split = record.seconds(index), recording.split(index)
+            values = {name: quality["psnr"] if quality else None for name, quality in found.items()}
+            figures.append({"second": seconds, "split": split, "psnr": values})
+            texts = [with_psnr(name, quality) for name, quality in found.items()]
+            notes = [NOTES.get(split or "", ""), *("" for _ in (*texts, last))]
+            pictures = panel_pictures(truth, *shown.values(), panels=panels)
+            yield panels.assembled(pictures), Caption([first, *texts, last], notes, f"{seconds:.1f} s")
+
+    encoding = FilmEncoding(fps=film_rate(record.timestamps[images]), crf=job.crf, captions=job.captions)
     with explain_out_of_memory(lambda: sum(map(len, models.values()))):
-        written = encode_film(path, comparison.frames(images), len(images), panels, encoding)
-    return film_record(job.eval_camera, encoding, panels, comparison.figures, written)
+        written = encode_film(path, frames(), len(images), panels, encoding)
+    return film_record(job.eval_camera, encoding, panels, figures, written)
 
 
 def images_of(recording: EvaluationData, camera: str) -> list[int]:

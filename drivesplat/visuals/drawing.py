@@ -25,7 +25,7 @@ _FIXES_HEIGHT = 1.4
 def draw_panel(panel: GhostPanel, record: dict[str, Any], method: str) -> Figure:
     """Ground truth and rendering above absolute error and ghosts."""
     title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
-    subject = record["subject"]
+    subject, ghosts = record["subject"], record["ghosts"]
     if subject is None:
         title += f"\n{record['why_null']}"
     else:
@@ -33,59 +33,55 @@ def draw_panel(panel: GhostPanel, record: dict[str, Any], method: str) -> Figure
         title += (
             f" ({split})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m away"
         )
-    figure, axes = image_grid(panel.truth.shape, rows=2, columns=2, title=title)
+    if ghosts is None:
+        about = "Ghosts: none, no moving vehicle"
+    elif not ghosts["gaussians"]:
+        about = "Ghosts: none along the vehicle's path (blue)"
+    else:
+        amplified = f", amplified {ghosts['drawn_times']:.1f}x" if ghosts["drawn_times"] > 1.0 else ""
+        count = f"{ghosts['gaussians']:,}, mean opacity {ghosts['opacity_mean']:.2f}"
+        about = f"Ghosts (red{amplified}) along its path (blue): {count}"
+    shape = panel.truth.shape
+    figure, axes = image_grid(shape, rows=2, columns=2, title=title)
+    quality = f"Rendering: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}"
     show(axes[0], panel.truth, "Ground truth")
-    show(
-        axes[1],
-        panel.render,
-        f"Rendering: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}",
-    )
+    show(axes[1], panel.render, quality)
     _show_error(axes[2], panel.render, panel.truth, "Absolute error, mean over the channels")
-    show(axes[3], panel.ghosts, _ghosts_title(record["ghosts"]))
-    if len(panel.path) > 1:
-        axes[3].plot(*_clipped(panel.path, panel.truth.shape).T, color=PATH_COLOR, linewidth=2.0, alpha=0.9)
-    _outline(axes, panel.outline)
+    show(axes[3], panel.ghosts, about)
+    if len(panel.path) > 1:  # with gaps outside of the image
+        inside = ((panel.path >= 0) & (panel.path <= [shape[1], shape[0]])).all(axis=1)
+        line = np.where(inside[:, None], panel.path - 0.5, np.nan)
+        axes[3].plot(*line.T, color=PATH_COLOR, linewidth=2.0, alpha=0.9)
+    for axis in axes if len(panel.outline) else ():
+        draw_outline(axis, panel.outline)
     figure.set_figheight(figure.get_figheight() + _FIXES_HEIGHT)
     figure.supxlabel(_FIXES, x=0.01, ha="left", fontsize=12, linespacing=1.4)
     return figure
 
 
-def _ghosts_title(ghosts: dict[str, Any] | None) -> str:
-    if ghosts is None:
-        return "Ghosts: none, no moving vehicle"
-    if not ghosts["gaussians"]:
-        return "Ghosts: none along the vehicle's path (blue)"
-    count, mean = ghosts["gaussians"], ghosts["opacity_mean"]
-    amplified = f", amplified {ghosts['drawn_times']:.1f}x" if ghosts["drawn_times"] > 1.0 else ""
-    return f"Ghosts (red{amplified}) along its path (blue): {count:,}, mean opacity {mean:.2f}"
-
-
 def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figure:
-    """Rendering with and without the vehicle, and their difference."""
+    """Rendering with and without the vehicle, and their difference. The title says whether the vehicle is gone, by the
+    pixels of its box."""
     title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
-    without = (
-        "Without the vehicle's Gaussians" if record["removed_by"] == "actor" else "Without the Gaussians in the box"
-    )
+    by = "Without the vehicle's Gaussians" if record["removed_by"] == "actor" else "Without the Gaussians in the box"
     if record["subject"] is None:
         title += f"\n{record['why_null']}"
     else:
-        title += f"\n{record['gaussians_removed']:,} Gaussians removed: {_verdict(record)}"
+        changed, holes = record["box"]["changed_share"] or 0.0, record["holes"]["share_of_box"] or 0.0
+        title += f"\n{record['gaussians_removed']:,} Gaussians removed: the vehicle is "
+        figures = f"{changed:.0%} of the pixels of the box changed"
+        behind = f"holes in {holes:.0%} of the box" if holes > MAX_HOLES else "no holes"
+        if changed < MIN_CHANGED:
+            title += f"still there, {figures} (gone: {MIN_CHANGED:.0%} or more)"
+        else:
+            title += f"gone, {figures}, {behind}"
     figure, axes = image_grid(pair.with_car.shape, rows=1, columns=3, title=title)
     show(axes[0], pair.with_car, "Rendering")
-    show(axes[1], pair.without_car, without)
+    show(axes[1], pair.without_car, by)
     _show_error(axes[2], pair.without_car, pair.with_car, "Absolute difference, mean over the channels")
-    _outline(axes, pair.outline)
+    for axis in axes if len(pair.outline) else ():
+        draw_outline(axis, pair.outline)
     return figure
-
-
-def _verdict(record: dict[str, Any]) -> str:
-    """Whether the vehicle is gone, by the pixels of its box."""
-    changed, holes = record["box"]["changed_share"] or 0.0, record["holes"]["share_of_box"] or 0.0
-    figures = f"{changed:.0%} of the pixels of the box changed"
-    if changed < MIN_CHANGED:
-        return f"the vehicle is still there, {figures} (gone: {MIN_CHANGED:.0%} or more)"
-    behind = f"holes in {holes:.0%} of the box" if holes > MAX_HOLES else "no holes"
-    return f"the vehicle is gone, {figures}, {behind}"
 
 
 def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) -> None:
@@ -95,18 +91,6 @@ def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) ->
     bar = axis.inset_axes((0.7, 0.12, 0.26, 0.03))
     axis.figure.colorbar(error, cax=bar, orientation="horizontal", ticks=[0.0, MAX_ERROR])
     bar.tick_params(colors="white", labelsize=11)
-
-
-def _outline(axes: list[Axes], outline: np.ndarray) -> None:
-    """Draws the outline (n, 2) of the box, in continuous pixels, into every image; nothing if it is empty."""
-    for axis in axes if len(outline) else ():
-        draw_outline(axis, outline)
-
-
-def _clipped(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A line (m, 2) of continuous pixels in the coordinates of axes, NaN (a gap) outside of the image."""
-    inside = ((pixels >= 0) & (pixels <= [shape[1], shape[0]])).all(axis=1)
-    return np.where(inside[:, None], pixels - 0.5, np.nan)
 
 
 def _decibels(record: dict[str, Any] | None) -> str:

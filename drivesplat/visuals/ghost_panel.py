@@ -9,7 +9,7 @@ from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.regions import region_mask
 from drivesplat.scene.rigid import inverse
-from drivesplat.settings.visuals import GhostSettings, PanelJob
+from drivesplat.settings.visuals import PanelJob
 from drivesplat.visuals.ghosts import (
     MIN_COVERING_OPACITY,
     SAMPLE_DISTANCE,
@@ -66,34 +66,22 @@ def ghost_panel(drive: ModelWithRecording, job: PanelJob) -> tuple[GhostPanel, d
         "ghosts": None,
         "why_null": None if subject else no_subject_reason(job.eval_camera),
     }
-    pale = pale_image(truth)
+    grey = truth.mean(axis=2, keepdims=True)
+    bright = max(float(np.quantile(grey, 0.98)), 1e-3)
+    pale = np.repeat(PALE[0] + (PALE[1] - PALE[0]) * np.minimum(grey / bright, 1.0), 3, axis=2)
     if subject is None:
         return GhostPanel(truth, render, pale, np.zeros((0, 2)), np.zeros((0, 2))), record
-    image, record["ghosts"] = _ghost_image(view, subject, pale, job.ghosts)
-    return GhostPanel(truth, render, image, subject.hull.polygon, _ground_path(view, subject)), record
-
-
-def pale_image(image: np.ndarray) -> np.ndarray:
-    """An image (h, w, 3) in [0, 1] as pale greys, stretched to the range of PALE: (h, w, 3)."""
-    grey = image.mean(axis=2, keepdims=True)
-    bright = max(float(np.quantile(grey, 0.98)), 1e-3)
-    return np.repeat(PALE[0] + (PALE[1] - PALE[0]) * np.minimum(grey / bright, 1.0), 3, axis=2)
-
-
-def _ghost_image(
-    view: RenderedView, subject: Subject, pale: np.ndarray, settings: GhostSettings
-) -> tuple[np.ndarray, dict[str, Any]]:
-    """The amplified opacity of the ghosts over the `pale` image (h, w, 3), and their figures."""
-    ghosts = ghosts_of(view, subject.box, settings)
+    ghosts = ghosts_of(view, subject.box, job.ghosts)
     opacity = colors_of(view.render(ghosts).alpha)
     covered = opacity >= MIN_COVERING_OPACITY
     amplification = 1.0
     if covered.any():
         amplification = float(np.clip(TARGET_OPACITY / np.quantile(opacity[covered], 0.95), 1.0, MAX_AMPLIFICATION))
     weight = np.minimum(amplification * opacity, 1.0)[..., None]
-    image = weight * np.array(GHOST_COLOR) + (1.0 - weight) * pale
+    shown = weight * np.array(GHOST_COLOR) + (1.0 - weight) * pale
     figures = {"covered_share": float(covered.mean()), "drawn_times": amplification}
-    return image, {**ghost_figures(view.gaussians, ghosts), **figures}
+    record["ghosts"] = {**ghost_figures(view.gaussians, ghosts), **figures}
+    return GhostPanel(truth, render, shown, subject.hull.polygon, _ground_path(view, subject)), record
 
 
 def _ground_path(view: RenderedView, subject: Subject) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The stage `lidar_film`: all recorded scans of a LiDAR beside those of a trained model, as a film."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ from drivesplat.evaluation.scan_metrics import scan_metrics
 from drivesplat.rendering.captions import Caption
 from drivesplat.rendering.film import encode_film
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.settings.render import FilmEncoding, LidarFilmJob
+from drivesplat.visuals.beside_truth import film_rate
 from drivesplat.visuals.lidar_frame import SIZE, LidarFrames
 from drivesplat.visuals.lidar_picture import figures_label
 from drivesplat.visuals.trained_lidar import TrainedLidar, heading
@@ -33,13 +33,24 @@ def render_lidar_film(lidar: TrainedLidar, method: str, job: LidarFilmJob, path:
     """
     title = f"Scene {lidar.scene.name} · {method} · {lidar.name}"
     drawn, panels = LidarFrames(lidar.scans, heading(lidar.scans), title), Panels((lidar.name,), SIZE)
-    encoding = FilmEncoding(fps=scan_rate(lidar.scans), crf=job.crf, captions=job.captions)
     figures: list[dict[str, Any]] = []
-    written = encode_film(path, _frames(lidar, drawn, figures), len(lidar.scans), panels, encoding)
+
+    def frames() -> Iterator[tuple[np.ndarray, Caption]]:
+        for recorded in lidar.scans:
+            rendered = lidar.render(recorded)
+            found = scan_metrics(lidar.scene, [(recorded, rendered)], chamfer=False)["all"]
+            measured = {name: value for name, value in found.items() if name != "chamfer_m"}
+            figures.append({"second": recorded.seconds, "split": recorded.group, **measured})
+            caption = Caption([figures_label(found)], [NOTES[recorded.group]], f"{recorded.seconds:.1f} s")
+            yield drawn.frame(recorded, rendered), caption
+
+    rate = film_rate([scan.timestamp for scan in lidar.scans])
+    encoding = FilmEncoding(fps=rate, crf=job.crf, captions=job.captions)
+    written = encode_film(path, frames(), len(lidar.scans), panels, encoding)
     return {
         "schema": 1,
         "lidar": lidar.name,
-        "fps": encoding.fps,
+        "fps": rate,
         "frames": len(lidar.scans),
         "width": SIZE[0],
         "height": SIZE[1],
@@ -47,22 +58,3 @@ def render_lidar_film(lidar: TrainedLidar, method: str, job: LidarFilmJob, path:
         "scans": figures,
         **written,
     }
-
-
-def _frames(
-    lidar: TrainedLidar, drawn: LidarFrames, figures: list[dict[str, Any]]
-) -> Iterator[tuple[np.ndarray, Caption]]:
-    """The picture and the caption of each scan; its figures are appended."""
-    for recorded in lidar.scans:
-        rendered = lidar.render(recorded)
-        found = scan_metrics(lidar.scene, [(recorded, rendered)], chamfer=False)["all"]
-        measured = {name: value for name, value in found.items() if name != "chamfer_m"}
-        figures.append({"second": recorded.seconds, "split": recorded.group, **measured})
-        caption = Caption([figures_label(found)], [NOTES[recorded.group]], f"{recorded.seconds:.1f} s")
-        yield drawn.frame(recorded, rendered), caption
-
-
-def scan_rate(scans: Sequence[RecordedScan]) -> int:
-    """Scans a second, rounded, at least 1."""
-    times = [scan.timestamp for scan in scans]
-    return max(1, round(1e6 / float(np.median(np.diff(times))))) if len(times) > 1 else 1

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -60,6 +60,8 @@ SHOWN_SHARE = 0.97
 """Share of the recorded returns that views from above reach, at least 20 m and at most 100 m."""
 VIEW_SIZE, VIEW_TOP = 540, 400
 VIEWS = tuple(Rectangle(left, VIEW_TOP, VIEW_SIZE, VIEW_SIZE) for left in (75, 690, 1305))
+BARS = tuple(Rectangle(view.left, view.top + view.height + 10, 330, 14) for view in VIEWS)
+"""The places of the colour bars of the views."""
 DOT = 2
 """Pixels of a return seen from above."""
 
@@ -82,41 +84,35 @@ class LidarFrames:
 
     def frame(self, recorded: RecordedScan, rendered: RenderedScan) -> UInt8[np.ndarray, "h w 3"]:
         """The frame of a recorded scan and its rendering."""
-        frame, scan = self._background.copy(), recorded.scan
+        frame, scan, measured, ahead = self._background.copy(), recorded.scan, recorded.measured, self._ahead
+        beams, firings = shown_order(scan.rays, ahead)
         for place, ranges, returned in (
             (RECORDED, scan.ranges, scan.returned),
             (RENDERED, rendered.ranges, rendered.returned),
         ):
             colors = _colors(RANGE_COLORS, RANGES, ranges)
             colors[~returned] = 0
-            colors[~recorded.measured] = _bytes(UNMEASURED)
-            place.inside(frame)[:] = _enlarged(colors, place, *shown_order(scan.rays, self._ahead))
-        there = scan.returned & recorded.measured, rendered.returned & recorded.measured
-        for place, ranges, chosen in zip(VIEWS, (scan.ranges, rendered.ranges), there, strict=False):
-            points = _points(recorded, ranges, chosen, self._ahead)
+            colors[~measured] = _bytes(UNMEASURED)
+            rows = beams[np.arange(place.height) * len(beams) // place.height]
+            columns = firings[np.arange(place.width) * len(firings) // place.width]
+            place.inside(frame)[:] = colors[rows][:, columns]  # each pixel is that of the nearest ray
+        there, found = scan.returned & measured, rendered.returned & measured
+        for place, ranges, chosen in zip(VIEWS, (scan.ranges, rendered.ranges), (there, found), strict=False):
+            points = _points(recorded, ranges, chosen, ahead)
             self._dot(place.inside(frame), points, _colors(HEIGHT_COLORS, self.heights, points[:, 2]), points[:, 2])
-        self._dot(VIEWS[2].inside(frame), *self._errors(recorded, rendered, *there))
-        return frame
-
-    def _errors(
-        self,
-        recorded: RecordedScan,
-        rendered: RenderedScan,
-        there: Bool[np.ndarray, "b a"],
-        found: Bool[np.ndarray, "b a"],
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points, colours and order of the error of range where both return, at the rendered range, and of what only
-        one of both returns."""
-        both, ranges = there & found, recorded.scan.ranges
-        error = np.abs(rendered.ranges - ranges)[both]
+        # the error where both return, at the rendered range; below it what is recorded alone, above it what is rendered
+        both = there & found
+        error = np.abs(rendered.ranges - scan.ranges)[both]
         parts = [
-            (_points(recorded, rendered.ranges, both, self._ahead), _colors(ERROR_COLORS, ERRORS, error), error),
-            (_points(recorded, ranges, there & ~found, self._ahead), _bytes(ONLY_RECORDED), -1.0),
-            (_points(recorded, rendered.ranges, found & ~there, self._ahead), _bytes(ONLY_RENDERED), np.inf),
+            (_points(recorded, rendered.ranges, both, ahead), _colors(ERROR_COLORS, ERRORS, error), error),
+            (_points(recorded, scan.ranges, there & ~found, ahead), _bytes(ONLY_RECORDED), -1.0),
+            (_points(recorded, rendered.ranges, found & ~there, ahead), _bytes(ONLY_RENDERED), np.inf),
         ]
         points = np.concatenate([cloud for cloud, _, _ in parts])
         colors = np.concatenate([np.broadcast_to(color, (len(cloud), 3)) for cloud, color, _ in parts])
-        return points, colors, np.concatenate([np.broadcast_to(order, len(cloud)) for cloud, _, order in parts])
+        order = np.concatenate([np.broadcast_to(order, len(cloud)) for cloud, _, order in parts])
+        self._dot(VIEWS[2].inside(frame), points, colors, order)
+        return frame
 
     def _dot(self, view: np.ndarray, points: np.ndarray, colors: np.ndarray, order: np.ndarray) -> None:
         """Draws points (n, 3), ahead, to the left and up, as dots into a view from above; the last in order are on
@@ -131,7 +127,7 @@ class LidarFrames:
                 view[rows + i, columns + j] = colors[chosen]
 
     def _drawn_background(self, scan: RecordedScan, title: str) -> UInt8[np.ndarray, "h w 3"]:
-        """What all frames have: titles, scales and rings of distance."""
+        """What all frames have: titles, scales, rings of distance, and what colours mean."""
         figure = Figure(figsize=(SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI, facecolor=PAGE)
         canvas = FigureCanvasAgg(figure)
         elevations = np.degrees(scan.scan.rays.beam_elevations)
@@ -143,39 +139,32 @@ class LidarFrames:
             axis.set_xticks([degrees for degrees, _ in DIRECTIONS], names if place is RENDERED else [])
         _bar(figure, Rectangle(1830, 92, 16, 248), RANGE_COLORS, RANGES, (1.0, 10.0, 100.0), "{:g} m")
         titles = ("From above, recorded", "From above, rendered", "Error of range, from above")
+        step = 10.0 if self.reach <= 40.0 else 20.0
         for place, name in zip(VIEWS, titles, strict=True):
-            self._rings(_panel(figure, place, name))
+            axis = _panel(figure, place, name)
+            axis.set_xlim(self.reach, -self.reach)
+            axis.set_ylim(-self.reach, self.reach)
+            for radius in np.arange(step, self.reach * 1.5, step).tolist():
+                axis.add_patch(Circle((0.0, 0.0), radius, fill=False, edgecolor=RING, linewidth=0.8))
+                if radius < self.reach:
+                    axis.text(0.0, -radius, f"{radius:g} m", color=ONLY_RECORDED, fontsize=9, ha="center", va="center")
+            axis.plot(0.0, 0.0, marker="^", color=INK, markersize=7)
+            axis.set_xticks([])
+            axis.set_yticks([])
         low, high = float(self.heights.vmin), float(self.heights.vmax)
         heights = sorted({low, min(max(0.0, low), high), high})
-        for place in VIEWS[:2]:
-            _bar(figure, _below(place), HEIGHT_COLORS, self.heights, heights, "{:+.0f} m")
-        _bar(figure, _below(VIEWS[2]), ERROR_COLORS, ERRORS, (0.01, 0.1, 1.0, 10.0), "{:g} m")
-        self._legend(figure, title)
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-    def _rings(self, axis: Axes) -> None:
-        axis.set_xlim(self.reach, -self.reach)
-        axis.set_ylim(-self.reach, self.reach)
-        step = 10.0 if self.reach <= 40.0 else 20.0
-        for radius in np.arange(step, self.reach * 1.5, step).tolist():
-            axis.add_patch(Circle((0.0, 0.0), radius, fill=False, edgecolor=RING, linewidth=0.8))
-            if radius < self.reach:
-                axis.text(0.0, -radius, f"{radius:g} m", color=ONLY_RECORDED, fontsize=9, ha="center", va="center")
-        axis.plot(0.0, 0.0, marker="^", color=INK, markersize=7)
-        axis.set_xticks([])
-        axis.set_yticks([])
-
-    def _legend(self, figure: Figure, title: str) -> None:
-        """The title at the upper rim, what colours mean beside the scales, and which side is ahead."""
-        for view, text in zip(VIEWS, ("height above the sensor",) * 2 + ("where both return",), strict=True):
-            bar = _below(view)
+        for place in BARS[:2]:
+            _bar(figure, place, HEIGHT_COLORS, self.heights, heights, "{:+.0f} m")
+        _bar(figure, BARS[2], ERROR_COLORS, ERRORS, (0.01, 0.1, 1.0, 10.0), "{:g} m")
+        for bar, text in zip(BARS, ("height above the sensor",) * 2 + ("where both return",), strict=True):
             _write(figure, text, bar.left + bar.width + 12, bar.top + 12, INK)
         _write(figure, title, 1775, 44, INK, size=15, ha="right")
         _write(figure, "ahead is up" if self._ahead is not None else "the x axis is up", 615, 392, INK, ha="right")
         _write(figure, "only rendered", 1845, 392, ONLY_RENDERED, ha="right")
         _write(figure, "only recorded", 1705, 392, ONLY_RECORDED, ha="right")
         _write(figure, "black: no return, grey blue: says nothing", 1805, 84, ONLY_RECORDED, ha="right")
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _points(
@@ -196,16 +185,6 @@ def _bytes(color: str) -> UInt8[np.ndarray, "3"]:
     return np.round(255.0 * np.array(to_rgb(color))).astype(np.uint8)
 
 
-def _enlarged(
-    colors: UInt8[np.ndarray, "b a 3"], place: Rectangle, beams: Int[np.ndarray, " b"], firings: Int[np.ndarray, " a"]
-) -> np.ndarray:
-    """An image of rays in the size of its place, each pixel that of the nearest ray."""
-    rows, columns = (
-        order[np.arange(size) * len(order) // size] for order, size in ((beams, place.height), (firings, place.width))
-    )
-    return colors[rows][:, columns]
-
-
 def _panel(figure: Figure, place: Rectangle, title: str) -> Axes:
     axis = place.axes(figure)
     axis.set_facecolor("black")
@@ -214,11 +193,6 @@ def _panel(figure: Figure, place: Rectangle, title: str) -> Axes:
     for spine in axis.spines.values():
         spine.set_visible(False)
     return axis
-
-
-def _below(view: Rectangle) -> Rectangle:
-    """The place of the colour bar of a view."""
-    return Rectangle(view.left, view.top + view.height + 10, 330, 14)
 
 
 def _bar(

@@ -29,12 +29,11 @@ def sample_scans(scene: Scene, scans: Sequence[RecordedScan]) -> list[RecordedSc
     """Of each held-out group the scan with most returns from moving vehicles, or the middle one; of training scans if
     none is held out."""
     groups = [[scan for scan in scans if scan.group == group] for group in HELD_OUT_GROUPS]
-    return [_most_moving(scene, group) for group in groups if group] or [_most_moving(scene, scans)]
-
-
-def _most_moving(scene: Scene, scans: Sequence[RecordedScan]) -> RecordedScan:
-    moving = [int(scan_regions(scene, scan)["moving_vehicle"].sum()) for scan in scans]
-    return scans[moving.index(max(moving)) if any(moving) else len(scans) // 2]
+    chosen = []
+    for group in [group for group in groups if group] or [scans]:
+        moving = [int(scan_regions(scene, scan)["moving_vehicle"].sum()) for scan in group]
+        chosen.append(group[moving.index(max(moving)) if any(moving) else len(group) // 2])
+    return chosen
 
 
 def scan_label(scan: RecordedScan) -> str:

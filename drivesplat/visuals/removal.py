@@ -66,7 +66,10 @@ def remove_actor(drive: ModelWithRecording, job: RemovalJob) -> tuple[RemovalPai
     }
     if subject is None:
         log.warning("%s: nothing to remove: %s", scene.name, reason)
-        return _unchanged(view), record
+        picture = view.render()
+        image, alpha = colors_of(picture.image), colors_of(picture.alpha)
+        empty = np.zeros(alpha.shape, dtype=bool)
+        return RemovalPair(image, image, alpha, alpha, empty, empty, ~empty, np.zeros((0, 2))), record
     removal = removal_of(drive.model, view.gaussians, subject.box, job.removal.margin)
     pair = _pair(view, subject, removal)
     count = int(removal.removed.sum())
@@ -77,13 +80,19 @@ def remove_actor(drive: ModelWithRecording, job: RemovalJob) -> tuple[RemovalPai
             "learned decomposition (Street Gaussians, the method 'street') the vehicle has its own Gaussians: without "
             "them the rendering shows the background as other images observed it"
         )
+    ghosts = ghosts_of(view, subject.box, job.ghosts)
+    covered = (colors_of(view.render(ghosts).alpha) >= MIN_COVERING_OPACITY) & pair.outside
     return pair, record | {
         "subject": subject_record(subject, drive.recording),
         "why_null": None,
         "removed_by": removal.by,
         "gaussians_removed": count,
         **figures(pair),
-        "ghosts": _ghost_figures(view, subject, pair, job),
+        "ghosts": {
+            **ghost_figures(view.gaussians, ghosts),
+            "covered_share_outside": _mean(covered, pair.outside),
+            "reach_outside_box": bool(covered.any()),
+        },
     }
 
 
@@ -148,25 +157,6 @@ def _edge(pair: RemovalPair, distance_outside: np.ndarray) -> dict[str, float | 
         return no_edge
     before, after = (float(sobel(rgb2gray(image))[band].mean()) for image in (pair.with_car, pair.without_car))
     return {"with_car": before, "without_car": after, "ratio": after / before if before > 0 else None}
-
-
-def _ghost_figures(view: RenderedView, subject: Subject, pair: RemovalPair, job: RemovalJob) -> dict[str, Any]:
-    """The ghosts that remain, and whether they are visible outside the box."""
-    ghosts = ghosts_of(view, subject.box, job.ghosts)
-    opacity = colors_of(view.render(ghosts).alpha)
-    covered = (opacity >= MIN_COVERING_OPACITY) & pair.outside
-    return {
-        **ghost_figures(view.gaussians, ghosts),
-        "covered_share_outside": _mean(covered, pair.outside),
-        "reach_outside_box": bool(covered.any()),
-    }
-
-
-def _unchanged(view: RenderedView) -> RemovalPair:
-    picture = view.render()
-    image, alpha = colors_of(picture.image), colors_of(picture.alpha)
-    empty = np.zeros(alpha.shape, dtype=bool)
-    return RemovalPair(image, image, alpha, alpha, empty, empty, ~empty, np.zeros((0, 2)))
 
 
 def _mean(values: np.ndarray, mask: np.ndarray) -> float | None:

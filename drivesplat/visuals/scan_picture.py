@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
+from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize, to_rgba
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
@@ -38,11 +37,6 @@ class ShownScan:
     recorded: RecordedScan
     rendered: RenderedScan
     title: str
-
-
-def draw_scan(recorded: RecordedScan, rendered: RenderedScan, title: str, ahead: float | None = None) -> Figure:
-    """The rows of a scan: see `draw_scans`."""
-    return draw_scans([ShownScan(recorded, rendered, title)], ahead)
 
 
 def draw_scans(shown: Sequence[ShownScan], ahead: float | None = None, title: str = "") -> Figure:
@@ -104,38 +98,28 @@ def _rows(recorded: RecordedScan, rendered: RenderedScan) -> list[_Row]:
 
 def _draw(part: SubFigure, item: ShownScan, rows: Sequence[_Row], ahead: float | None) -> None:
     part.suptitle(item.title, x=0.01, ha="left", fontsize=15)
-    rays, measured = item.recorded.scan.rays, item.recorded.measured
+    rays = item.recorded.scan.rays
     beams, firings = shown_order(rays, ahead)
-    elevations = np.degrees(rays.beam_elevations)[beams[[0, -1]]]
-    heights = [f"{degrees:+.0f}°".replace("-", "−") for degrees in elevations]
+    measured = item.recorded.measured[beams][:, firings]
+    unmeasured = np.zeros((*measured.shape, 4))
+    unmeasured[~measured] = to_rgba(UNMEASURED)
+    elevations = [f"{degrees:+.0f}°".replace("-", "−") for degrees in np.degrees(rays.beam_elevations)[beams[[0, -1]]]]
+    names = [f"{degrees:.0f}°" if ahead is None else name for degrees, name in DIRECTIONS]
+    options = {"aspect": "auto", "interpolation": "nearest", "extent": (180.0, -180.0, 0.0, 1.0)}
     for axis, row in zip(part.subplots(len(rows), 1, squeeze=False)[:, 0], rows, strict=True):
         hidden = False if row.there is None else ~row.there
-        values = np.ma.masked_array(np.asarray(row.values, dtype=np.float64), hidden)
-        _show(axis, row, values[beams][:, firings], measured[beams][:, firings])
-        axis.set_yticks([1.0, 0.0], heights, fontsize=10)
-        _label_azimuths(axis, ahead)
-
-
-def _show(axis: Axes, row: _Row, values: np.ma.MaskedArray, measured: np.ndarray) -> None:
-    axis.set_facecolor(NO_RETURN)
-    options = {"aspect": "auto", "interpolation": "nearest", "extent": (180.0, -180.0, 0.0, 1.0)}
-    image = axis.imshow(np.ma.masked_where(~measured, values), norm=row.norm, cmap=row.colors, **options)
-    grey = np.zeros((*measured.shape, 4))
-    grey[~measured] = [*(int(UNMEASURED[i : i + 2], 16) / 255.0 for i in (1, 3, 5)), 1.0]
-    axis.imshow(grey, **options)
-    axis.set_title(row.title, loc="left", fontsize=12, pad=3)
-    bar = axis.figure.colorbar(image, ax=axis, pad=0.005, aspect=8)
-    bar.ax.yaxis.set_major_locator(FixedLocator(list(row.ticks)))
-    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}{row.unit}"))
-    bar.ax.yaxis.set_minor_locator(NullLocator())
-    bar.ax.tick_params(labelsize=10)
-
-
-def _label_azimuths(axis: Axes, ahead: float | None) -> None:
-    """Names of directions below the last row, ticks without them below the others."""
-    at = [degrees for degrees, _ in DIRECTIONS]
-    names = [f"{degrees:.0f}°" if ahead is None else name for degrees, name in DIRECTIONS]
-    last = axis.get_subplotspec().is_last_row()
-    axis.set_xticks(at, names if last else [""] * len(at), fontsize=12)
-    if last and ahead is None:
-        axis.set_xlabel("azimuth from the sensor's x axis", fontsize=12)
+        values = np.ma.masked_array(np.asarray(row.values, dtype=np.float64), hidden)[beams][:, firings]
+        axis.set_facecolor(NO_RETURN)
+        image = axis.imshow(np.ma.masked_where(~measured, values), norm=row.norm, cmap=row.colors, **options)
+        axis.imshow(unmeasured, **options)
+        axis.set_title(row.title, loc="left", fontsize=12, pad=3)
+        bar = axis.figure.colorbar(image, ax=axis, pad=0.005, aspect=8)
+        bar.ax.yaxis.set_major_locator(FixedLocator(list(row.ticks)))
+        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _, unit=row.unit: f"{value:g}{unit}"))
+        bar.ax.yaxis.set_minor_locator(NullLocator())
+        bar.ax.tick_params(labelsize=10)
+        axis.set_yticks([1.0, 0.0], elevations, fontsize=10)
+        last = axis.get_subplotspec().is_last_row()
+        axis.set_xticks([at for at, _ in DIRECTIONS], names if last else [""] * len(names), fontsize=12)
+        if last and ahead is None:
+            axis.set_xlabel("azimuth from the sensor's x axis", fontsize=12)

@@ -47,7 +47,15 @@ def choose_subject(recording: EvaluationData, camera: str, settings: SubjectSett
         if best is None or subject.pixels > best.pixels:
             best = subject
     if best is None and (settings.track is not None or settings.key_frame is not None):
-        raise ConfigError(_not_found_message(recording, camera, settings))
+        requested = " and ".join(f"{name} {value}" for name, value in settings if value is not None)
+        by_track: dict[str, list[int]] = {}
+        for subject in _candidates(recording, camera, SubjectSettings()):
+            by_track.setdefault(subject.box.track_id, []).append(subject.frame.sample_index)
+        known = "; ".join(f"{track} in {min(frames)}-{max(frames)}" for track, frames in by_track.items())
+        raise ConfigError(
+            f"subjects.{recording.scene.name}: {camera} shows no vehicle that matches {requested}; "
+            f"moving vehicles with their first and last key frame: {known or 'none'}"
+        )
     return best
 
 
@@ -75,18 +83,6 @@ def _candidates(recording: EvaluationData, camera: str, settings: SubjectSetting
                 else subject.box.track_id == settings.track
             ):
                 yield subject
-
-
-def _not_found_message(recording: EvaluationData, camera: str, settings: SubjectSettings) -> str:
-    requested = " and ".join(f"{name} {value}" for name, value in settings if value is not None)
-    by_track: dict[str, list[int]] = {}
-    for subject in _candidates(recording, camera, SubjectSettings()):
-        by_track.setdefault(subject.box.track_id, []).append(subject.frame.sample_index)
-    known = "; ".join(f"{track} in {min(frames)}-{max(frames)}" for track, frames in by_track.items())
-    return (
-        f"subjects.{recording.scene.name}: {camera} shows no vehicle that matches {requested}; "
-        f"moving vehicles with their first and last key frame: {known or 'none'}"
-    )
 
 
 def no_subject_reason(camera: str) -> str:

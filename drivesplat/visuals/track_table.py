@@ -5,13 +5,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drivesplat.io.storage import write_csv
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import MIN_PIXELS
-from drivesplat.scene.scene import Track
 from drivesplat.scene.tracks import box_at, ever_moves, short_ids
 from drivesplat.settings.actor_seed import ActorSeedSettings
 from drivesplat.trajectories.actor_record import read_actors
@@ -82,40 +80,36 @@ def track_rows(
     by_track: dict[str, list[Subject]] = {}
     for subject in (subject for seen in subjects.values() for subject in seen):
         by_track.setdefault(subject.box.track_id, []).append(subject)
-    interval = recording.scene.key_frame_interval
-    tracks = [track for track in recording.scene.tracks if track.object_class.is_dynamic]
-    reasons = [None if track.id in editable else _not_editable(track, actors) for track in tracks]
-    rows = [_row(t, reason, by_track.get(t.id, []), interval) for t, reason in zip(tracks, reasons, strict=True)]
+    rows, interval = [], recording.scene.key_frame_interval
+    for track in recording.scene.tracks:
+        if not track.object_class.is_dynamic:
+            continue
+        moves, seen = ever_moves(track), by_track.get(track.id, [])
+        reason = ""
+        if track.id not in editable and not moves:
+            reason = PARKED
+        elif track.id not in editable:
+            reason = NO_METHOD if actors is None else NEVER_SEEN if actors.parts_of(track.object_class) else CLASS
+        boxes = (box_at(track, int(time), interval) for time in track.timestamps)
+        speeds = [box.speed for box in boxes if box is not None]
+        largest = max(seen, key=lambda subject: subject.pixels, default=None)
+        seconds = float(track.timestamps[-1] - track.timestamps[0]) * 1e-6
+        row = TrackRow(
+            id=track.id,
+            category=track.category,
+            moves=moves,
+            editable=not reason,
+            seconds=round(seconds, 2),
+            seconds_visible=round(seconds * min(1.0, len(seen) / len(track.timestamps)), 2),
+            speed_mean=round(float(np.mean(speeds)), 2),
+            speed_max=round(float(np.max(speeds)), 2),
+            **dict(zip(("length", "width", "height"), (round(float(s), 2) for s in track.size), strict=True)),
+            key_frame=largest.frame.sample_index if largest else None,
+            pixels=largest.pixels if largest else 0,
+            not_editable=reason,
+        )
+        rows.append(row)
     return sorted(rows, key=lambda row: (not row.moves, -row.seconds_visible, -row.pixels, row.id))
-
-
-def _not_editable(track: Track, actors: ActorSeedSettings | None) -> str:
-    if not ever_moves(track):
-        return PARKED
-    if actors is None:
-        return NO_METHOD
-    return NEVER_SEEN if actors.parts_of(track.object_class) else CLASS
-
-
-def _row(track: Track, not_editable: str | None, seen: list[Subject], interval: float) -> TrackRow:
-    boxes = (box_at(track, int(time), interval) for time in track.timestamps)
-    speeds = [box.speed for box in boxes if box is not None]
-    largest = max(seen, key=lambda subject: subject.pixels, default=None)
-    seconds = float(track.timestamps[-1] - track.timestamps[0]) * 1e-6
-    return TrackRow(
-        id=track.id,
-        category=track.category,
-        moves=ever_moves(track),
-        editable=not_editable is None,
-        seconds=round(seconds, 2),
-        seconds_visible=round(seconds * min(1.0, len(seen) / len(track.timestamps)), 2),
-        speed_mean=round(float(np.mean(speeds)), 2),
-        speed_max=round(float(np.max(speeds)), 2),
-        **dict(zip(("length", "width", "height"), (round(float(s), 2) for s in track.size), strict=True)),
-        key_frame=largest.frame.sample_index if largest else None,
-        pixels=largest.pixels if largest else 0,
-        not_editable=not_editable or "",
-    )
 
 
 def write_tracks(path: str | Path, rows: Sequence[TrackRow]) -> None:
@@ -140,14 +134,23 @@ def draw_tracks(recording: EvaluationData, subjects: SubjectsByImage, rows: Sequ
     title += DASHED if largest.keys() - editable else ""
     names = short_ids(list(largest))
     columns = min(2, len(chosen))
-    shape = recording.labels(chosen[0]).shape
-    figure, axes = image_grid(shape, rows=-(-len(chosen) // columns), columns=columns, title=title)
+    height, width = recording.labels(chosen[0]).shape
+    figure, axes = image_grid((height, width), rows=-(-len(chosen) // columns), columns=columns, title=title)
     for axis, index in zip(axes, chosen, strict=False):
         show(axis, recording.image(index), f"Key frame {recording.frame(index).sample_index}")
         taken: list[np.ndarray] = []
         for subject in moving[index]:
-            place = _label(axis, subject, names[subject.box.track_id], shape, subject.box.track_id in editable, taken)
+            name = subject.box.track_id
+            color, line = (BOX, "solid") if name in editable else (DASHED_COLOR, "dashed")
+            outline = draw_outline(axis, subject.hull.polygon, color, line)
+            corner = np.clip(outline.min(axis=0), 0, [width * 0.9, height * 0.97])
+            place, size = corner.copy(), LABEL_SHARE * [width, height]
+            while any((np.abs(place - other) < size).all() for other in taken):  # above the other labels
+                place[1] -= 0.25 * size[1]
             taken.append(place)
+            box = {"facecolor": color, "edgecolor": "none", "pad": 1.5}
+            arrow = {"arrowprops": {"arrowstyle": "-", "color": color}} if place[1] < corner[1] else {}
+            axis.annotate(names[name], corner, place, fontsize=9, bbox=box, verticalalignment="bottom", **arrow)
     return figure
 
 
@@ -162,20 +165,3 @@ def covering_images(pixels: Mapping[int, Mapping[str, int]]) -> list[int]:
         chosen.append(best)
         missing -= pixels[best].keys()
     return sorted(chosen)
-
-
-def _label(
-    axis: Axes, subject: Subject, name: str, shape: tuple[int, ...], editable: bool, taken: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Draws the outline of an object and its label above it, higher where other labels are (`taken`, their lower left
-    corners), and a line from one to the other there. Returns the lower left corner of the label."""
-    color = BOX if editable else DASHED_COLOR
-    outline = draw_outline(axis, subject.hull.polygon, color, "solid" if editable else "dashed")
-    corner = np.clip(outline.min(axis=0), 0, [shape[1] * 0.9, shape[0] * 0.97])
-    place, size = corner.copy(), LABEL_SHARE * [shape[1], shape[0]]
-    while any((np.abs(place - other) < size).all() for other in taken):
-        place[1] -= 0.25 * size[1]
-    box, line = {"facecolor": color, "edgecolor": "none", "pad": 1.5}, {"arrowstyle": "-", "color": color}
-    arrow = {"arrowprops": line} if place[1] < corner[1] else {}
-    axis.annotate(name, corner, place, fontsize=9, bbox=box, verticalalignment="bottom", **arrow)
-    return place

@@ -1,12 +1,10 @@
 """The stage `truth_film`: a method from beside the recorded path, beside the truth of a synthetic world, as a film."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import psnr_record
@@ -14,7 +12,6 @@ from drivesplat.evaluation.synthetic import DriveTruth, rendered
 from drivesplat.evaluation.views_aside import LATERAL, place_of_view
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
-from drivesplat.model.splat_model import SplatModel
 from drivesplat.readers.truth import TruthFrame
 from drivesplat.rendering.captions import Caption
 from drivesplat.rendering.film import encode_film
@@ -22,42 +19,10 @@ from drivesplat.rendering.panels import Panels
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import CompareJob, FilmEncoding
-from drivesplat.visuals.beside_truth import (
-    even_size,
-    film_record,
-    finite_image,
-    image_rate,
-    panel_pictures,
-    with_psnr,
-)
+from drivesplat.visuals.beside_truth import even_size, film_rate, film_record, finite_image, panel_pictures, with_psnr
 
 Place = tuple[str, int, Frame, TruthFrame]
 """A frame of the film: the key of a lateral view, a recorded image, the camera beside it, and the truth from there."""
-
-
-@dataclass(frozen=True)
-class _Sideways:
-    """A model beside the truth, and the figures of the frames rendered so far."""
-
-    known: DriveTruth
-    model: SplatModel
-    method: str
-    device: torch.device
-    panels: Panels
-    figures: list[dict[str, Any]] = field(default_factory=list)
-
-    def frames(self, places: Sequence[Place]) -> Iterator[tuple[np.ndarray, Caption]]:
-        """The picture and the caption of each place."""
-        record = self.known.recording.record
-        for key, index, camera, truth in places:
-            image = finite_image(rendered(self.model, self.known.view(index, camera, self.device)), self.method)
-            true = self.known.image(truth.image, record.image_size(index))
-            found = psnr_record(image, true, np.ones(image.shape[:2], dtype=bool))
-            seconds = record.seconds(index)
-            self.figures.append({"left_m": float(key), "second": seconds, "psnr": found["psnr"] if found else None})
-            labels = [self.panels.labels[0], with_psnr(self.method, found), self.panels.labels[-1]]
-            caption = Caption(labels, [place_of_view((LATERAL, key)), "", ""], f"{seconds:.1f} s")
-            yield self.panels.assembled(panel_pictures(true, image, panels=self.panels)), caption
 
 
 def render_truth_film(
@@ -75,17 +40,29 @@ def render_truth_film(
     Raises DatasetError where the world has no such view of the camera, DeviceError, and ResultError where the film
     cannot be written or a rendering contains NaN or Inf.
     """
-    places = places_of(known, job.eval_camera)
+    places, record = places_of(known, job.eval_camera), known.recording.record
     if not places:
         raise DatasetError(f"the truth of this world has no view of {job.eval_camera} from beside the path")
-    panels = Panels(("ground truth", method, "error"), even_size(known.recording.size(places[0][1])))
+    panels = Panels(("ground truth", method, "error"), even_size(record.image_size(places[0][1])))
     model, device = open_model(checkpoint, device_settings)
+    figures: list[dict[str, Any]] = []
+
+    def frames() -> Iterator[tuple[np.ndarray, Caption]]:
+        for key, index, camera, truth in places:
+            image = finite_image(rendered(model, known.view(index, camera, device)), method)
+            true = known.image(truth.image, record.image_size(index))
+            found = psnr_record(image, true, np.ones(image.shape[:2], dtype=bool))
+            seconds = record.seconds(index)
+            figures.append({"left_m": float(key), "second": seconds, "psnr": found["psnr"] if found else None})
+            labels = [panels.labels[0], with_psnr(method, found), panels.labels[-1]]
+            caption = Caption(labels, [place_of_view((LATERAL, key)), "", ""], f"{seconds:.1f} s")
+            yield panels.assembled(panel_pictures(true, image, panels=panels)), caption
+
     images = list(dict.fromkeys(index for _, index, _, _ in places))
-    encoding = FilmEncoding(fps=image_rate(known.recording, images), crf=job.crf, captions=job.captions)
-    sideways = _Sideways(known, model, method, device, panels)
+    encoding = FilmEncoding(fps=film_rate(record.timestamps[images]), crf=job.crf, captions=job.captions)
     with explain_out_of_memory(lambda: len(model)):
-        written = encode_film(path, sideways.frames(places), len(places), panels, encoding)
-    return film_record(job.eval_camera, encoding, panels, sideways.figures, written)
+        written = encode_film(path, frames(), len(places), panels, encoding)
+    return film_record(job.eval_camera, encoding, panels, figures, written)
 
 
 def places_of(known: DriveTruth, camera: str) -> list[Place]:

@@ -26,7 +26,7 @@ from helpers.hand_made_traffic import placed
 from helpers.samples import sampled_with
 from PIL import Image
 
-from drivesplat.editing.actors import actor_placements, collisions, editable_actors
+from drivesplat.editing.actors import actor_placements, editable_actors, warn_of_collisions
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
@@ -441,5 +441,5 @@ def test_a_camera_collides_inside_the_box_of_a_present_actor():
     across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
     car = EditedActor.recorded("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
-    found = collisions(edited_actors([car], BESIDE, ""), cameras, seconds)
+    found = warn_of_collisions(edited_actors([car], BESIDE, ""), cameras, seconds, "")
     assert found.tolist() == [False, True, True, False, True, False]

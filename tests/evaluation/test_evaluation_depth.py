@@ -11,7 +11,7 @@ from helpers.drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
 from helpers.hand_made import looking_at, recording_of, round_gaussians
 
 from drivesplat.evaluation.image_metrics import evaluate_groups, held_out_depths
-from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, DepthErrors, relative_depth_errors
+from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, depth_summary, relative_depth_errors
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
@@ -37,16 +37,16 @@ def known(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray) -> PixelDept
 
 def test_the_figure_is_the_median_over_all_pixels_of_the_group():
     """It is neither the mean nor the mean of the images' medians: the first image has a third of the pixels."""
-    random, errors = np.random.default_rng(0), DepthErrors()
+    random, errors = np.random.default_rng(0), []
     expected = []
     for count, spread in ((500, 0.3), (1000, 0.05)):
         places = random.permutation(40 * 50)[:count]
         depth, off = random.uniform(3.0, 60.0, count), random.normal(size=count) * spread
         image = np.full((40, 50), np.nan, dtype=np.float32)
         image[places // 50, places % 50] = depth * (1.0 + off)
-        errors.add(relative_depth_errors(image, known(places // 50, places % 50, depth)))
+        errors.append(relative_depth_errors(image, known(places // 50, places % 50, depth)))
         expected.append(np.abs(off))
-    record = errors.summary()["depth"]
+    record = depth_summary(errors)["depth"]
     assert record["median_relative_error"] == pytest.approx(np.median(np.concatenate(expected)), rel=1e-3)
     assert record["pixels"] == 1500 and json.dumps(record, allow_nan=False)
 
@@ -55,11 +55,13 @@ def test_the_figure_is_the_median_over_all_pixels_of_the_group():
     ("count", "summary"), [(None, {}), (0, {"depth": None}), (MIN_REGION_PIXELS - 1, {"depth": None})]
 )
 def test_too_few_pixels_give_null_and_no_sweep_gives_no_entry(count, summary):
-    errors = DepthErrors()
+    errors = []
     if count is not None:
         columns = np.arange(count)
-        errors.add(relative_depth_errors(np.ones((1, 1000), np.float32), known(0 * columns, columns, np.ones(count))))
-    assert errors.summary() == summary
+        errors.append(
+            relative_depth_errors(np.ones((1, 1000), np.float32), known(0 * columns, columns, np.ones(count)))
+        )
+    assert depth_summary(errors) == summary
 
 
 def held_out_recording(root: Path) -> EvaluationData:

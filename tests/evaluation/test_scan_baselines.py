@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 from helpers.scan_drives import AZIMUTHS, KEY_FRAME_US, STEPS, recorded, room
 
-from drivesplat.evaluation.scan_baselines import (
-    fused,
-    measured_points,
-    nearest_scan,
-    neighbouring_scans,
-    sensor_to_world,
-)
+from drivesplat.evaluation.scan_baselines import fused, measured_points, nearest_scan, neighbouring_scans
+from drivesplat.lidar.moved_sensor import sensor_poses_of
 
 TARGET = recorded(room(), timestamp=KEY_FRAME_US)
 
@@ -85,7 +80,7 @@ def test_rays_leave_from_where_the_sensor_was_at_their_times():
         **vars(scan), "scan": type(scan.scan)(rays, scan.scan.returned, scan.scan.ranges, scan.scan.intensities),
         "linear": np.array([10.0, 0.0, 0.0]), "angular": np.array([0.0, 0.0, 0.5]),
     })  # fmt: skip
-    poses = sensor_to_world(moving, np.array([-0.1, 0.0]))
+    poses = sensor_poses_of(moving)(np.array([-0.1, 0.0]))
     np.testing.assert_allclose(poses[:, 0, 3], [-1.0, 0.0])
     np.testing.assert_allclose(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]), [-0.05, 0.0], atol=1e-12)
     first = measured_points(moving)[0]

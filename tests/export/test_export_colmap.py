@@ -8,7 +8,7 @@ import pytest
 from helpers.hand_made import recording_of
 
 from drivesplat.errors import ResultError
-from drivesplat.export.colmap import ColmapFiles, export_colmap
+from drivesplat.export.camera_files import ColmapFiles, export_colmap
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse
 

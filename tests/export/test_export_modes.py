@@ -112,9 +112,9 @@ def test_what_is_rigid_has_no_modes(model, group):
 
 def test_bytes_hold_the_modes_of_all_groups_in_order(modes):
     other = Modes(2.0 * modes.shifts[:2], modes.turns[:2], modes.weights)
-    stored, largest = modes_array(["a", "rigid", "b"], {"b": modes, "a": other}, modes.count)
+    stored, largest = modes_array(["a", "rigid", "b"], {"b": modes, "a": other}, len(modes.shifts))
     count = modes.shifts.shape[1]
-    assert stored.shape == (2 * count, modes.count, 2, 3) and stored.dtype == np.int8
+    assert stored.shape == (2 * count, len(modes.shifts), 2, 3) and stored.dtype == np.int8
     values = largest * stored * np.abs(stored.astype(float)) / 127.0**2
     expected = np.stack([modes.shifts, modes.turns], axis=2).transpose(1, 0, 2, 3)
     np.testing.assert_allclose(values[count:], expected, atol=largest / 60)

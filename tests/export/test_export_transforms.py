@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.hand_made import recording_of
 
-from drivesplat.export.nerfstudio import transforms_record
+from drivesplat.export.camera_files import transforms_record
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse
 

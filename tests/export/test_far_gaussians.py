@@ -10,10 +10,11 @@ from helpers.hand_made import Own, looking_at, recording_of, round_gaussians
 from pxr import Usd, UsdGeom
 
 from drivesplat.errors import ResultError
-from drivesplat.export.far_gaussians import MAX_CHANGE, find_far, find_far_in, read_far, within_reach, write_far
+from drivesplat.export.far_gaussians import MAX_CHANGE, find_far, find_far_in, read_far, within_reach
 from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.export.usd import export_usd
+from drivesplat.io.array_file import write_arrays
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.reach import reach_of
 from drivesplat.model.sky import ConstantSky
@@ -180,7 +181,7 @@ def test_positions_that_are_not_finite_are_left_to_the_exports():
 
 def test_the_record_is_read_back_and_a_damaged_one_refused(tmp_path):
     far = found(checkpoint_of([[8e4, 0.0, 1.0]], sizes=3e3, opacities=0.9), views())
-    write_far(tmp_path / "far.npz", far)
+    write_arrays(tmp_path / "far.npz", far)
     again = read_far(tmp_path / "far.npz")
     for name, value in vars(far).items():
         np.testing.assert_array_equal(getattr(again, name), value)

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.export.nerfstudio import transforms_record
+from drivesplat.export.camera_files import transforms_record
 from drivesplat.readers.drive.__main__ import main
 from drivesplat.readers.drive.check import check, whole_scene
 from drivesplat.readers.drive.format import read_drive

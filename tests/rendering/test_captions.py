@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from drivesplat.rendering.captions import BEYOND, captioned, drive_captions, last_training_second, text_mask
+from drivesplat.rendering.captions import BEYOND, captioned, drive_captions, text_mask
 from drivesplat.rendering.panels import Panels
+from drivesplat.scene.splits import last_training_timestamp
 from drivesplat.settings.images import HoldoutSettings
 
 HEIGHT, WIDTH = 180, 640
@@ -78,13 +79,13 @@ def test_captions_larger_than_the_picture_are_cut_off():
     assert picture.shape == (12, 20, 3) and picture.any()
 
 
-def test_the_last_training_second_is_that_of_the_last_image_before_the_last_block(tiny_scene):
+def test_the_last_training_timestamp_is_that_of_the_last_image_before_the_last_block(tiny_scene):
     keys = [f for f in tiny_scene.frames if f.is_key_frame]
     held = HoldoutSettings(every_nth=0, last_block=2)
     trained = [f.timestamp for f in tiny_scene.frames if f.timestamp < keys[-2].timestamp]
-    found = last_training_second(tiny_scene, "CAM_FRONT", held)
-    assert keys[-4].timestamp < found * 1e6 + tiny_scene.frames[0].timestamp <= max(trained)
+    found = last_training_timestamp(tiny_scene, "CAM_FRONT", held)
+    assert keys[-4].timestamp < found <= max(trained)
     none = HoldoutSettings(every_nth=0, last_block=0)
-    assert last_training_second(tiny_scene, "CAM_FRONT", none) == tiny_scene.seconds(tiny_scene.frames[-1].timestamp)
+    assert last_training_timestamp(tiny_scene, "CAM_FRONT", none) == tiny_scene.frames[-1].timestamp
     empty = dataclasses.replace(tiny_scene, frames=())
-    assert last_training_second(empty, "CAM_FRONT", held) == np.inf
+    assert last_training_timestamp(empty, "CAM_FRONT", held) is None

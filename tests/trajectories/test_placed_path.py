@@ -8,7 +8,7 @@ from drivesplat.scene.rigid import rigid
 from drivesplat.settings.edit import Edit, Place
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
 from drivesplat.trajectories.motion import Motion
-from drivesplat.trajectories.placed_path import placed_motion
+from drivesplat.trajectories.steps import placed_motion
 
 SIZE = np.array([4.0, 2.0, 1.5])
 EGO = 8.0 * np.arange(0.0, 10.0, 0.1)

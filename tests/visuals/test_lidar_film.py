@@ -13,7 +13,8 @@ from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.splits import SIDE_CAMERA, Group
 from drivesplat.settings.render import LidarFilmJob
 from drivesplat.visuals import lidar_film
-from drivesplat.visuals.lidar_film import NOTES, render_lidar_film, scan_rate
+from drivesplat.visuals.beside_truth import film_rate
+from drivesplat.visuals.lidar_film import NOTES, render_lidar_film
 from drivesplat.visuals.lidar_frame import (
     HEIGHT_COLORS,
     ONLY_RECORDED,
@@ -154,8 +155,5 @@ def test_captions_say_which_scans_are_held_out(lidar_of, tmp_path, monkeypatch):
 
 
 def test_films_run_at_the_rate_of_the_scans():
-    def at(*times: int):
-        return [recorded(room(), timestamp=time) for time in times]
-
-    assert scan_rate(at(0, 50_000, 100_000, 600_000)) == 20
-    assert scan_rate(at(0, 5_000_000)) == scan_rate(at(0)) == 1
+    assert film_rate([0, 50_000, 100_000, 600_000]) == 20
+    assert film_rate([0, 5_000_000]) == film_rate([0]) == 1

@@ -8,7 +8,7 @@ from PIL import Image
 
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.visuals.figures import save_figure
-from drivesplat.visuals.scan_picture import draw_scan
+from drivesplat.visuals.scan_picture import ShownScan, draw_scans
 
 TITLES = [
     "Range, recorded", "Range, rendered", "Error of range, where both return", "Intensity, recorded",
@@ -44,7 +44,7 @@ def labels(figure) -> list[str]:
 
 
 def test_rows_show_values_with_the_highest_beam_above_and_azimuth_clockwise(pair, tmp_path):
-    figure = draw_scan(*pair, "a scan")
+    figure = draw_scans([ShownScan(*pair, "a scan")])
     shown = {title: image.get_array() for title, image in images(figure).items()}
     assert list(shown) == TITLES
     recorded_range, error, drop = (shown[TITLES[i]] for i in (0, 2, 6))
@@ -60,7 +60,9 @@ def test_rows_show_values_with_the_highest_beam_above_and_azimuth_clockwise(pair
 
 def test_without_intensities_their_rows_are_left_out(pair):
     record, predicted = recorded(room(), intensity=None), pair[1]
-    assert list(images(draw_scan(record, predicted, ""))) == [t for t in TITLES if t != "Intensity, recorded"]
+    assert list(images(draw_scans([ShownScan(record, predicted, "")]))) == [
+        t for t in TITLES if t != "Intensity, recorded"
+    ]
 
 
 def test_the_direction_of_travel_is_in_the_middle(pair):
@@ -68,14 +70,14 @@ def test_the_direction_of_travel_is_in_the_middle(pair):
     record, rendered = pair
     at = STEPS // 2 + STEPS // 4
     rendered.ranges[:, at] = 99.0
-    figure = draw_scan(record, rendered, "", ahead=np.pi / 2)
+    figure = draw_scans([ShownScan(record, rendered, "")], ahead=np.pi / 2)
     (column,) = np.unique(np.nonzero(images(figure)["Range, rendered"].get_array() > 50.0)[1])
     assert abs(column - STEPS / 2) <= 1
     assert labels(figure) == ["behind", "left", "ahead", "right", "behind"]
-    assert labels(draw_scan(record, rendered, ""))[:2] == ["180°", "90°"]
+    assert labels(draw_scans([ShownScan(record, rendered, "")]))[:2] == ["180°", "90°"]
 
 
 def test_no_return_has_a_colour_of_its_own(pair):
     """Neither the nearest nor the farthest range, the smallest error nor the lowest intensity is as black."""
-    for image in list(images(draw_scan(*pair, "")).values())[:5]:
+    for image in list(images(draw_scans([ShownScan(*pair, "")])).values())[:5]:
         assert image.get_cmap()(np.linspace(0.0, 1.0, 9))[:, :3].sum(axis=1).min() > 0.3
