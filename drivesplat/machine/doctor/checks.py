@@ -38,8 +38,8 @@ def python(facts: Facts) -> Iterator[Finding]:
     """The interpreter, and whether its packages are the required ones."""
     version = ".".join(map(str, facts.python))
     found = f"{version} ({facts.executable})"
-    if not (3, 11) <= facts.python <= (3, 12):
-        yield note("Python", f"{found}: tested with 3.11 and 3.12; PYTHON=python3.11 make setup")
+    if not (3, 11) <= facts.python <= (3, 13):
+        yield note("Python", f"{found}: tested with 3.11 to 3.13; PYTHON=python3.11 make setup")
     elif facts.venv_outdated:
         yield fix("Python", ".venv was made from other requirements than the present ones: run make setup")
     else:
@@ -199,6 +199,8 @@ def datasets(facts: Facts) -> Iterator[Finding]:
 
 def _dataset(dataset: Dataset) -> Finding:
     topic = f"dataset {dataset.name}"
+    if dataset.missing_package:
+        return fix(topic, dataset.missing_package)
     if dataset.root is not None:
         return ok(topic, f"found in {dataset.root}")
     if dataset.generated:
