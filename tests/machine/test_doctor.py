@@ -213,7 +213,7 @@ def test_a_missing_dataset_is_a_note_with_its_place_and_source():
 def test_a_dataset_whose_reader_lacks_a_package_is_to_be_fixed(monkeypatch):
     monkeypatch.setattr("drivesplat.readers.nuscenes.layout.find_spec", lambda name: None)
     config = load({"datasets": {
-        "one": {"dataroot": "/no", "scenes": ["0001"]}, "two": {"reader": "drive", "dataroot": "/no", "scenes": ["0002"]}
+        "one": {"dataroot": "/no", "scenes": ["a"]}, "two": {"reader": "drive", "dataroot": "/no", "scenes": ["b"]}
     }})  # fmt: skip
     facts = replace(LAPTOP, datasets=facts_module._datasets(config))
     assert only(facts, "dataset one")[0] == "fix" and "pip install --no-deps" in only(facts, "dataset one")[1]
