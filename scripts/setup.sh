@@ -24,13 +24,13 @@ version_of() { "$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/de
 
 # Prints the interpreter to make .venv with; says what to install where there is none.
 find_python() {
-  local candidate version seen="" bare="" candidates=(python3.11 python3.12 python3 python)
+  local candidate version seen="" bare="" candidates=(python3.11 python3.12 python3.13 python3 python)
   if [ -n "${PYTHON:-}" ]; then candidates=("$PYTHON"); fi
   for candidate in "${candidates[@]}"; do
     command -v "$candidate" >/dev/null 2>&1 || continue
     version=$(version_of "$candidate") || continue
     case $version in
-      3.11|3.12) ;;
+      3.11|3.12|3.13) ;;
       *) seen="$seen, $candidate is $version"; continue ;;
     esac
     if "$candidate" -c 'import venv, ensurepip' 2>/dev/null; then
@@ -43,7 +43,7 @@ find_python() {
   if [ -n "$bare" ]; then
     say "Python $bare is there, but not its venv module: sudo apt-get install python$bare-venv, then make setup"
   else
-    say "no Python 3.11 or 3.12 found${PYTHON:+ at PYTHON=$PYTHON}${seen:+ (${seen#, })}; $(how_to_get_python)"
+    say "no Python 3.11 to 3.13 found${PYTHON:+ at PYTHON=$PYTHON}${seen:+ (${seen#, })}; $(how_to_get_python)"
   fi
   return 1
 }
@@ -54,7 +54,8 @@ how_to_get_python() {
   case $distribution in
     "debian 12"*|"ubuntu 22.04"*) echo "sudo apt-get install python3.11 python3.11-venv python3.11-dev" ;;
     "ubuntu 24.04"*) echo "sudo apt-get install python3.12 python3.12-venv python3.12-dev" ;;
-    *) echo "this distribution packages neither, as far as is known: conda create -p ~/python3.11 python=3.11," \
+    "debian 13"*) echo "sudo apt-get install python3.13 python3.13-venv python3.13-dev" ;;
+    *) echo "this distribution packages none of them, as far as is known: conda create -p ~/python3.11 python=3.11," \
             "then PYTHON=~/python3.11/bin/python make setup (pyenv and uv do as well)" ;;
   esac
 }
@@ -116,6 +117,7 @@ make_venv() {
       fail "$torch_index/$build did not give a torch for $build; is TORCH_INDEX a mirror of PyTorch's index?"
   fi
   .venv/bin/python -m pip check >&2 || fail "the installed packages do not fit together (see above)"
+  pip_install --no-deps "$(grep '^nuscenes-devkit==' constraints.txt)"  # its own requirements ask for numpy < 2
   stamp_for "$build" > "$stamp"
 }
 

@@ -1,6 +1,7 @@
 """The project as a whole: pins in one place, planning that stays quick, presets that load."""
 
 import ast
+import importlib.metadata
 import re
 import subprocess
 import sys
@@ -15,22 +16,34 @@ from packaging.requirements import Requirement
 
 from drivesplat.settings.config import load, merged
 
+DEVKIT = "nuscenes-devkit"
+"""Installed without its requirements, beside those of requirements.txt."""
+PYTHONS = ("3.11", "3.12", "3.13")
 
-def pins(lines: list[str]) -> dict[str, str]:
-    return dict(line.strip().split("==") for line in lines if "==" in line and not line.strip().startswith("#"))
+
+def pins(lines: list[str], python: str) -> dict[str, str]:
+    """The pinned versions of a requirements file for a Python, by package."""
+    parsed = [Requirement(line) for line in lines if "==" in line and not line.startswith(("#", "--"))]
+    chosen = [one for one in parsed if one.marker is None or one.marker.evaluate({"python_version": python})]
+    return {one.name: str(one.specifier).removeprefix("==") for one in chosen}
+
+
+def constraints(python: str) -> dict[str, str]:
+    return pins((REPOSITORY / "constraints.txt").read_text().splitlines(), python)
 
 
 def test_environments_pin_what_the_constraints_pin():
-    constraints = pins((REPOSITORY / "constraints.txt").read_text().splitlines())
     for path in (REPOSITORY / "envs").glob("*.yaml"):
-        packages = next(d["pip"] for d in yaml.safe_load(path.read_text())["dependencies"] if isinstance(d, dict))
-        environment = pins(packages)
+        dependencies = yaml.safe_load(path.read_text())["dependencies"]
+        packages = next(d["pip"] for d in dependencies if isinstance(d, dict))
+        python = next(d for d in dependencies if str(d).startswith("python=")).removeprefix("python=")
+        environment, pinned = pins(packages, python), constraints(python)
         amds_own = {"torch", "torchvision", "gsplat"} if path.name == "rocm.yaml" else set()
         same = {name: version for name, version in environment.items() if name not in amds_own}
-        assert same and all(constraints[name] == version for name, version in same.items()), path.name
+        assert same and all(pinned[name] == version for name, version in same.items()), path.name
         tools = {requirement.name for requirement in requirements("requirements-dev.txt")}
         tools |= {"snakemake-executor-plugin-slurm"}
-        assert constraints.keys() - same.keys() == tools | amds_own, path.name
+        assert pinned.keys() - same.keys() == tools | amds_own, path.name
 
 
 def requirements(name: str) -> list[Requirement]:
@@ -38,13 +51,42 @@ def requirements(name: str) -> list[Requirement]:
     return [Requirement(line) for line in lines if line and not line.startswith("#")]
 
 
-def test_every_requirement_is_pinned_within_its_range():
-    pinned = pins((REPOSITORY / "constraints.txt").read_text().splitlines())
+@pytest.mark.parametrize("python", PYTHONS)
+def test_every_requirement_is_pinned_within_its_range(python):
+    pinned = constraints(python)
     required = [*requirements("requirements.txt"), *requirements("requirements-dev.txt")]
-    assert [requirement.name for requirement in required] == list(pinned)
+    assert {requirement.name for requirement in required} == pinned.keys() - {DEVKIT}
     assert [one.name for one in required if pinned[one.name] not in one.specifier] == []
     bounded = {one.name: {part.operator for part in one.specifier} for one in requirements("requirements.txt")}
     assert {name for name, operators in bounded.items() if operators != {">=", "<"}} == set(), "from, and up to"
+
+
+def test_supported_pythons_are_the_same_everywhere():
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    named = [name.rpartition(" ")[2] for name in project["classifiers"] if "Python :: 3." in name]
+    assert tuple(named) == PYTHONS and project["requires-python"] == ">=3.11,<3.14"
+    assert f"{'|'.join(PYTHONS)}) ;;" in (REPOSITORY / "scripts/setup.sh").read_text()
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+def test_the_extra_pins_the_devkit_where_its_numpy_has_wheels(python):
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    (devkit,) = map(Requirement, project["optional-dependencies"]["nuscenes"])
+    assert devkit.name == DEVKIT and constraints(python)[DEVKIT] in devkit.specifier
+    assert devkit.marker.evaluate({"python_version": python}) == constraints(python)["numpy"].startswith("1.")
+
+
+def test_everything_that_the_devkits_tables_import_is_required():
+    """It is installed without its requirements."""
+    code = (
+        "import sys; before = {*sys.modules}; from nuscenes.nuscenes import NuScenes; "
+        "print(' '.join({it.partition('.')[0] for it in {*sys.modules} - before}))"
+    )
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    packages = importlib.metadata.packages_distributions()
+    asked = {Requirement(line).name.lower() for line in importlib.metadata.requires(DEVKIT)}
+    needed = {package.lower() for name in loaded for package in packages.get(name, [])} & asked
+    assert needed <= {one.name for one in requirements("requirements.txt")}
 
 
 def test_planning_imports_nothing_heavy():

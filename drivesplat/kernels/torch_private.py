@@ -1,15 +1,14 @@
 """torch's private functions, each behind one function of ours. tests/kernels/test_private.py checks their signatures.
 
 There is no public way to update many tensors in one call, to run one fused Adam step, to end a broken capture, or to
-compile CUDA C++ without a compiler of CUDA.
+load compiled CUDA kernels.
 """
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -42,23 +41,12 @@ def write_count(tensor: Tensor) -> int:
     return tensor._version
 
 
-def compiled_cuda(source: str, kernel: str, defined: Mapping[str, int], capability: str) -> bytes:
-    """CUDA C++ source compiled by NVRTC for GPUs of a compute capability, such as "90". `kernel` is one of its kernels,
-    `defined` are its macros. Raises RuntimeError, or OSError without NVRTC."""
-    from torch.cuda import _utils
-
-    options = [f"-D{name}={value}" for name, value in defined.items()]
-    with patch("torch.utils.cpp_extension.include_paths", return_value=[]):  # headers of CUDA may not be there
-        binary, _ = _utils._nvrtc_compile(source, kernel, capability, nvcc_options=options)
-    return binary
-
-
 def loaded_cuda(binary: bytes, kernels: Sequence[str]) -> dict[str, Callable[..., None]]:
     """Compiled kernels by name, loaded for the current device. They take the number of blocks, the number of threads of
     a block, and arguments: tensors on the device and integers of 32 bits. They run in the current stream."""
     from torch.cuda import _utils
 
-    loaded, driver = _utils._cuda_load_module(binary, list(kernels)), _utils._get_gpu_runtime_library()
+    loaded, driver = _utils._cuda_load_module(binary, list(kernels)), _utils._get_cuda_library()
     return {name: partial(_launch, driver, loaded[name]) for name in kernels}
 
 

@@ -32,6 +32,11 @@ def reads_unposed(name: str) -> bool:
     return getattr(layout(name), "POSES_OPTIONAL", False)
 
 
+def missing_package(name: str) -> str | None:
+    """The package that a reader needs and this Python lacks, with what to do (`layout.missing_package`)."""
+    return getattr(layout(name), "missing_package", lambda: None)()
+
+
 def unpacker(name: str) -> ModuleType | None:
     """The module that writes a dataset's images and sweeps as files; None if they are files already."""
     return dataset_module(UNPACK, name) if has_module(UNPACK, name) else None

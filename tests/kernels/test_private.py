@@ -59,14 +59,12 @@ def test_torch_can_release_the_memory_pool_of_a_broken_capture(name):
     assert hasattr(torch._C, name), f"torch has no _C.{name} any more: adapt drivesplat/kernels/torch_private.py"
 
 
-def test_torch_compiles_and_loads_cuda_with_the_arguments_that_we_pass():
+def test_torch_loads_and_launches_cuda_with_the_arguments_that_we_pass():
     from torch.cuda import _utils
 
-    compiling = list(inspect.signature(_utils._nvrtc_compile).parameters)
-    assert compiling[:3] == ["kernel_source", "kernel_name", "compute_capability"] and "nvcc_options" in compiling
     assert list(inspect.signature(_utils._cuda_load_module).parameters) == ["ptx", "kernel_names"]
     assert _utils._CudaKernel("function", "module").func == "function"
-    assert callable(_utils._get_gpu_runtime_library)
+    assert callable(_utils._get_cuda_library)
     assert list(inspect.signature(_utils._check_cuda).parameters) == ["result"]
 
 

@@ -210,6 +210,16 @@ def test_a_missing_dataset_is_a_note_with_its_place_and_source():
     assert level == "note" and problem in text and "make demo" in text
 
 
+def test_a_dataset_whose_reader_lacks_a_package_is_to_be_fixed(monkeypatch):
+    monkeypatch.setattr("drivesplat.readers.nuscenes.layout.find_spec", lambda name: None)
+    config = load({"datasets": {
+        "one": {"dataroot": "/no", "scenes": ["a"]}, "two": {"reader": "drive", "dataroot": "/no", "scenes": ["b"]}
+    }})  # fmt: skip
+    facts = replace(LAPTOP, datasets=facts_module._datasets(config))
+    assert only(facts, "dataset one")[0] == "fix" and "pip install --no-deps" in only(facts, "dataset one")[1]
+    assert only(facts, "dataset two")[0] == "note"
+
+
 def test_a_generated_dataset_may_be_missing():
     level, text = only(replace(LAPTOP, datasets=(Dataset("demo", problem="none", generated=True),)), "dataset demo")
     assert level == "ok" and "generates" in text
@@ -245,7 +255,7 @@ def test_other_problems_are_to_be_fixed():
     broken = replace(LAPTOP, config=None, config_problem="'trian' is not a setting", ffmpeg=None, venv_outdated=True)
     for topic in ("config", "ffmpeg", "Python"):
         assert only(broken, topic)[0] == "fix"
-    assert only(replace(LAPTOP, python=(3, 13)), "Python")[0] == "note"
+    assert only(replace(LAPTOP, python=(3, 14)), "Python")[0] == "note"
 
 
 # Gathering facts.

@@ -27,6 +27,7 @@ from pyquaternion import Quaternion
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.readers.nuscenes import layout
 from drivesplat.readers.nuscenes.layout import TABLES, find_root, table_files
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.scene import Frame, Scene
@@ -86,6 +87,12 @@ def test_without_cameras_a_scene_has_its_sweeps_and_boxes_alone(tiny_root):
         assert len(getattr(alone, name)) == len(getattr(with_images, name)) > 0
     np.testing.assert_array_equal(alone.origin, with_images.origin)
     np.testing.assert_array_equal(alone.key_frame_timestamps, with_images.key_frame_timestamps)
+
+
+def test_missing_devkit_is_reported_with_the_command_that_installs_it(root, monkeypatch):
+    monkeypatch.setattr(layout, "find_spec", lambda name: None)
+    with pytest.raises(DatasetError, match=r"nuscenes-devkit.*is not installed: pip install --no-deps"):
+        extract_scene(source(), root)
 
 
 def test_names_and_times_of_the_scene_match_the_tables(scene):

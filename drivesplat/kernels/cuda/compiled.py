@@ -1,5 +1,6 @@
 """The compiled CUDA kernels, cached on disk, and whether this process can have them."""
 
+import ctypes
 import logging
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -77,6 +78,26 @@ def _binary(program: Program, channels: int, length: int, capability: str) -> by
 
 
 def compiled(program: Program, channels: int, length: int, capability: str) -> bytes:
-    """The kernels compiled for GPUs of a compute capability, such as "90"."""
-    defined = {"CHANNELS": channels, "LENGTH": length}
-    return torch_private.compiled_cuda(program.source, program.kernels[0], defined, capability)
+    """The kernels compiled by NVRTC for GPUs of a compute capability, such as "90"; needs no GPU. Raises RuntimeError
+    with NVRTC's messages, or OSError without NVRTC."""
+    nvrtc = ctypes.CDLL(f"libnvrtc.so.{str(torch.version.cuda).partition('.')[0]}")  # loaded by torch already
+    handle = ctypes.c_void_p()
+    options = [f"--gpu-architecture=sm_{capability}", f"-DCHANNELS={channels}", f"-DLENGTH={length}"]
+    arguments = (ctypes.c_char_p * len(options))(*map(str.encode, options))
+
+    def output(name: str) -> bytes:
+        size = ctypes.c_size_t()
+        status = getattr(nvrtc, f"nvrtcGet{name}Size")(handle, ctypes.byref(size))
+        content = ctypes.create_string_buffer(size.value)
+        if status or getattr(nvrtc, f"nvrtcGet{name}")(handle, content):
+            raise RuntimeError(f"NVRTC does not give its {name}")
+        return content.raw
+
+    if nvrtc.nvrtcCreateProgram(ctypes.byref(handle), program.source.encode(), None, 0, None, None):
+        raise RuntimeError("NVRTC does not take programs")
+    try:
+        if nvrtc.nvrtcCompileProgram(handle, len(options), arguments):
+            raise RuntimeError(output("ProgramLog").rstrip(b"\0").decode(errors="replace"))
+        return output("CUBIN")
+    finally:
+        nvrtc.nvrtcDestroyProgram(ctypes.byref(handle))

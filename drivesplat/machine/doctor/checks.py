@@ -38,8 +38,8 @@ def python(facts: Facts) -> Iterator[Finding]:
     """The interpreter, and whether its packages are the required ones."""
     version = ".".join(map(str, facts.python))
     found = f"{version} ({facts.executable})"
-    if not (3, 11) <= facts.python <= (3, 12):
-        yield note("Python", f"{found}: tested with 3.11 and 3.12; PYTHON=python3.11 make setup")
+    if not (3, 11) <= facts.python <= (3, 13):
+        yield note("Python", f"{found}: tested with 3.11 to 3.13; PYTHON=python3.11 make setup")
     elif facts.venv_outdated:
         yield fix("Python", ".venv was made from other requirements than the present ones: run make setup")
     else:
@@ -185,7 +185,9 @@ def datasets(facts: Facts) -> Iterator[Finding]:
     """The datasets that the config names."""
     for dataset in facts.datasets:
         topic = f"dataset {dataset.name}"
-        if dataset.root is not None:
+        if dataset.missing_package:
+            yield fix(topic, dataset.missing_package)
+        elif dataset.root is not None:
             yield ok(topic, f"found in {dataset.root}")
         elif dataset.generated:
             yield ok(topic, "not there yet: the workflow generates it when needed")

@@ -1,6 +1,7 @@
 """The location of the files of nuScenes."""
 
 import json
+from importlib.util import find_spec
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
@@ -17,6 +18,16 @@ HOW_TO_GET_IT = (
 HOW_TO_GET_MINI = (
     "`snakemake --cores 1 download_nuscenes_mini` fetches it, where you accept nuScenes' terms (docs/data.md); or "
 )
+
+
+def missing_package() -> str | None:
+    """The package that reading tables needs and this Python lacks, with what to do; None if it is installed."""
+    if find_spec("nuscenes") is not None:
+        return None
+    return (
+        "nuscenes-devkit, which reads these tables, is not installed: pip install --no-deps 'nuscenes-devkit>=1.2,<2' "
+        "(it asks for numpy < 2 without need)"
+    )
 
 
 def how_to_get_it(version: str) -> str:

@@ -27,6 +27,7 @@ from drivesplat.readers.checks import (
     require_increasing,
 )
 from drivesplat.readers.drive_checks import chain, require_microseconds
+from drivesplat.readers.nuscenes.layout import missing_package
 from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.readers.nuscenes.row_checks import check_rows
 from drivesplat.readers.nuscenes.scene_tables import PREFIX, damaged, read_scene_tables, scene_file, write_scene_tables
@@ -131,6 +132,8 @@ def _calibration(tables: Any, sample_data: str) -> dict:
 
 def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
     """nuscenes-devkit's view of the tables, reduced to one scene."""
+    if missing := missing_package():
+        raise DatasetError(missing)
     from nuscenes.nuscenes import NuScenes
 
     with TemporaryDirectory() as folder:
