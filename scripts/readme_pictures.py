@@ -1,4 +1,4 @@
-"""Pictures of the documentation, composed from films of benchmarks/worlds/film.yaml: drive.webp, the README's moving
+"""Pictures of the documentation, composed from films of benchmarks/film.yaml: drive.webp, the README's moving
 picture, and ghosts.webp of docs/ghosts.md.
 
 python scripts/readme_pictures.py [results/film/demo] [docs/images]

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import pickle
 import sys
 from argparse import Namespace
 from pathlib import Path
@@ -99,7 +100,8 @@ def trained_by_rule(drive: EvaluationData, job: TrainJob, folder: Path) -> Splat
 def in_one_file(drive: EvaluationData, **arguments: Any) -> tuple[street.Street, list[street.View]]:
     """The untrained model of street.py and the training images."""
     assert drive.masks is not None
-    folder, record = drive.masks.parent, drive.record.to_plain()
+    folder = drive.masks.parent
+    record = pickle.loads((folder / "parser.pkl").read_bytes())
     views = street.read_views(folder, record, record["splits"]["train"], CPU)
     actors = [actor for actor in street.read_actors(folder / "actors.npz").actors if "actors" in actor.parts]
     return street.Street(record, actors, views, Namespace(**{**ARGUMENTS, **arguments})), views
@@ -107,7 +109,7 @@ def in_one_file(drive: EvaluationData, **arguments: Any) -> tuple[street.Street,
 
 def psnrs(model: street.Street, drive: EvaluationData, group: str) -> dict[str, float | None]:
     assert drive.masks is not None
-    record = drive.record.to_plain()
+    record = pickle.loads((drive.masks.parent / "parser.pkl").read_bytes())
     images = [i for i in record["splits"][group] if record["is_key_frame"][i]]
     return street.evaluate(model, street.read_views(drive.masks.parent, record, np.array(images), CPU))
 

@@ -120,7 +120,7 @@ def _rendered_frames(scene: Scene, camera: str, change: EgoEdit | None, job: Dri
         camera_to_world = displaced(camera_to_world, ego_to_world, trajectory)
         ego_to_world = displaced(ego_to_world, ego_to_world, aside)
     rendered = []
-    for frame, camera_pose, ego_pose in zip(frames, camera_to_world, ego_to_world, strict=True):
+    for frame, camera_pose, pose_of_ego in zip(frames, camera_to_world, ego_to_world, strict=True):
         size = target_size(frame, job.images if job.width is None else ImageSettings(width=job.width))
         intrinsics = continuous_intrinsics(frame, size)
         intrinsics[:2, 2] -= 0.5
@@ -131,7 +131,7 @@ def _rendered_frames(scene: Scene, camera: str, change: EgoEdit | None, job: Dri
             height=size[1],
             intrinsics=intrinsics,
             camera_to_world=camera_pose,
-            ego_to_world=ego_pose,
+            ego_to_world=pose_of_ego,
         )
         rendered.append(moved)
     return rendered

@@ -1,7 +1,5 @@
 """The static world: one set of Gaussians, fixed in world coordinates."""
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -39,7 +37,9 @@ class Background(Part):
         return cls(init_params(positions, colors, settings, classes, lidar_logits, offsets), settings, extent)
 
     def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
-        p, q = self.params, self._where_lidar_sees() if want.lidar else self.params
+        p = q = self.params
+        if want.lidar and "lidar_means" in p:  # a LiDAR may see the geometry elsewhere than cameras do
+            q = {name: p[name] + p[offset] for name, offset in OFFSETS.items()}
         return Gaussians(
             q["means"],
             q["quats"],
@@ -48,11 +48,6 @@ class Background(Part):
             *((p["sh0"], p["shN"]) if want.colors else no_colors(p["means"])),
             lidar_logits=p.get("lidar_logits") if want.lidar else None,
         )
-
-    def _where_lidar_sees(self) -> Mapping[str, Tensor]:
-        """The parameters of geometry as a LiDAR sees it, which cameras may see elsewhere."""
-        p = self.params
-        return {name: p[name] + p[offset] for name, offset in OFFSETS.items()} if "lidar_means" in p else p
 
     def learning_rates(self) -> dict[str, float]:
         return learning_rates(self._settings, self.extent)

@@ -28,12 +28,13 @@ from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.densify import Densifier
 from drivesplat.training.floaters import EmptySpace, SensorPath, fade_in_empty_space
 from drivesplat.training.graphs.captured_steps import CapturedSteps
+from drivesplat.training.losses import Terms
 from drivesplat.training.monitor import FiniteGuard, Monitor, camera_figures
 from drivesplat.training.optimizers import DeviceSchedule, ParameterAverage, make_optimizers
 from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, curve_psnrs
 from drivesplat.training.scans import TrainingScan, scan_index
 from drivesplat.training.schedule import Schedule
-from drivesplat.training.step import ITERATION, UNTIMED, Clock, Terms, TrainingState
+from drivesplat.training.step import ITERATION, UNTIMED, Clock, TrainingState
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)

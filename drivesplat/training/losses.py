@@ -22,6 +22,8 @@ from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.views import LidarDepth, TrainingView
 
+Terms = dict[str, Float[Tensor, ""]]
+"""The weighted terms of a loss, by name."""
 Means = dict[str, tuple[float, Float[Tensor, ""]]]
 """Weights and means of the terms of a loss, by name."""
 MIN_DEPTH = 1.0

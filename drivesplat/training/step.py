@@ -17,15 +17,13 @@ from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN, ModelStates, want_of
 from drivesplat.training.augmentation import mirrored_at_random, with_dropout
-from drivesplat.training.losses import loss_terms, surface_terms
+from drivesplat.training.losses import Terms, loss_terms, surface_terms
 from drivesplat.training.monitor import FiniteGuard, readable
 from drivesplat.training.optimizers import DeviceSchedule, ModelOptimizers, choose_learned, set_learning_rates
 from drivesplat.training.scans import TrainingScan, scan_terms
 from drivesplat.training.schedule import Schedule
 from drivesplat.training.views import TrainingView
 
-Terms = dict[str, Float[Tensor, ""]]
-"""The weighted terms of a loss, by name."""
 ITERATION = "iteration"
 """The stage that holds all others."""
 

@@ -18,13 +18,12 @@ from helpers.hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_e
 from helpers.patience import PATIENCE_S
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
-from benchmarks.quality.__main__ import main, measure
+from benchmarks.quality.__main__ import main
 from benchmarks.quality.compare import quality
 from benchmarks.quality.recipes import RecipeFile
-from benchmarks.quality.results import Result, collect_results
+from benchmarks.quality.results import collect_results
 from benchmarks.quality.table import markdown
 from benchmarks.snakemake_run import Outcome, SnakemakeRun
-from drivesplat.errors import ConfigError
 
 BAD = {"overrides": {"sky": "none"}}
 
@@ -102,40 +101,6 @@ def test_the_page_has_a_table_for_each_group_and_one_of_costs(compared):
     ]  # fmt: skip
 
 
-def test_the_page_says_how_it_was_measured_and_what_the_recipes_are(compared):
-    text = markdown(compared(EVALS, {**TWO, "street": {"of": "street", "overrides": {"train": {"depth_weight": 0.5}}}}))
-    (line,) = (line for line in text.splitlines() if line.startswith("Scene 0061"))
-    for words in (
-        "of nuscenes (v1.0-mini)", "CAM_FRONT at 640x360", "key frames 4, 12, 20, 28 between training frames",
-        "35 to 38 beyond the last training frame", "poses: nuscenes", "15,000 iterations", "NVIDIA H200",
-        "random seeds 0, 1.",
-    ):  # fmt: skip
-        assert words in line, words
-    assert "- `street`: of `street`, overrides `{train: {depth_weight: 0.5}}`" in text
-    assert "Shared" not in text and "failed" not in text and "depth error" not in text
-
-
-def test_depth_error_and_lpips_have_columns_only_if_measured(compared):
-    evals = json.loads(json.dumps(EVALS))
-    for content, error in zip(evals["street"], (0.02, 0.04), strict=True):
-        content["result"]["interpolation"] |= {"depth": {"median_relative_error": error, "pixels": 9}}
-        content["result"]["interpolation"]["all"]["lpips"] = 0.25
-    between, beyond, _ = rows(markdown(compared(evals, TWO)))
-    assert between[0][-3:] == ["SSIM", "LPIPS", "depth error"]
-    assert [line[-2:] for line in between[2:]] == [["-", "-"], ["0.250", "3.0%"]]
-    assert beyond[0][-1] == "gap"
-
-
-def test_moving_people_have_a_column_only_if_measured(compared):
-    evals = json.loads(json.dumps(EVALS))
-    for content, psnr in zip(evals["plain"], (15.0, 16.0), strict=True):
-        content["result"]["interpolation"]["moving_human"] = {"psnr": psnr}
-    between, beyond, _ = rows(markdown(compared(evals, TWO)))
-    assert between[0][-2:] == ["moving people", "SSIM"]
-    assert [line[-2] for line in between[2:]] == ["15.5", "-"]
-    assert "moving people" not in beyond[0]
-
-
 def test_figures_against_the_truth_have_tables_of_their_own(compared):
     evals = json.loads(json.dumps(EVALS))
     for seed, content in enumerate(evals["street"]):
@@ -194,36 +159,6 @@ def test_results_measured_under_another_protocol_get_their_own_table(compared, k
     assert len(re.findall("^Difference|Difference from `other`", text)) == 1
 
 
-@pytest.mark.parametrize(
-    ("change", "cells"),
-    [
-        ({"sweeps": True, "train_images": 186}, ["186", "yes", "nuscenes"]),
-        ({"poses": "refined"}, ["31", "no", "refined"]),
-        ({"cameras": ["CAM_FRONT", "CAM_BACK"], "train_images": 62}, ["62", "no", "nuscenes"]),
-    ],
-)
-def test_rows_state_the_training_data_of_their_recipe(compared, change, cells):
-    evals = {**EVALS, "street": [evaluation(26.0, 21.0, protocol=change)] * 2}
-    record = compared(evals, TWO)
-    (table,) = record["tables"]
-    assert table["rows"][1]["trained_on"].items() >= change.items()
-    text = markdown(record)
-    assert rows(text)[-1][3][2:5] == cells and rows(text)[-1][2][2:5] == ["31", "no", "nuscenes"]
-    assert ("poses: nuscenes, refined" in text) == ("poses" in change)
-
-
-def test_times_of_trainings_that_shared_a_gpu_are_marked(tmp_path):
-    file, _ = recipe_file(tmp_path, recipes=TWO)
-    results = [
-        Result(recipe, seed, tmp_path, {**content, "provenance": {}}, shared=(recipe, seed) == ("street", 1))
-        for recipe in TWO
-        for seed, content in enumerate(EVALS[recipe])
-    ]
-    text = markdown(quality(file, results))
-    assert [line[7] for line in rows(text)[2][2:]] == ["60 s", "110 s, shared"]
-    assert "\n\nShared: during training another job ran on the same GPU" in text
-
-
 def test_a_failed_recipe_is_listed_with_its_reason_beside_the_others(compared):
     record = compared({**EVALS, "bad": [None, None]}, {**TWO, "bad": BAD})
     assert [(item["recipe"], item["seed"]) for item in record["failed"]] == [("bad", 0), ("bad", 1)]
@@ -231,29 +166,6 @@ def test_a_failed_recipe_is_listed_with_its_reason_beside_the_others(compared):
     assert between[4] == ["`bad`", r"failed: train: a loss \| no number", "", "", "", "", ""] and len(beyond) == 5
     assert [line[0] for line in costs[2:]] == ["`plain`", "`street`"]
     assert "- `bad`, seed 1: train: a loss | no number" in markdown(record)
-
-
-def test_a_failed_seed_does_not_remove_the_other_seeds_of_its_recipe(compared):
-    evals = {"plain": EVALS["plain"], "street": [None, EVALS["street"][1]]}
-    record = compared(evals, TWO)
-    street = record["tables"][0]["rows"][1]
-    assert (street["seeds"], street["interpolation"]["static"]["by_seed"]) == ([1], [None, 27.0])
-    assert street["interpolation"]["difference"]["static"] == {
-        "mean": 2.0, "standard_error": None, "by_seed": [None, 2.0]
-    }  # fmt: skip
-    text = markdown(record)
-    assert rows(text)[2][3][:2] == ["`street`", "1"] and "- `street`, seed 0: " in text
-    assert "failed:" not in text, "it has a row of figures"
-
-
-def test_if_the_first_recipe_failed_differences_name_their_reference(compared):
-    record = compared({"bad": [None, None], **EVALS}, {"bad": BAD, **TWO})
-    assert record["tables"][0]["reference"] == "plain" and "Difference from `plain`" in markdown(record)
-
-
-def test_if_all_recipes_failed_the_page_gives_the_reasons(compared):
-    text = markdown(compared({"plain": [None, None], "street": [None, None]}, TWO))
-    assert "Nothing was measured." in text and text.count("a loss | no number") == 4 and "| ---" not in text
 
 
 def test_the_record_holds_the_figures_and_source_of_every_seed(compared):
@@ -301,30 +213,6 @@ def test_the_command_passes_arguments_to_snakemake_and_writes_page_and_record(ca
     page = (tmp_path / "out/quality.md").read_text(encoding="utf-8")
     record = json.loads((tmp_path / "out/quality.json").read_text())
     assert page == markdown(record) and page in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(("done", "status", "expected"), [(("plain",), 0, 1), (("plain", "street"), 7, 7)])
-def test_the_exit_status_is_zero_only_if_all_results_exist(called, done, status, expected):
-    assert called(["--", "--cores", "4"], done, status)[0] == expected
-
-
-def test_a_dry_run_writes_nothing(called, tmp_path):
-    assert called(["--", "-n"], done=())[0] == 0
-    assert not list((tmp_path / "out").glob("quality.*"))
-
-
-def test_the_output_folder_is_named_after_the_recipe_file_by_default(monkeypatch, capsys):
-    places = []
-    monkeypatch.setattr(
-        "benchmarks.quality.__main__.measure", lambda file, out, words, workflow: places.append(out) or 0
-    )
-    assert main(["a/mine.yaml"]) == main(["a/mine.yaml", "--out", "there", "--", "-n"]) == 0
-    assert places == [Path("results/quality/mine"), Path("there")]
-
-
-def test_a_folder_without_a_snakefile_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="no Snakefile"):
-        measure(tmp_path / "recipes.yaml", tmp_path, [], tmp_path)
 
 
 # --- from end to end ---

@@ -10,7 +10,7 @@ from helpers import REPOSITORY
 from benchmarks.quality.recipes import plan_runs, read_recipes
 from benchmarks.snakemake_run import SnakemakeRun
 from drivesplat.errors import ConfigError
-from drivesplat.settings.config import load, merged
+from drivesplat.settings.config import load
 from drivesplat.workflow.stages import stage_settings
 
 DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
@@ -50,14 +50,6 @@ def test_a_method_of_the_config_is_unchanged_except_for_its_seed(runs):
         assert settings_of(run, "train", f"{name}-seed1") == expected | {"random_seed": 1}
 
 
-def test_the_run_file_merged_over_config_yaml_equals_the_planned_config(runs):
-    """Snakemake merges the run's file over config.yaml; `merged` does the same."""
-    made = runs(recipes={"street": {"of": "street"}, "more": {"of": "street", "config": {"sweeps": True}}})
-    for run in made:
-        written = yaml.safe_load(yaml.safe_dump(run.overlay))
-        assert load(merged(DEFAULTS, written)) == run.plan.config
-
-
 def test_parts_and_overrides_replace_those_of_the_base_method(runs):
     recipes = {
         "bare": {"of": "street", "parts": ["background"], "overrides": {"sky": "none", "train": {"depth_weight": 0.0}}},
@@ -87,30 +79,6 @@ def test_recipes_share_a_folder_where_their_scene_is_the_same(runs, tmp_path):
     assert plain == "plain" and swept.startswith("sweeps-") and small.startswith("images-lidar_seed-")
     alone = runs(recipes={"renamed": recipes["small"], "other": recipes["swept"]})
     assert {run.folder.name for run in alone} == {small, swept}, "folders depend on no other recipe"
-
-
-def test_base_files_lie_under_the_recipes_in_order(runs, tmp_path):
-    first = {"holdout": {"every_nth": 4, "offset": 2}, "methods": {"third": {"overrides": {"sky": "mask"}}}}
-    second = {"holdout": {"offset": 1}, "train": {"iterations": 77}}
-    for name, content in (("a.yaml", first), ("b.yaml", second), ("empty.yaml", None)):
-        (tmp_path / name).write_text(yaml.safe_dump(content) if content else "")
-    base = [str(tmp_path / name) for name in ("a.yaml", "b.yaml", "empty.yaml")]
-    recipes = {"third": {"of": "third"}, "long": {"of": "third", "overrides": {"train": {"iterations": 99}}}}
-    (run,) = runs(base=base, recipes=recipes)
-    config = run.plan.config
-    assert (config.holdout.every_nth, config.holdout.offset, config.holdout.last_block) == (4, 1, 4)
-    iterations = [settings_of(run, "train", f"{name}-seed0")["train"]["iterations"] for name in recipes]
-    assert iterations == [77, 99] and settings_of(run, "train", "third-seed0")["sky"] == "mask"
-
-
-def test_recipe_settings_take_precedence_over_dataset_settings(runs):
-    """The demo dataset sets 1,000 iterations and 25,000 LiDAR points, which override the general settings."""
-    recipes = {"vanilla": {}, "few": {"config": {"lidar_seed": {"max_points": 200}}}}
-    plain, few = runs(scene="demo", config={"train": {"iterations": 7}}, recipes=recipes)
-    assert settings_of(plain, "train", "vanilla-seed0")["train"]["iterations"] == 7
-    assert settings_of(plain, "train", "vanilla-seed0")["train"]["cap_max"] == 40_000
-    seeds = [settings_of(run, "lidar_seed")["lidar_seed"] for run in (plain, few)]
-    assert [(seed["max_points"], seed["far_points"]) for seed in seeds] == [(25_000, 8_000), (200, 8_000)]
 
 
 @pytest.mark.parametrize(
@@ -163,28 +131,6 @@ def test_recipes_with_identical_trainings_are_refused(runs, again):
     """Vanilla has no actors; no sweeps are the default."""
     with pytest.raises(ConfigError, match="'vanilla' and 'again' train the same on scene 0061"):
         runs(recipes={"vanilla": {}, "again": again})
-
-
-def test_recipes_on_different_copies_of_a_dataset_differ(runs):
-    other = {"config": {"datasets": {"nuscenes": {"dataroot": "elsewhere"}}}}
-    assert len(runs(recipes={"vanilla": {}, "other": other})) == 2
-
-
-def test_two_synthetic_worlds_in_one_folder_are_refused(runs):
-    """Each run would overwrite the other's world and make its results stale."""
-    night = {"datasets": {"demo": {"world": {"night": True}}}}
-    with pytest.raises(ConfigError, match=r"'day' and 'night' make different worlds in resources/demo; .* own$"):
-        runs(scene="demo", recipes={"day": {}, "night": {"config": night}})
-    with pytest.raises(ConfigError, match=r", or set world\.cameras and world\.sweeps to the same sensors in both$"):
-        runs(scene="demo", recipes={"day": {}, "swept": {"config": {"sweeps": True}}})
-    apart = merged(night, {"datasets": {"demo": {"dataroot": "resources/night"}}})
-    assert len(runs(scene="demo", recipes={"day": {}, "night": {"config": apart}})) == 2
-
-
-def test_recipes_that_name_what_a_world_records_anyway_are_the_same(runs):
-    named = {"config": {"datasets": {"demo": {"world": {"sweeps": []}}}}}
-    with pytest.raises(ConfigError, match="'day' and 'named' train the same on scene demo"):
-        runs(scene="demo", recipes={"day": {}, "named": named})
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks/recipes").glob("*.yaml")), ids=lambda path: path.name)

@@ -1,12 +1,9 @@
 """Timed trainings: the planned trainings, the tables, and the command end to end."""
 
-import dataclasses
 import json
 import os
 import re
-import time
 from pathlib import Path
-from threading import Barrier
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,22 +11,19 @@ import pytest
 import torch
 import yaml
 from helpers import REPOSITORY
-from helpers.patience import PATIENCE_S
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
-from benchmarks.snakemake_run import Outcome, SnakemakeRun
 from benchmarks.speed import __main__ as command
-from benchmarks.speed import curves, runs
+from benchmarks.speed import runs
 from benchmarks.speed.compare import speed
 from benchmarks.speed.cpu_load import CpuSample, busy_elsewhere
 from benchmarks.speed.own_process import run_in_process
 from benchmarks.speed.plan import Task, plan_run, read_speed_file, targets_of, tasks_of
 from benchmarks.speed.settings import SpeedFile
 from benchmarks.speed.table import markdown
-from drivesplat.errors import ConfigError, DeviceError, TrainingError
+from drivesplat.errors import ConfigError, TrainingError
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.settings.config import load, merged
-from drivesplat.training.probes import NO_PROBES
 from drivesplat.training.stage import TrainingFiles, read_inputs, run_training
 from drivesplat.workflow.stages import stage_settings
 
@@ -72,12 +66,6 @@ def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_pa
     }  # fmt: skip
 
 
-def test_the_files_config_takes_precedence_over_dataset_settings(tmp_path):
-    """The demo dataset sets a cap of 40,000 Gaussians and 1,000 iterations."""
-    _, (task, _) = planned(tmp_path, scene="demo", iterations=[9], seeds=[0], config={"train": {"cap_max": 123}})
-    assert (task.train.train.cap_max, task.iterations) == (123, 9)
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -106,19 +94,6 @@ def test_errors_are_reported_in_one_line(tmp_path, content, words):
         plan_run(read_speed_file(path, {}), tmp_path / "out", REPOSITORY)
     message = str(failure.value)
     assert "\n" not in message and all(word in message for word in words), message
-
-
-def test_command_line_arguments_replace_the_files_values(tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(command, "measure", lambda *args: seen.append(args) or 0)
-    path = str(REPOSITORY / "benchmarks/speed/demo_1600.yaml")
-    assert command.main([path, "--iterations", "5", "6", "--seeds", "9", "--", "--cores", "3"]) == 0
-    assert command.main([path, "--out", "there"]) == 0
-    (short, out, words, *_), (whole, there, none, *_) = seen
-    assert (short.iterations, short.seeds, out, words) == (
-        (5, 6), (9,), Path("results/speed/demo_1600"), ["--cores", "3"]
-    )  # fmt: skip
-    assert (whole.iterations, whole.seeds, there, none) == ((30_000, 7_000), (0, 1, 2), Path("there"), [])
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks/speed").glob("*.yaml")), ids=lambda path: path.name)
@@ -184,16 +159,6 @@ def test_the_table_gives_times_with_the_quality_reached():
     assert json.loads(json.dumps(record, allow_nan=False)) == record and record["runs"] == RUNS
 
 
-def test_variants_of_the_plain_recipe_are_compared_with_it():
-    file = TWO.model_copy(update={"baselines": ("plain", "plain_sky"), "seeds": (0,)})
-    assert speed(file, RUNS, [])["tables"] == [], "not every recipe has run"
-    (table,) = speed(file, [*RUNS, ended("plain_sky", 0, 90.0, 24.0)], [])["tables"]
-    assert [row["recipe"] for row in table["rows"]] == ["plain", "plain_sky", "ours"]
-    sky = table["rows"][1]
-    assert sky["times_as_fast"]["loop"]["mean"] == pytest.approx(60.0 / 90.0)
-    assert sky["interpolation"]["difference"]["static"]["by_seed"] == [4.0]
-
-
 def points(*of: tuple[float, float]) -> list[dict[str, float]]:
     return [{"iteration": 10 * i, "seconds": seconds, "static": psnr} for i, (seconds, psnr) in enumerate(of, 1)]
 
@@ -222,40 +187,6 @@ def test_the_table_gives_the_time_to_quality():
     assert "Time to quality" not in markdown(speed(TWO, RUNS, []))
 
 
-def test_the_page_says_that_the_plain_recipe_is_handicapped_without_fused_ssim():
-    assert "handicapped" not in markdown(speed(TWO, RUNS, []))
-    slow = [{**run, "ssim": "torch"} if run["recipe"] == "plain" else run for run in RUNS]
-    page = markdown(speed(TWO, slow, []))
-    assert page.index("handicapped") < page.index("Scene 0061 of nuscenes"), "in its first line"
-    on_cpu = [{**run, "peak_gpu_memory_gb": None} for run in slow]
-    assert "handicapped" not in markdown(speed(TWO, on_cpu, [])), "the example needs a GPU for it"
-
-
-def test_only_seeds_run_by_both_recipes_count():
-    (table,) = speed(TWO, RUNS[:3], [])["tables"]
-    assert table["seeds"] == [0] and table["rows"][1]["loop"]["by_seed"] == [30.0]
-    assert speed(TWO, RUNS[:1], [])["tables"] == []
-    assert "Nothing was measured." in markdown(speed(TWO, RUNS[:1], []))
-
-
-def test_the_page_says_how_it_was_measured():
-    text = markdown(speed(TWO, RUNS, []))
-    (line,) = (line for line in text.splitlines() if line.startswith("Scene 0061"))
-    for words in (
-        "of nuscenes (v1.0-mini)", "CAM_FRONT at 640x360", "31 training images", "at most 5,000 Gaussians",
-        "NVIDIA H200, 16 processors", "SSIM of `plain`: fused_ssim", "random seeds 0, 1.",
-    ):  # fmt: skip
-        assert words in line, words
-    assert "Other programs" not in text and "Milliseconds" not in text
-
-
-def test_other_load_on_the_processors_is_reported():
-    text = markdown(speed(TWO, [*RUNS[:3], ended("plain", 1, 50.0, 22.0, busy_elsewhere=4.04)], []))
-    assert "up to 4.0 of the 16 processors busy" in text
-    unknown = [{**run, "busy_elsewhere": None} for run in RUNS]
-    assert "Other programs" not in markdown(speed(TWO, unknown, []))
-
-
 def shares(**of: tuple[float, float]) -> dict[str, dict[str, float]]:
     return {name: {"device_ms": device, "host_ms": host} for name, (device, host) in of.items()}
 
@@ -274,13 +205,6 @@ def test_the_table_compares_stages_by_their_share_of_the_iteration():
     ]  # fmt: skip
 
 
-def test_on_a_gpu_the_table_also_gives_host_time():
-    ours = shares(render=(4.0, 1.0), other=(1.0, 0.5), iteration=(5.0, 1.5))
-    text = markdown(speed(TWO, RUNS, [{"recipe": "ours", "iterations": 300, "stages": ours}]))
-    assert rows(text)[2][0] == ["stage", "`vanilla`", "`vanilla`, Python"]
-    assert rows(text)[2][2] == ["render", "4.00 (80%)", "1.00 (67%)"]
-
-
 # --- runs ---
 
 
@@ -289,26 +213,6 @@ def test_the_load_of_other_processes_is_measured():
     assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 118.0, 8.0)) == pytest.approx(1.2)
     assert busy_elsewhere(CpuSample(5.0, None, 2.0), CpuSample(15.0, None, 8.0)) is None
     assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 101.0, 8.0)) == 0.0, "its own, counted twice"
-
-
-def test_the_load_of_this_process_does_not_count_as_other_load(tmp_path, monkeypatch):
-    """This process's work counts as `own`; the kernel's statistics are converted from ticks."""
-    before = CpuSample.now()
-    sum(i * i for i in range(3_000_000))
-    assert CpuSample.now().own - before.own > 0.05
-    statistics = tmp_path / "stat"
-    statistics.write_text("cpu  200 100 300 5000 700 10 90 0 0 0\ncpu0 1 1 1 1 1 1 1 0 0 0\n")
-    monkeypatch.setattr("benchmarks.speed.cpu_load.STATISTICS", statistics)
-    monkeypatch.setattr("os.sysconf", lambda name: 100)
-    assert CpuSample.now().busy == 7.0, "neither idle nor waiting for disks"
-    monkeypatch.setattr("benchmarks.speed.cpu_load.STATISTICS", tmp_path / "none")
-    assert CpuSample.now().busy is None
-
-
-def test_a_subprocess_passes_on_results_and_exceptions():
-    assert run_in_process(divmod, 7, 2) == (3, 1)
-    with pytest.raises(ConfigError, match="cannot be read"):
-        run_in_process(read_speed_file, "nowhere.yaml", {})
 
 
 def test_a_killed_training_is_reported_in_one_line():
@@ -378,18 +282,6 @@ def assert_curve_ends_at_result(run: dict[str, Any]) -> None:
 @pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("speed")
-def test_our_curve_ends_at_the_result_but_for_colours_that_follow_the_last_iteration(measured, tmp_path, monkeypatch):
-    monkeypatch.chdir(measured.folder)
-    monkeypatch.setattr("drivesplat.training.stage.fill_unseen", lambda model, views: None)
-    file, out = read_speed_file("tiny.yaml", {}), Path("results/speed/tiny")
-    *_, task = tasks_of(file, plan_run(file, out, Path()), out)
-    assert task.recipe == "ours"
-    assert_curve_ends_at_result(runs.run(dataclasses.replace(task, folder=tmp_path)))
-
-
-@pytest.mark.slow
-@pytest.mark.workflow
-@pytest.mark.xdist_group("speed")
 def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkeypatch):
     """Both call the same function, and equal settings and files give the same model."""
     script = (REPOSITORY / "workflow_scripts/train.py").read_text()
@@ -412,58 +304,3 @@ def test_the_packed_recipe_is_refused_without_a_gpu_before_anything_is_trained(t
     monkeypatch.setattr(command, "visible_gpus", lambda: 0)
     with pytest.raises(ConfigError, match="plain_packed needs a GPU"):
         command.measure(file, tmp_path, (), REPOSITORY, cards=0)
-
-
-def test_stops_do_not_count(monkeypatch):
-    """Neither in the seconds of a point nor in the whole time of a training."""
-    monkeypatch.setattr(curves, "static_psnr", lambda *_: time.sleep(0.2) or 20.0)
-    curve = curves.QualityCurve([])
-    for step in (1, 2):
-        curve.see(step, 0.5 * step, None)
-    assert curve.points == [{"iteration": i, "seconds": 0.5 * i, "static": 20.0} for i in (1, 2)]
-    assert curve.spent == pytest.approx(0.4, abs=0.1)
-
-
-def test_the_packed_recipe_is_refused_on_a_cpu(tmp_path):
-    _, tasks = planned(tmp_path, scene="demo", seeds=[0], iterations=[3], baselines=["plain", "plain_packed"])
-    with pytest.raises(DeviceError, match=r"plain_packed: .* needs a GPU; drop it from baselines"):
-        runs.plain(tasks[1], torch.device("cpu"), [], NO_PROBES)
-
-
-def test_nothing_is_trained_if_snakemake_fails_or_only_plans(tmp_path, monkeypatch):
-    monkeypatch.chdir(REPOSITORY)
-    file = SpeedFile(scene="demo", iterations=(3,), seeds=(0,))
-    for arguments, status in ((["-n"], 0), (["--cores", "1"], 7)):
-        monkeypatch.setattr(SnakemakeRun, "start", lambda *_, status=status: Outcome(status))
-        assert command.measure(file, tmp_path / "out", arguments, Path()) == status
-    assert not (tmp_path / "out").exists()
-
-
-def test_seeds_are_trained_in_parallel_on_several_gpus(tmp_path, monkeypatch):
-    file, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
-    assert command.in_series(tasks, 1) == [tasks]
-    assert [{task.seed for task in series} for series in command.in_series(tasks, 2)] == [{4}, {5}]
-    monkeypatch.setattr(command, "visible_gpus", lambda: 2)
-    monkeypatch.setattr(SnakemakeRun, "start", lambda *_: Outcome(0))
-    monkeypatch.setattr(command, "write", lambda record, _: record["runs"])
-    monkeypatch.setattr(command, "speed", lambda _, measured, profiles: {"runs": list(measured)})
-    both, trained = Barrier(2, timeout=PATIENCE_S), []
-
-    def in_turn(function, task, *_):
-        if task.seed not in [seed for seed, *_ in trained]:
-            both.wait()
-        trained.append((task.seed, task.iterations, task.recipe))
-        return {"loop": 1.0} if function is runs.run else {}
-
-    monkeypatch.setattr(command, "run_in_process", in_turn)
-    assert command.measure(file, tmp_path, (), REPOSITORY, cards=2) == 0
-    order = [(task.seed, task.iterations, task.recipe) for task in tasks]
-    assert [it for it in trained[:8] if it[0] == 5] == [it for it in order if it[0] == 5]
-    assert sorted(trained[:8]) == sorted(order)
-    with pytest.raises(ConfigError, match="--cards 3: there are 2 GPUs"):
-        command.measure(file, tmp_path, (), REPOSITORY, cards=3)
-
-
-def test_a_folder_without_a_snakefile_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="no Snakefile"):
-        command.measure(SpeedFile(scene="demo"), tmp_path, [], tmp_path)

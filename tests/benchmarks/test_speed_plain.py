@@ -1,12 +1,6 @@
 """The plain recipe follows gsplat's example trainer in its configuration `mcmc`."""
 
-import dataclasses
 import math
-import sys
-import time
-from itertools import pairwise
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,13 +20,12 @@ from benchmarks.speed.plain import (
     make_sky,
     scene_scale,
 )
-from benchmarks.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
+from benchmarks.speed.plain_images import ImageFiles, endless, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
-from benchmarks.speed.plain_training import PlainTraining, _visible, fit
+from benchmarks.speed.plain_training import PlainTraining, fit
 from drivesplat.io.checkpoint_file import load
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.probes import Probes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CPU = torch.device("cpu")
@@ -80,11 +73,6 @@ def test_the_full_schedule_equals_that_of_the_example():
     assert [schedule.sh_degree(step) for step in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
 
 
-def test_a_shorter_schedule_scales_in_proportion():
-    assert Schedule.of(7_000) == Schedule(7_000, sh_every=233, refine_start=116, refine_stop=5_833)
-    assert Schedule.of(3).sh_degree(2) == 2
-
-
 @pytest.mark.parametrize(("iterations", "start", "stop"), [(30_000, 500, 25_000), (15_000, 250, 12_500)])
 def test_densification_follows_the_example(iterations, start, stop):
     strategy = PlainRecipe(Schedule.of(iterations), cap_max=1234, seed=0).strategy()
@@ -118,48 +106,7 @@ def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(record):
     assert splats["shN"].shape == (60, 15, 3) and not splats["shN"].any()
 
 
-def test_coincident_seed_points_give_finite_scales(record):
-    splats = init_splats(np.zeros((6, 3)), record.points_rgb[:6], seed=0)
-    assert torch.isfinite(splats["scales"]).all()
-
-
 # --- its images ---
-
-
-def test_every_epoch_decodes_each_image_once_in_random_order(record):
-    images = images_of(record)
-    recorded = [np.asarray(Image.open(record.image_paths[i]), dtype=np.float32) for i in (0, 1, 2, 4)]
-    torch.manual_seed(0)
-    data = endless(loader_of(images, 0, CPU))
-    seen = []
-    for _ in range(3 * len(images)):
-        batch = next(data)
-        (which,) = [i for i, pixels in enumerate(recorded) if np.array_equal(batch["image"][0].numpy(), pixels)]
-        assert batch["camtoworld"][0, 0, 3] == pytest.approx(0.2 * (0, 1, 2, 4)[which])
-        seen.append(which)
-    epochs = [seen[start : start + 4] for start in (0, 4, 8)]
-    assert all(sorted(epoch) == [0, 1, 2, 3] for epoch in epochs) and len({tuple(epoch) for epoch in epochs}) > 1
-
-
-def test_worker_processes_decode_the_images_as_in_the_example(record):
-    loader = loader_of(images_of(record), 2, CPU)
-    assert (loader.num_workers, loader.persistent_workers, loader.batch_size) == (2, True, 1)
-    assert loader.multiprocessing_context.get_start_method() == "fork", "in a spawned process, too: no import of torch"
-    data = endless(loader)
-    assert [next(data)["image"].shape for _ in range(5)] == [(1, HEIGHT, WIDTH, 3)] * 5
-    assert PlainRecipe(Schedule.of(1), 1, 0).workers == 4
-
-
-def test_larger_images_are_resized_once_to_the_training_size(record, tmp_path):
-    assert files_of_size(record, tmp_path / "reduced") == [record.image_paths[i] for i in (0, 1, 2, 4)]
-    smaller = dataclasses.replace(record, image_sizes=np.tile([WIDTH // 2, HEIGHT // 2], (5, 1)))
-    paths = files_of_size(smaller, tmp_path / "reduced")
-    whole, half = (np.asarray(Image.open(path), dtype=float) for path in (record.image_paths[4], paths[3]))
-    means = whole.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
-    assert np.abs(half - means).max() <= 0.5
-    times = [Path(path).stat().st_mtime_ns for path in paths]
-    assert files_of_size(smaller, tmp_path / "reduced") == paths
-    assert [Path(path).stat().st_mtime_ns for path in paths] == times
 
 
 # --- its loss ---
@@ -174,19 +121,6 @@ def test_ssim_uses_only_windows_fully_inside_the_image():
     )
     batches = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (a, b)]
     assert float(torch_ssim(*batches)) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
-
-
-def test_fused_ssim_is_used_on_a_gpu_if_installed(monkeypatch):
-    calls = []
-    fused = SimpleNamespace(fused_ssim=lambda image, target, padding: calls.append(padding), __spec__=SimpleNamespace())
-    monkeypatch.setitem(sys.modules, "fused_ssim", fused)
-    chosen = chosen_ssim(torch.device("cuda"))
-    chosen.of(torch.zeros(1), torch.zeros(1))
-    assert (chosen.name, calls) == ("fused_ssim", ["valid"])
-    assert chosen_ssim(CPU).name == "torch"
-    monkeypatch.delitem(sys.modules, "fused_ssim")
-    monkeypatch.setattr("benchmarks.speed.plain_ssim.find_spec", lambda name: None)
-    assert chosen_ssim(torch.device("cuda")).name == "torch"
 
 
 def test_the_loss_equals_that_of_the_mcmc_example(record):
@@ -241,43 +175,6 @@ def test_the_training_converges_reaches_its_cap_and_writes_a_measurable_model(re
     assert kept["step"] == 220 and torch.equal(kept["splats"]["means"], splats["means"])
     after = as_model(kept["splats"], scene_scale(record))
     assert after.sky is None and off(after, record) < 0.7 * off(before, record)
-
-
-def test_a_sky_is_learned_behind_the_gaussians_where_it_is_wanted(record, tmp_path):
-    splats = init_splats(record.points, record.points_rgb, seed=0)
-    assert make_sky(VARIANTS["plain"], TrainSettings()) is None
-    sky = make_sky(VARIANTS["plain_sky"], TrainSettings(sky_resolution=16))
-    before = {name: value.clone() for name, value in sky.state_dict().items()}
-    recipe = PlainRecipe(Schedule(60, sh_every=1, refine_start=0, refine_stop=60), 64, 0, 0, VARIANTS["plain_sky"])
-    grey = off(as_model({name: value.detach().clone() for name, value in splats.items()}, 1.0, sky), record)
-    fit(splats, images_of(record), scene_scale(record), recipe, tmp_path, sky=sky)
-    kept = load(tmp_path / "ckpt.npz", rule="train")
-    again = make_sky(VARIANTS["plain_sky"], TrainSettings(sky_resolution=16))
-    again.load_state_dict(kept["sky"])
-    assert any(not torch.equal(value, before[name]) for name, value in again.state_dict().items())
-    assert off(as_model(kept["splats"], 1.0, again), record) < grey
-
-
-def test_visits_see_the_training_and_take_no_time(record, tmp_path, monkeypatch):
-    splats, seen = init_splats(record.points, record.points_rgb, seed=0), []
-
-    def see(step, seconds, model):
-        seen.append((step, seconds, off(model, record)))
-        away.append(3600.0)
-
-    recipe = PlainRecipe(Schedule(40, sh_every=1, refine_start=0, refine_stop=40), 64, 0, workers=0)
-    away, clock = [], time.monotonic  # a visit takes an hour
-    monkeypatch.setattr(time, "monotonic", lambda: clock() + sum(away))
-    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path, visits=Probes(4, see))
-    assert [step for step, *_ in seen] == [10, 20, 30, 40]
-    assert all(earlier[1] < later[1] for earlier, later in pairwise(seen)) and seen[-1][1] <= summary.seconds
-    assert seen[-1][2] < seen[0][2], "it learns between visits"
-    assert summary.seconds < 3600.0
-
-
-def test_visible_gaussians_are_those_that_a_packed_rasterization_lists():
-    info = {"gaussian_ids": torch.tensor([1, 1, 3], dtype=torch.int32)}
-    assert _visible(info, 5).tolist() == [False, True, False, True, False]
 
 
 @pytest.mark.gpu

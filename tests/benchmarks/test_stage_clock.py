@@ -46,24 +46,6 @@ def test_stages_have_their_mean_time_an_iteration_and_the_rest_is_other(time_pas
     assert all(share.host_ms == share.device_ms for share in shares.values())
 
 
-def test_a_stage_that_comes_twice_counts_twice(time_passes):
-    clock = StageClock(CPU, warm_up=0)
-    with clock.stage(ITERATION):
-        for seconds in (1.0, 3.0):
-            with clock.stage("often"):
-                time_passes(seconds)
-    assert clock.shares()["often"].device_ms == 4000.0
-
-
-@pytest.mark.parametrize("iterations", [0, 2])
-def test_without_an_iteration_after_the_warm_up_nothing_is_logged(iterations):
-    clock = StageClock(CPU, warm_up=2)
-    for _ in range(iterations):
-        with clock.stage(ITERATION):
-            pass
-    assert clock.shares() == {}
-
-
 def test_the_stages_of_a_training_are_timed_and_it_learns_the_same(tmp_path):
     def trained(folder: Path, clock: Clock) -> torch.nn.Module:
         settings = settings_of(iterations=12)

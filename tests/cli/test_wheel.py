@@ -17,7 +17,14 @@ from packaging.requirements import Requirement
 from drivesplat.provenance.code_digest import code_digest
 
 FOLDERS = ("envs", "presets", "profiles", "report", "rules", "workflow_scripts")
-FILES = ("Snakefile", "config.yaml", "config.schema.json", "docs/ghosts.md", "docs/settings.md")
+FILES = (
+    "Snakefile",
+    "config.yaml",
+    "config.schema.json",
+    "docs/ghosts.md",
+    "docs/images/ghosts.webp",
+    "docs/settings.md",
+)
 PLACE = "drivesplat/_workflow"
 
 
@@ -85,6 +92,7 @@ def test_an_installed_copy_has_the_code_digests_of_the_checkout(site, tmp_path):
     assert json.loads(done.stdout) == {script.stem: code_digest(script) for script in scripts}
 
 
+@pytest.mark.slow
 def test_an_installed_copy_plans_the_demo_in_an_empty_folder(site, tmp_path):
     """With the packaged Snakefile, presets, edits and default profile; it writes nothing where it is installed."""
     before = {file for file in site.rglob("*") if "__pycache__" not in file.parts}

@@ -1,7 +1,6 @@
 """The labels of an exported drive: boxes of what its images show and of nothing else, as nuscenes-devkit reads them."""
 
 import dataclasses
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -248,13 +247,6 @@ def test_labels_of_a_film_name_a_source_only_of_what_has_gaussians_of_its_own(sc
         the(PARKED, scene).id: (None, "background"),
         **{the(category, scene).id: (None, "none") for category in (WALKER, CONE)},
     }
-
-
-def test_a_drive_that_shows_no_object_has_tables_that_the_devkit_loads(scene, tmp_path):
-    exported(scene, model_of(round_gaussians([[30.0, 10.0, 5.0]], 0.15)), tmp_path)
-    devkit = NuScenes(version=VERSION, dataroot=str(tmp_path / TABLES), verbose=False)
-    assert devkit.sample_annotation == [] and len(devkit.sample) == 10
-    assert set(json.loads((tmp_path / "drive.json").read_text())["rendered"]["shown_by"].values()) == {"none"}
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 """The outputs of an edit: film, still and labels; and refused edits."""
 
 import json
-import time
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,31 +11,25 @@ from helpers.hand_made_street import (
     AHEAD,
     DRIVERS,
     GONE,
-    SPEED,
     TURNING,
     Reels,
     a_format,
     checkpoint_of,
-    straight,
     street_model,
     views_of,
 )
-from helpers.hand_made_traffic import placed
 from helpers.samples import sampled_with
 from PIL import Image
 
-from drivesplat.editing.actors import actor_placements, editable_actors, warn_of_collisions
+from drivesplat.editing.actors import warn_of_collisions
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
-from drivesplat.io.prefetch import THREADS
-from drivesplat.io.video import read_footage
 from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
@@ -173,22 +165,6 @@ def test_labels_and_cameras_reproduce_the_frames(scene, model, busy):
         assert np.abs(again - picture).max() <= 1
 
 
-def seconds_of(made: Made, scene: Scene) -> np.ndarray:
-    return np.array([scene.seconds(timestamp) for timestamp in made.record["timestamps"]])
-
-
-def test_labels_hold_the_pose_of_every_object_in_every_frame(scene, busy):
-    times = seconds_of(busy, scene)
-    np.testing.assert_allclose(times, 0.25 * np.arange(19), atol=1e-6)
-    ahead, twin = ([*map(np.array, busy.track(name)["object_to_world"])] for name in (AHEAD, "twin"))
-    aside = rigid(np.eye(3), np.array([0.0, 2.0, 0.0]))
-    np.testing.assert_allclose(ahead, [straight(t) @ aside for t in times], atol=1e-6)
-    np.testing.assert_allclose(twin, [straight(t - 6.0 / SPEED) @ aside for t in times], atol=1e-6)
-    there = [pose is not None for pose in busy.track(GONE)["object_to_world"]]
-    assert there == [0.285 <= t <= 1.785 or 2.785 <= t <= 4.285 for t in times]
-    assert 0 < sum(there) < len(times)
-
-
 def test_labels_hold_the_attributes_of_every_object(busy):
     known = {
         track["id"]: [track[key] for key in ("source", "shown_by", "category", "scale", "edited", "editable")]
@@ -205,39 +181,6 @@ def test_labels_hold_the_attributes_of_every_object(busy):
     np.testing.assert_allclose(busy.track("twin")["size"], DRIVERS[AHEAD].size)
     assert busy.track("twin")["color_matrix"] == [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     assert busy.track(AHEAD)["color_matrix"] is None
-
-
-def test_objects_that_cannot_be_edited_are_labelled_as_recorded(scene, busy):
-    """A parked truck, and a pedestrian who walks at 1.2 m/s; the tiny world's key frames begin at second 0.035."""
-    parked, walker = (busy.track(f"0001 instance {i}")["object_to_world"] for i in (1, 2))
-    np.testing.assert_allclose(parked, [rigid(np.eye(3), np.array([16.0, -4.5, 1.3]))] * 19, atol=1e-6)
-    expected = [[12.0 + 1.2 * (t - 0.035), 4.0, 0.9] for t in seconds_of(busy, scene)]
-    np.testing.assert_allclose(np.array(walker)[:, :3, 3], expected, atol=1e-6)
-
-
-def test_unedited_actors_are_labelled_with_the_trained_motion(scene, model, tmp_path):
-    made = make(scene, model, tmp_path, {"remove": {"track": AHEAD}})
-    track, motion = made.track(TURNING), model.rigid_groups(0.0)[TURNING].motion
-    assert (track["edited"], track["scale"]) == (False, 1.0)
-    np.testing.assert_allclose(track["object_to_world"], motion.poses(seconds_of(made, scene)), atol=1e-6, rtol=0)
-
-
-def test_the_record_holds_the_edit_and_the_number_of_frames(busy):
-    record = busy.record
-    assert (record["frames"], record["width"], record["height"], record["fps"]) == (19, 64, 36, 4)
-    assert len(record["camera_to_world"]) == len(record["timestamps"]) == len(busy.reels["it"]) == 19
-    assert all(len(track["object_to_world"]) == 19 for track in record["tracks"])
-    assert record["images"] == [f"it/{number:06d}.png" for number in range(19)]
-    assert Edit.model_validate(record["edit"]) == edit_of(*BUSY)
-
-
-def test_captions_are_in_the_film_and_not_in_the_frames(scene, model, tmp_path):
-    large = {"width": 128, "height": 72, "frames": True}
-    plain, captioned = (make(scene, model, tmp_path, *BUSY, captions=it, **large) for it in (False, True))
-    different = (plain.reels["it"] != captioned.reels["it"]).any(axis=3)
-    assert different.any(axis=(1, 2)).all() and different.mean() < 0.4
-    assert captioned.record["still_frame"] == plain.record["still_frame"]
-    np.testing.assert_array_equal(captioned.pictures(), plain.halves[1])
 
 
 def test_the_caption_says_where_an_object_shows_a_side_that_no_camera_saw(scene, model, tmp_path):
@@ -271,39 +214,6 @@ def test_the_still_is_not_beyond_the_last_training_image(scene, model, tmp_path)
     assert still_second(len(held_out)) < scene.seconds(int(held_out[0])) < still_second(0)
 
 
-def test_the_still_is_the_pair_with_the_largest_difference(busy):
-    left, right = (half.astype(float) for half in busy.halves)
-    difference = np.abs(left - right).mean(axis=(1, 2, 3))
-    number = int(difference.argmax())
-    assert busy.record["still_frame"] == number and 0 < number < len(left) - 1
-    np.testing.assert_array_equal(np.asarray(Image.open(busy.folder / "it.png")), busy.reels["it"][number])
-
-
-def test_a_later_run_without_frames_removes_them_and_nothing_else(scene, model, tmp_path):
-    kept = {"it/mine.png", "it/12345.png", "it/1234567.png", "it/000001.txt", "other/000001.png"}
-    for name in kept | {"it/000700.png"}:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"mine")
-    step, small = {"remove": {"track": AHEAD}}, {"width": 16, "height": 16, "fps": 1}
-
-    def left() -> set[str]:
-        return {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
-
-    made = make(scene, model, tmp_path, step, frames=True, **small)
-    assert len(made.record["images"]) == 5
-    assert left() == {*kept, *made.record["images"], "it.mp4", "it.png"}
-    made = make(scene, model, tmp_path, step, **small)
-    assert left() == kept | {"it.mp4", "it.png"} and made.record["images"] == []
-
-
-def test_a_folder_that_held_only_frames_is_removed_with_them(scene, model, tmp_path):
-    step, small = {"remove": {"track": AHEAD}}, {"width": 16, "height": 16, "fps": 1}
-    make(scene, model, tmp_path, step, frames=True, **small)
-    assert (tmp_path / "it").is_dir()
-    make(scene, model, tmp_path, step, **small)
-    assert {path.name for path in tmp_path.iterdir()} == {"it.mp4", "it.png"}
-
-
 def test_a_faster_ego_vehicle_shortens_both_halves(scene, model, tmp_path):
     """The recorded drive goes on beside it at its own speed until the edited film ends."""
     small = {"width": 32, "height": 18}
@@ -317,61 +227,6 @@ def test_a_faster_ego_vehicle_shortens_both_halves(scene, model, tmp_path):
     np.testing.assert_array_equal(made.halves[0], slow.halves[0][:13])
     frames = made.halves[1]
     assert (frames[-1] != made.halves[0][-1]).mean() > 0.5
-
-
-def test_at_60_frames_a_second_actors_move_in_every_frame(scene, model):
-    step = {"shift": {"track": AHEAD, "lateral": 2.0}}
-    slow, fast = (edited_camera_path(scene, "CAM_FRONT", fps, edit_of(step), "") for fps in (30, 60))
-    assert (len(slow), len(fast)) == (136, 271)
-    assert np.abs(fast.timestamps[::2] - slow.timestamps).max() <= 1
-    seconds = np.array([scene.seconds(timestamp) for timestamp in fast.timestamps])
-    np.testing.assert_allclose(seconds, np.arange(271) / 60, atol=1e-6)
-    present = actor_placements(edited_actors(editable_actors(model, scene, "here"), edit_of(step), "here"), seconds)
-    aside, motion = rigid(np.eye(3), np.array([0.0, 2.0, 0.0])), model.rigid_groups(0.0)[TURNING].motion
-    for number in (1, 77, 270):
-        shown = sampled_with(model, float(seconds[number]), present[number])
-        groups = model.rigid_groups(float(seconds[number]))
-        poses = {AHEAD: straight(number / 60) @ aside, TURNING: motion.poses(np.array([number / 60]))[0]}
-        for name, pose in poses.items():
-            expected = placed(groups[name].gaussians, pose).means
-            np.testing.assert_allclose(shown.means[model.of_track(name)], expected, atol=2e-4)
-
-
-def test_an_encoded_film_has_as_many_frames_and_is_twice_as_wide(scene, model, tmp_path):
-    job = a_job({"remove": {"track": AHEAD}}, width=38, height=24, fps=6)
-    record = render_edit(scene, checkpoint_of(model), job, CPU, files_in(tmp_path))
-    footage = read_footage(tmp_path / "it.mp4")
-    assert (footage.frames, footage.fps) == (record["frames"], 6.0) == (28, 6.0)
-    assert (footage.width, footage.height) == (76, 24) == Image.open(tmp_path / "it.png").size
-
-
-def test_an_edit_does_not_change_the_checkpoint(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr("drivesplat.rendering.film.write_video", Reels())
-    checkpoint, before = checkpoint_of(model), checkpoint_of(model)
-    render_edit(scene, checkpoint, a_job(*BUSY, width=16, height=16, fps=1), CPU, files_in(tmp_path))
-    assert checkpoint.model.keys() == before.model.keys()
-    assert all(bool((value == checkpoint.model[key]).all()) for key, value in before.model.items())
-
-
-def test_few_frames_are_rendered_ahead_of_the_encoder(scene, model, tmp_path, monkeypatch):
-    rendered = []
-
-    def counted(_: SplatModel, shown: Iterable[Any]) -> Iterator[np.ndarray]:
-        for _ in shown:
-            rendered.append(1)
-            yield np.zeros((36, 64, 3), np.uint8)
-
-    def encoder(path, frames, size, fps, crf, threads):
-        for taken, _ in enumerate(frames, start=1):
-            time.sleep(0.01)
-            assert 2 * taken <= len(rendered) <= 2 * (taken + THREADS + 1)
-        path.write_bytes(b"")
-
-    for module in ("drivesplat.editing.film", "drivesplat.rendering.film"):
-        monkeypatch.setattr(f"{module}.film_frames", counted)
-    monkeypatch.setattr("drivesplat.rendering.film.write_video", encoder)
-    render_edit(scene, checkpoint_of(model), a_job(*BUSY), CPU, files_in(tmp_path))
-    assert len(rendered) == 2 * 19
 
 
 def refusal(scene: Scene, model: SplatModel, folder: Path, *steps: dict[str, Any], kind: type[DriveSplatError]) -> str:

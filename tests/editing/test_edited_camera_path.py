@@ -79,20 +79,6 @@ def test_a_lateral_offset_equals_that_of_a_film_trajectory(motion):
     np.testing.assert_allclose(path.camera_to_world, beside.camera_to_world, atol=1e-9)
 
 
-def test_at_half_speed_the_camera_covers_half_of_its_path_in_the_same_time():
-    path = edited(circle, {"speed": 0.5})
-    assert len(path) == 10 * FPS + 1 and seconds(path)[-1] == pytest.approx(10.0 + DELAY)
-    expected = np.stack([circle(DELAY + 0.5 * (t - DELAY)) for t in seconds(path)])
-    np.testing.assert_allclose(cars(path), expected, atol=1e-4)
-
-
-def test_at_speed_zero_the_camera_stays_at_its_start():
-    path = edited(straight, {"speed": 0.0})
-    assert len(path) == 10 * FPS + 1
-    np.testing.assert_allclose(path.camera_to_world, np.tile(path.camera_to_world[0], (len(path), 1, 1)), atol=1e-9)
-    np.testing.assert_allclose(cars(path)[0], straight(DELAY), atol=1e-6)
-
-
 @pytest.mark.parametrize("factor", [1.25, 2.0])
 def test_the_film_of_a_faster_camera_ends_where_the_recorded_path_does(factor):
     path = edited(straight, {"speed": factor})

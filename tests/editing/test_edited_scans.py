@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import about_z, actors_of, motion_through, round_gaussians, track_of
-from helpers.samples import EVERYTHING, sampled, sampled_with
+from helpers.samples import EVERYTHING, sampled_with
 from torch import nn
 
 from drivesplat.editing.actors import actor_placements
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanPicture, ScanView
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import SCAN
 from drivesplat.rasterization.scans import RayGrid
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
@@ -24,7 +23,6 @@ CAR_AT, WALL_AT = 12.0, 30.0
 CAR_LOGITS, WALL_LOGITS = (2.0, 5.0), (-2.0, 5.0)
 """Logits of intensity and of a return."""
 SIZE = np.array([4.0, 2.0, 1.6])
-REVOLUTION_S = 0.1
 AHEAD = np.linspace(-0.05, 0.05, 9)
 """Azimuths (radians) that meet the car: it is 2 m wide."""
 
@@ -97,15 +95,6 @@ def test_the_recorded_car_returns_its_own_echo():
     assert_meets(scan(), CAR_AT, CAR_LOGITS)
 
 
-def test_an_edit_of_nothing_is_the_recorded_scan():
-    model = street()
-    recorded, same = model.scan(view(offset_s=-0.05)), model.scan(
-        view(offset_s=-0.05), gaussians=edited(model, {"recolour": {"track": CAR, "hue": 90.0}})
-    )  # fmt: skip
-    for name in ("range", "returned", "intensity", "alpha"):
-        torch.testing.assert_close(getattr(same, name), getattr(recorded, name), atol=1e-4, rtol=1e-4)
-
-
 def test_rays_of_a_removed_car_return_what_is_behind_it():
     assert_meets(scan({"remove": {"track": CAR}}), WALL_AT, WALL_LOGITS)
 
@@ -167,33 +156,3 @@ def test_a_shifted_sensor_sees_past_the_car():
     assert_meets(scan(left=3.0), WALL_AT, WALL_LOGITS)
     toward = np.arctan2(-3.0, CAR_AT) + np.linspace(-0.03, 0.03, 5)
     assert_meets(scan(left=3.0, azimuths=toward), CAR_AT, CAR_LOGITS, azimuths=toward)
-
-
-def test_rows_know_their_placements():
-    """Of a removed, copied and moved car; the static wall has none."""
-    model = street()
-    (group,) = (group for group in model.rigid_groups(0.0).values() if group.motion is not None)
-    recorded = [EditedActor.recorded(CAR, "vehicle.car", SIZE, group.motion)]
-    steps = [
-        {"duplicate": {"track": CAR, "as": "one", "longitudinal": 6.0}},
-        {"duplicate": {"track": CAR, "as": "two", "lateral": 3.0}},
-        {"remove": {"track": CAR}},
-    ]
-    (there,) = actor_placements(
-        edited_actors(recorded, Edit.model_validate({"steps": steps}), "here"), np.array([TIME])
-    )
-    found = sampled_with(model, TIME, there)
-    rows = found.placement
-    walls, own = len(model.parts[0]), len(model.parts[1])
-    assert rows.tolist() == [-1] * walls + [0] * own + [1] * own
-    places = [found.means[rows == number].mean(dim=0) for number in (0, 1)]
-    assert float(places[0][0] - places[1][0]) == pytest.approx(6.0, abs=0.01)
-    assert float(places[1][1]) == pytest.approx(3.0, abs=0.01)
-    assert set(sampled_with(model, TIME, []).placement.tolist()) == {-1}
-
-
-def test_a_car_about_to_vanish_has_no_speed_rather_than_that_to_nowhere():
-    """The motion reaches 0.25 s beyond its last annotation at 2 s."""
-    (car,) = (part for part in street().parts if part.moves)
-    assert float(sampled(car, 2.24, SCAN).velocities.abs().max()) == 0.0
-    assert float(sampled(car, 2.2, SCAN).velocities[:, 0].mean()) == pytest.approx(SPEED, rel=0.01)

@@ -14,7 +14,6 @@ from plyfile import PlyData
 
 from drivesplat.editing.scan_folder import write_scan_folder
 from drivesplat.editing.scans import ScanRenderPlan, SimulatedScan, scan_render_plan
-from drivesplat.editing.sensor_path import recorded_ego
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import scan_of
@@ -169,22 +168,6 @@ def listed(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "scans.json").read_text())
 
 
-def test_the_list_names_scans_objects_and_files(folder, scene, records):
-    record = listed(folder)
-    assert {key: record[key] for key in SOURCE} == SOURCE and record["provenance"] == {"stage": "scan_folder"}
-    assert record["offset"] == {"lateral": 2.0, "vertical": 0.0, "yaw": 0.0} and record["steps"] is None
-    assert record["origin"] == scene.origin.tolist()
-    ahead = record["objects"][0]
-    assert ahead == {
-        "id": AHEAD, "track": AHEAD, "category": "vehicle.car", "class": "car", "size": [4.0, 1.8, 1.5],
-    }  # fmt: skip
-    assert [scan["timestamp"] for scan in record["scans"]] == [scan.timestamp for scan in records.scans[1:3]]
-    for scan in record["scans"]:
-        assert set(scan["files"]) == {"npz", "ply", "pcd.bin"}
-        assert all((folder / name).is_file() for name in scan["files"].values())
-        assert 0 < scan["returns"] < scan["rays"] == 9 * 230
-
-
 def files_of(folder: Path, number: int = 1) -> dict[str, Path]:
     return {kind: folder / name for kind, name in listed(folder)["scans"][number]["files"].items()}
 
@@ -239,16 +222,6 @@ def test_the_dataset_s_own_format_is_read_as_the_scan_that_it_holds(folder, scen
     )
 
 
-def test_scans_of_an_earlier_run_are_removed_and_other_files_stay(folder, scene, lidar_model, records):
-    lidar = records.scans[0].lidar
-    old, mine = folder / lidar / "17.npz", folder / lidar / "mine.npz"
-    old.write_bytes(b"old"), mine.write_bytes(b"mine")
-    some = replace(records, scans=records.scans[:1])
-    arguments = (some, a_job(formats=("ply",)), DeviceSettings(kind="cpu"))
-    write_scan_folder(scene, checkpoint_of(lidar_model), *arguments, folder / "scans.json", SOURCE, {})
-    assert {file.name for file in (folder / lidar).iterdir()} == {"mine.npz", f"{some.scans[0].timestamp}.ply"}
-
-
 def test_a_model_without_lidar_is_refused_in_one_sentence_and_leaves_no_file(scene, records, tmp_path):
     path = tmp_path / "scans" / "scans.json"
     with pytest.raises(ResultError, match=r"trained without LiDAR: train it with train\.scans\.per_image above 0"):
@@ -263,16 +236,6 @@ def test_an_edit_of_an_unknown_track_is_refused(scene, lidar_model, records):
         driven(scene, lidar_model, records, a_job({"remove": {"track": "nobody"}}))
 
 
-def test_a_sensor_inside_a_vehicle_is_warned_of(scene, lidar_model, records, caplog):
-    driven(
-        scene,
-        lidar_model,
-        records,
-        a_job({"shift": {"track": AHEAD, "longitudinal": -9.0}}, {"speed": {"track": AHEAD, "to": 4.0}}),
-    )
-    assert "here: the LiDAR is inside a vehicle between 0.0 and" in caplog.text
-
-
 def test_without_cameras_a_trajectory_moves_the_sensor_and_an_edit_is_refused(scene, lidar_model, records):
     alone, some = replace(scene, frames=()), replace(records, scans=records.scans[1:3])
     job = a_job(lateral=2.0).model_copy(update={"eval_camera": None})
@@ -281,11 +244,3 @@ def test_without_cameras_a_trajectory_moves_the_sensor_and_an_edit_is_refused(sc
     job = a_job({"remove": {"track": AHEAD}}).model_copy(update={"eval_camera": None})
     with pytest.raises(ConfigError, match=r"^here: scans of edits need images, and the scene has no camera$"):
         driven(alone, lidar_model, some, job)
-
-
-def test_without_images_left_is_beside_the_direction_of_travel(scene, records):
-    alone = replace(scene, frames=())
-    seconds = np.array([0.3, 2.0])
-    np.testing.assert_allclose(
-        recorded_ego(alone, "CAM_FRONT")(seconds)[:, :3, :3], np.tile(np.eye(3), (2, 1, 1)), atol=1e-6
-    )

@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import subprocess
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,14 @@ from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.evaluation.ablation import ablation, markdown, write_csv
 from drivesplat.settings.ablation import AblationJob
-from drivesplat.settings.config import Config, for_scene, load, merged
+from drivesplat.settings.config import Config, load, merged
 from drivesplat.workflow.plan import Plan
-from drivesplat.workflow.stages import METHOD_STAGES, SCENE_STAGES, TRAINING_INPUTS, stage_settings, training_inputs
+from drivesplat.workflow.stages import stage_settings
 
 VARIANTS = (
     "actors", "track_correction", "sky", "sky_loss", "depth", "ground", "dropout", "entropy", "colours_in_time",
     "dynamic_loss",
 )  # fmt: skip
-NOTHING = {"ablation": {"of": "nobody"}}
-"""No ablation, whatever the methods."""
 
 
 def names(seeds=(0, 1, 2), without=VARIANTS, of="street") -> list[str]:
@@ -45,13 +42,6 @@ def training(config: Config, method: str) -> dict[str, Any]:
 
 
 # --- which methods there are ---
-
-
-def test_the_full_method_and_every_variant_become_methods_with_every_seed():
-    config = load({})
-    assert list(config.ablated) == names() and len(config.ablated) == 33
-    assert list(config.all_methods) == ["vanilla", "street", *names()]
-    assert list(config.methods) == ["vanilla", "street"]
 
 
 LACKING = {
@@ -79,37 +69,6 @@ def test_a_variant_differs_from_the_method_in_one_setting_only(without, seed):
     assert changed == LACKING[without] | ({"random_seed": seed} if seed else {})
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_full_method_is_unchanged_except_for_its_seed(seed):
-    config = load({})
-    assert training(config, f"street-seed{seed}") == training(config, "street") | {"random_seed": seed}
-
-
-def test_overrides_of_a_variant_are_merged_over_those_of_the_method():
-    """Overrides are merged key by key, and the ablation's seeds replace the method's own seed."""
-    mine = {
-        "parts": ["background", "actors"],
-        "overrides": {"train": {"iterations": 7, "mcmc": {"noise_lr": 3.0}, "depth_weight": 0.5}, "random_seed": 9},
-    }
-    without = {"noise": {"overrides": {"train": {"mcmc": {"noise_lr": 0.0}}}}, "sky": {"overrides": {"sky": "mask"}}}
-    config = load({"methods": {"mine": mine}, "ablation": {"of": "mine", "seeds": [4], "without": without}})
-    assert list(config.ablated) == ["mine-seed4", "mine-without-noise-seed4", "mine-without-sky-seed4"]
-    actual = {name: training(config, name) for name in config.all_methods}
-    for name, settings in actual.items():
-        assert (settings["train.iterations"], settings["train.depth_weight"]) == (7, 0.5), name
-        assert settings["parts"] == ["background", "actors"]
-        assert settings["random_seed"] == (9 if name == "mine" else 4)
-        assert settings["train.mcmc.noise_lr"] == (0.0 if "noise" in name else 3.0)
-        assert settings["sky"] == ("mask" if "sky" in name else "cubemap")
-    assert config.methods["mine"].overrides == mine["overrides"], "the method itself stays as it is"
-
-
-def test_a_variant_takes_precedence_over_dataset_settings():
-    values = {"datasets": {"nuscenes": {"overrides": {"train": {"entropy_weight": 0.7, "iterations": 5}}}}}
-    actual = training(load(values), "street-without-entropy-seed1")
-    assert (actual["train.entropy_weight"], actual["train.iterations"]) == (0.0, 5)
-
-
 def test_users_can_drop_variants_and_add_their_own():
     mine = {"ablation": {"without": {"sky": None, "ssim": {"overrides": {"train": {"ssim_weight": 0.0}}}}}}
     defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
@@ -118,21 +77,6 @@ def test_users_can_drop_variants_and_add_their_own():
     assert list(config.ablated) == names(without=(*kept, "ssim"))
     assert json.loads(stage_settings(config, "ablation", "0061"))["without"] == [*kept, "ssim"]
     assert training(config, "street-without-ssim-seed0")["train.ssim_weight"] == 0.0
-
-
-def test_the_random_seed_of_a_method_affects_its_training_only():
-    config = load({"methods": {"vanilla": {}, "again": {"overrides": {"random_seed": 5}}}})
-    assert (training(config, "again")["random_seed"], training(config, "vanilla")["random_seed"]) == (5, 0)
-    assert for_scene(config, "0061").random_seed == 0
-    assert stage_settings(config, "evaluate", "0061", "again") == stage_settings(config, "evaluate", "0061", "vanilla")
-
-
-def test_only_methods_with_actors_read_actors_and_only_methods_with_depth_loss_read_depth():
-    taken = {name: training_inputs(load({}), "0061", name) for name in names(seeds=[1])}
-    for name, inputs in taken.items():
-        expected = {"actors": "without-actors" not in name, "lidar_depth": "without-depth" not in name}
-        expected |= {"scans": False}  # asked for by no default
-        assert {stage: stage in inputs for stage in TRAINING_INPUTS} == expected, name
 
 
 # --- what is refused ---
@@ -144,14 +88,6 @@ def refusal(values: dict[str, Any]) -> str:
     message = str(failure.value)
     assert "\n" not in message
     return message
-
-
-@pytest.mark.parametrize("name", ["street-seed1", "street-without-sky_loss-seed2"])
-def test_a_method_with_the_name_of_a_variant_is_refused(name):
-    message = refusal({"methods": {"street": {}, name: {}}})
-    assert name in message and "ablation" in message and "rename" in message
-    assert name in load({"methods": {"vanilla": {}, name: {}}}).methods, "no such ablation, no such variant"
-    assert name in load({"methods": {"street": {}, name: {}}, "ablation": {"seeds": [7]}}).methods
 
 
 @pytest.mark.parametrize(
@@ -182,16 +118,6 @@ def plan(**values: Any) -> Plan:
     return Plan({"datasets": {"a": {"scenes": ["a1"]}}, **values}, str(REPOSITORY))
 
 
-@pytest.mark.parametrize("target", ["results/a1/ablation.csv", "results/a1/ablation.json"])
-def test_a_config_without_the_method_is_valid_until_its_ablation_is_requested(target):
-    made = plan(methods={"vanilla": {}, "mine": {}})
-    assert made.config.ablated == {} and list(made.config.all_methods) == ["vanilla", "mine"]
-    made.refuse_unknown(["all", "results/a1/metrics.json", "results/a1/mine/eval.json"])
-    with pytest.raises(ConfigError, match=r"ablation\.of.*'street'.*vanilla, mine"):
-        made.refuse_unknown([target])
-    plan().refuse_unknown([target])
-
-
 def told_to_drop(made: Plan, target: str) -> dict[str, Any]:
     """The setting that the error message of an ablation suggests."""
     with pytest.raises(ConfigError) as failure:
@@ -219,68 +145,7 @@ def test_variants_without_effect_block_the_ablation_only():
     plan(ablation={"of": "vanilla"}).refuse_unknown(["all", *(f"results/a1/{file}" for file in files)])
 
 
-def test_the_effect_of_a_variant_depends_on_the_settings_of_the_scene():
-    """If the drive's settings have no entropy loss, the variant without it equals the method."""
-    free = {"scenes": ["a1"], "overrides": {"train": {"entropy_weight": 0.0}}}
-    made = Plan({"datasets": {"a": free, "b": {"scenes": ["b1"]}}}, str(REPOSITORY))
-    made.refuse_unknown(["results/b1/ablation.csv"])
-    with pytest.raises(ConfigError, match=r"a1.*'street'.*: entropy; drop them.*\{entropy: null\}"):
-        made.refuse_unknown(["results/a1/ablation.csv"])
-
-
-@pytest.mark.parametrize(
-    ("seeds", "without", "expected"),
-    [
-        ((0, 1), ("sky", "depth"), "it-seed{0,1}, it-without-{sky,depth}-seed{0,1}"),
-        ((2,), ("sky", "depth"), "it-seed2, it-without-{sky,depth}-seed2"),
-        ((2, 3), ("sky",), "it-seed{2,3}, it-without-sky-seed{2,3}"),
-        ((2,), (), "it-seed2"),
-    ],
-)
-def test_method_names_are_written_as_shell_braces(seeds, without, expected):
-    job = AblationJob(of="it", seeds=seeds, without=without)
-    assert job.name_pattern == expected
-    command = ["bash", "-c", f"echo {expected.replace(', ', ' ')}"]
-    expanded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-    assert sorted(expanded) == sorted(job.method(name, seed) for name in (None, *without) for seed in seeds)
-
-
-def test_an_unknown_variant_is_refused_with_a_list_of_known_ones():
-    made = plan(ablation={"seeds": [3, 5]})
-    made.refuse_unknown(["results/a1/street-without-sky-seed3/eval.json", "results/a1/street-seed5/original.mp4"])
-    for unknown in ("street-without-sky-seed0", "street-without-skies-seed3", "street-without-sky"):
-        with pytest.raises(ConfigError) as failure:
-            made.refuse_unknown([f"results/a1/{unknown}/eval.json"])
-        message = str(failure.value)
-        assert f"'{unknown}'" in message and "vanilla, street;" in message
-        assert "street-seed{3,5}" in message and "street-without-{actors,track_correction," in message
-
-
-def test_variants_can_be_filmed_and_those_with_actors_edited():
-    made = plan()
-    made.refuse_unknown(["results/a1/street-without-sky-seed0/parts.mp4"])
-    with pytest.raises(ConfigError, match=r"street-without-actors-seed0.*those do: street$"):
-        made.refuse_unknown(["results/a1/street-without-actors-seed0/parts.mp4"])
-
-
 # --- settings of all other stages ---
-
-
-def test_other_stages_do_not_depend_on_the_ablation():
-    """Stage settings, films, edits and the report's inputs are the same without an ablation."""
-    edits = {"demo": str(REPOSITORY / "presets/edits/demo.yaml")}
-    datasets = {"a": {"scenes": ["a1", "demo"], "edits": edits}}
-    with_it, without = (Plan({"datasets": datasets, **more}, str(REPOSITORY)) for more in ({}, NOTHING))
-    for stage in (*SCENE_STAGES, *TRAINING_INPUTS):
-        assert stage_settings(with_it.config, stage, "a1") == stage_settings(without.config, stage, "a1")
-    for method in ("vanilla", "street"):
-        for stage in METHOD_STAGES:
-            actual = (stage_settings(made.config, stage, "a1", method) for made in (with_it, without))
-            assert next(actual) == next(actual)
-    assert with_it.films(scenes=["a1", "demo"]) == without.films(scenes=["a1", "demo"])
-    assert with_it.edits(scenes=["a1", "demo"]) == without.edits(scenes=["a1", "demo"]) != []
-    assert {Path(edit).parts[2] for edit in with_it.edits(scenes=["demo"])} == {"street"}
-    assert with_it.report([]).settings() == without.report([]).settings()
 
 
 # --- what it says ---
@@ -346,25 +211,6 @@ def test_a_row_has_means_standard_deviations_and_differences_paired_by_seed():
     assert (sky["gaussians"]["mean"], sky["gaussians"]["max"], sky["train_seconds"]["mean"]) == (1100.0, 1400, 55.0)
 
 
-@pytest.fixture
-def still() -> dict[str, Any]:
-    """The ablation of a static scene, measured in both groups."""
-    runs = [measured(24.0 + i, None, beyond=(18.0 - i, None)) for i in range(3)]
-    return ablation(evals(runs, runs, runs), JOB)
-
-
-def test_moving_figures_are_null_on_a_static_scene(still, tmp_path):
-    for row in still["rows"]:
-        for group in ("interpolation", "extrapolation"):
-            assert row[group]["moving_vehicle"] is row[group]["gap_db"] is None
-            assert row[group]["difference"]["moving_vehicle"] is None
-    assert json.loads(json.dumps(still, allow_nan=False)) == still
-    write_csv(tmp_path / "ablation.csv", still)
-    rows = read_csv(tmp_path / "ablation.csv")
-    assert {row["interpolation_moving_vehicle"] for row in rows} == {""}
-    assert "None" not in markdown(still) and "nan" not in markdown(still)
-
-
 @pytest.mark.parametrize("key", ["protocol", "scene", "dataset"])
 def test_results_of_different_protocols_are_not_compared(key):
     other = {**SKY[1], key: {**PROTOCOL, "width": 320} if key == "protocol" else "other"}
@@ -421,14 +267,6 @@ def test_the_markdown_is_a_table_ready_for_the_documentation():
     ]  # fmt: skip
     assert "0061" in text and "seeds 0, 1, 2" in text and "standard error" in text and "dB" in text
     assert "beyond" not in text.lower(), "a group that was not measured has no table"
-
-
-def test_each_measured_group_has_a_table(still):
-    text = markdown(still)
-    between, beyond = tables(text)
-    assert text.index("Between training frames") < text.index("Beyond the last training frame")
-    assert between[2][1:6] == ["25.0 (24.0 to 26.0)", "-", "-", "-", "-"]
-    assert beyond[3][1:6] == ["17.0 (16.0 to 18.0)", "+0.00 ± 0.00", "-", "-", "-"]
 
 
 # --- through Snakemake ---

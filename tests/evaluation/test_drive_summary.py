@@ -39,16 +39,6 @@ def test_from_training_m_is_the_distance_driven_since_the_nearest_training_image
     assert record["extrapolation"]["from_training_m"] == pytest.approx((2.0 + 4.0) / 2)
 
 
-def test_images_of_other_cameras_do_not_count_as_near(tiny_scene):
-    beside = tuple(dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames)
-    frames = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
-    both = recording_of(dataclasses.replace(tiny_scene, frames=(*frames, *beside)))
-    assert record_of(both)["interpolation"]["from_training_m"] == pytest.approx(2.0)
-    alone = tuple(frame for frame in frames if frame.sample_index in (2, 6, 8, 9))
-    only_held_out = recording_of(dataclasses.replace(tiny_scene, frames=(*alone, *beside)))
-    assert record_of(only_held_out)["interpolation"]["from_training_m"] is None
-
-
 def test_brightness_covers_held_out_images_and_flat_psnr_their_static_pixels(tiny_scene):
     recording = recording_of(tiny_scene)
     measured = measured_images(recording.record, "CAM_FRONT")
@@ -63,12 +53,3 @@ def test_brightness_covers_held_out_images_and_flat_psnr_their_static_pixels(tin
         assert 1000 < len(pixels) < 2 * World().width * World().height
         flat = np.mean((pixels - pixels.mean(axis=0)) ** 2)
         assert record[group]["flat_psnr"] == pytest.approx(-10 * np.log10(flat))
-
-
-def test_an_empty_group_and_images_of_one_colour_give_none(tiny_scene, tmp_path):
-    Image.new("RGB", (96, 54), (0, 0, 0)).save(tmp_path / "black.png")
-    frames = (dataclasses.replace(frame, image_path=str(tmp_path / "black.png")) for frame in tiny_scene.frames)
-    black = dataclasses.replace(tiny_scene, frames=tuple(frames))
-    record = record_of(recording_of(black, {"every_nth": 4, "offset": 2, "last_block": 0}))
-    assert record["extrapolation"] is None
-    assert (record["interpolation"]["luminance"], record["interpolation"]["flat_psnr"]) == (0.0, None)

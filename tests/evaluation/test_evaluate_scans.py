@@ -16,17 +16,14 @@ from drivesplat.evaluation.evaluate_scans import (
     ScanEvaluationInputs,
     evaluate_scans,
     missing_sweeps,
-    scan_protocol,
 )
-from drivesplat.evaluation.scene_metrics import side_by_side
-from drivesplat.evaluation.summary import sentences
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.parser import training_record
 from drivesplat.preprocess.scans import scan_records
 from drivesplat.scene.regions import REGIONS
-from drivesplat.scene.scan_record import RecordedScan, ScanRecords
+from drivesplat.scene.scan_record import ScanRecords
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord
@@ -130,28 +127,6 @@ def test_a_sweep_that_gave_no_scan_is_counted(measured):
     assert measured.eval["protocol"]["lidar_missing"] == 0 == missing_sweeps(measured.scene, measured.scans)
     fewer = dataclasses.replace(measured.scans, scans=measured.scans.scans[1:-1])
     assert missing_sweeps(measured.scene, fewer) == 2
-
-
-def test_at_5_hz_its_protocol_states_the_neighbourhood_and_the_time_to_the_nearest_training_scan(measured):
-    record = dataclasses.replace(measured.record, scene=dataclasses.replace(measured.record.scene, key_frame_hz=5.0))
-
-    def stated(scans: list[RecordedScan]) -> dict[str, Any]:
-        known = dataclasses.replace(measured.inputs, record=record, scans=ScanRecords(scans, measured.scans.tracks))
-        return scan_protocol(known, job("evaluate_scans", EvaluateScansJob))
-
-    made = stated(measured.scans.scans)
-    assert made["holdout"]["neighbourhood_s"] == 0.25 and made["key_frame_hz"] == 5.0
-    assert made["nearest_training_s"] == pytest.approx(0.5)
-    assert stated(measured.scans.of_group("train"))["nearest_training_s"] is None
-
-
-def test_its_summary_speaks_of_lidar(measured, tmp_path):
-    lines = sentences(side_by_side({METHOD: measured.eval}), tmp_path / "metrics.json")
-    assert lines[0] == "The scene has no camera, so there are figures of LiDAR alone"
-    assert (
-        lines[1].startswith("with_lidar, LiDAR scans between training frames: range off by ")
-        and "intensity by" in lines[1]
-    )
 
 
 def test_a_split_without_training_sweeps_is_refused(measured):

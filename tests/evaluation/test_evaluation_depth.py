@@ -1,18 +1,16 @@
 """The error of rendered depth, and the LiDAR sweep that it is compared with."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers.drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
-from helpers.hand_made import looking_at, recording_of, round_gaussians
+from helpers.hand_made import recording_of, round_gaussians
 
 from drivesplat.evaluation.image_metrics import evaluate_groups, held_out_depths
 from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, depth_summary, relative_depth_errors
-from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.lidar_depth import lidar_depths
@@ -82,14 +80,6 @@ def test_images_are_compared_with_the_sweep_of_their_own_key_frame(tiny_root):
             np.testing.assert_array_equal(values, vars(everything[index])[key])
 
 
-def test_images_without_their_own_sweep_are_not_compared(tiny_root, tmp_path):
-    """The sweeps of other key frames, 0.5 s away, are not used."""
-    root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
-    (root / "samples/LIDAR_TOP/0001__0008.pcd.bin").unlink()
-    depths = held_out_depths(held_out_recording(root), "CAM_FRONT", job())
-    assert [index // 2 for index in sorted(depths)] == [2, 6, 9]
-
-
 def test_groups_include_the_depth_error(tiny_root):
     """The first held-out image shows a disc at 5 m whose LiDAR depth is 4 m; the second has no LiDAR depth."""
     recording = held_out_recording(tiny_root)
@@ -102,11 +92,3 @@ def test_groups_include_the_depth_error(tiny_root):
     )
     assert groups["interpolation"]["depth"] == {"median_relative_error": pytest.approx(0.25, abs=2e-3), "pixels": 1500}
     assert "depth" not in groups["extrapolation"]
-
-
-def test_rendering_depth_does_not_change_the_image():
-    model = SplatModel([round_gaussians([[6.0, 0.0, 0.0]], 0.5, 0.9)], None).requires_grad_(False)
-    view = looking_at([6.0, 0.0, 0.0], [1.0, 0.0, 0.0])
-    image, depth = rendered_with_depth(model, view)
-    np.testing.assert_allclose(image, rendered(model, view), atol=1e-6)
-    assert depth.shape == image.shape[:2] and depth[16, 24] == pytest.approx(5.0, abs=1e-3)

@@ -64,23 +64,8 @@ def test_psnr_equals_that_of_skimage():
     assert measured((image, truth, labels_of()))["all"]["psnr"] == pytest.approx(expected)
 
 
-def test_identical_images_have_no_psnr_and_say_so():
-    _, truth = pair(1)
-    record = measured((truth, truth, labels_of()))["all"]
-    assert record["psnr"] is None and record["identical"] is True
-    assert record["psnr_frame_mean"] is None
-    assert record["ssim"] == pytest.approx(1.0)
-
-
 def test_images_that_differ_are_not_called_identical():
     assert "identical" not in measured((*pair(1), labels_of()))["all"]
-
-
-def test_colours_are_clamped_before_they_are_compared():
-    truth = np.zeros((HEIGHT, WIDTH, 3))
-    truth[: HEIGHT // 2] = 1.0
-    beyond = np.where(truth > 0, 1.7, -0.4)
-    assert measured((beyond, truth, labels_of()))["all"]["identical"] is True
 
 
 def test_colours_are_not_quantised():
@@ -108,13 +93,6 @@ def test_psnr_is_pooled_over_frames_and_the_frame_mean_is_not():
     record = measured(*frames)["all"]
     assert record["psnr"] == pytest.approx(-10 * math.log10((0.01 + 0.0001) / 2))
     assert record["psnr_frame_mean"] == pytest.approx((20.0 + 40.0) / 2)
-
-
-def test_pooling_weighs_pixels_not_frames():
-    truth = np.full((HEIGHT, WIDTH, 3), 0.3)
-    frames = [(truth + 0.1, truth, labels_of(moving_car=1500)), (truth + 0.2, truth, labels_of(moving_car=300))]
-    record = measured(*frames)["moving_vehicle"]
-    assert record["psnr"] == pytest.approx(-10 * math.log10((1500 * 0.01 + 300 * 0.04) / 1800))
 
 
 def test_a_frame_with_fewer_than_100_pixels_of_a_region_is_left_out_of_its_frame_mean():
@@ -208,29 +186,8 @@ def test_the_ssim_map_is_accurate_where_images_are_even(level):
     np.testing.assert_array_equal(ssim_map(truth, truth), 1.0)
 
 
-@pytest.mark.parametrize("level", [0.0, 0.05, 0.5, 0.95, 1.0])
-def test_the_ssim_of_large_even_images_of_8_bits_is_accurate(level):
-    """Among many pixels some have larger errors of rounding, which their mean does not have."""
-    rng = np.random.default_rng(7)
-    truth = np.full((225, 400, 3), level)
-    image = np.round(255.0 * (truth + rng.normal(scale=0.002, size=truth.shape)).clip(0.0, 1.0)) / 255.0
-    found, expected = ssim_map(image, truth), skimage_ssim(image, truth)
-    np.testing.assert_allclose(found, expected, atol=2e-4)
-    assert float(found.mean()) == pytest.approx(expected.mean(), abs=5e-5)
-    np.testing.assert_array_equal(ssim_map(truth, truth), 1.0)
-
-
 def test_without_a_map_lpips_is_null():
     assert measured((*pair(7), labels_of()))["all"]["lpips"] is None
-
-
-def test_the_input_images_are_not_modified():
-    image, truth = pair(8)
-    image = image * 2.0 - 0.5
-    before = image.copy(), truth.copy()
-    measured((image, truth, labels_of()))
-    np.testing.assert_array_equal(image, before[0])
-    np.testing.assert_array_equal(truth, before[1])
 
 
 def test_without_frames_all_figures_are_null():
@@ -283,26 +240,6 @@ def record_of(value: float | None) -> dict[str, Any]:
 def test_gap_is_static_minus_moving(static, moving, vehicle, expected):
     regions = {"static": static, "moving_vehicle": moving, "vehicle": vehicle, "moving_human": None}
     assert with_gap(regions)["gap_db"] == expected
-
-
-@pytest.mark.parametrize(
-    ("static", "people", "expected"),
-    [
-        (record_of(30.0), record_of(19.5), 10.5), (record_of(30.0), None, None), (None, record_of(19.5), None),
-        (record_of(30.0), record_of(None), None),
-    ],
-)  # fmt: skip
-def test_the_gap_of_people_is_static_minus_theirs_alone(static, people, expected):
-    regions = {"static": static, "moving_vehicle": record_of(25.0), "vehicle": None, "moving_human": people}
-    assert with_gap(regions)["human_gap_db"] == expected
-
-
-def test_the_gap_of_the_summary_equals_that_of_its_regions():
-    truth = np.full((HEIGHT, WIDTH, 3), 0.3)
-    image = truth + 0.01
-    image.reshape(-1, 3)[:1000] = 0.4
-    result = measured((image, truth, labels_of(moving_car=1000)))
-    assert result["gap_db"] == pytest.approx(40.0 - 20.0)
 
 
 @pytest.mark.parametrize(

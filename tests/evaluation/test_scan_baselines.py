@@ -49,14 +49,6 @@ def test_of_several_returns_a_ray_meets_the_nearest_with_its_intensity():
     assert without.intensities is None and without.returned.all()
 
 
-def test_points_between_or_beyond_the_beams_are_met_by_no_ray():
-    """10 m above the sensor's next position there is no beam."""
-    ranges = room(np.nan)
-    ranges[3, STEPS // 2] = 10.0
-    assert not fused([recorded(ranges)], recorded(room(), place=(9.5, 0.0, 0.0))).returned.any()
-    assert fused([recorded(ranges)], TARGET).returned.sum() == 1
-
-
 def test_the_nearest_training_scan_in_time_is_taken_and_the_neighbours_are_fused():
     training = [recorded(room(float(5 + i)), timestamp=t * KEY_FRAME_US) for i, t in enumerate((0, 3, 8))]
     target = recorded(room(), timestamp=4 * KEY_FRAME_US)

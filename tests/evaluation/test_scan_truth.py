@@ -191,13 +191,6 @@ def scan_seconds(known: ScanTruth) -> float:
     return next(scan.seconds for scan, _ in known.scans())
 
 
-def test_rays_within_the_ego_vehicle_do_not_count(path, scene):
-    far = ScanTruth.of(read_truth(path), path, scene, scan_records(scene), 25.0)
-    for scan, _ in far.scans():
-        np.testing.assert_array_equal(scan.measured, (scan.scan.ranges >= 25.0) | ~scan.scan.returned)
-        assert not scan.measured.all()
-
-
 def test_the_figures_have_the_places_of_those_of_images(known):
     found = scan_truth_metrics(street(), known, MARGIN, SPREAD, CPU)
     assert set(found) == {"lateral", "removal"} and set(found["lateral"]) == {"2.0", "-2.0"}

@@ -64,51 +64,6 @@ def test_figures_against_ground_truth_are_reported():
     assert expected in lines
 
 
-def test_each_lateral_offset_is_a_sentence_with_its_side_and_all_its_figures():
-    full = {"static": {"psnr": 22.7}, "moving_vehicle": {"psnr": 14.0}, "depth": {"median_relative_error": 0.0312}}
-    lateral = {
-        "2.0": full,
-        "-2.0": {"static": {"psnr": 21.0}, "moving_vehicle": None, "depth": None},
-        "4.0": {"static": None, "moving_vehicle": None, "depth": {"median_relative_error": 0.25}},
-        "-0.5": {"static": None, "moving_vehicle": None, "depth": None},
-    }
-    lines = sentences({"methods": {"vanilla": {**method(), "lateral": lateral}}}, "m.json")
-    assert [line for line in lines if "against truth" in line] == [
-        "vanilla, from 2 m to the left, against truth: static 22.7 dB, moving vehicles 14.0 dB, "
-        "depth off by 3.1 % in the median",
-        "vanilla, from 2 m to the right, against truth: static 21.0 dB",
-        "vanilla, from 4 m to the left, against truth: depth off by 25.0 % in the median",
-    ]
-
-
-def test_existing_films_and_images_are_listed_last_by_method(tmp_path):
-    """Only existing files are listed; methods without files are not mentioned."""
-    made = {"vanilla": ("viewer.html", "original.mp4", "train.json", "removal.png"), "plain": ("ghost_panel.png",)}
-    for name, files in {**made, "bare": ("train.json",)}.items():
-        (tmp_path / name).mkdir()
-        for file in files:
-            (tmp_path / name / file).touch()
-    (tmp_path / "plain" / "original.mp4").mkdir()
-    (tmp_path / "plain" / "edits").mkdir()
-    metrics = {"methods": {name: method() for name in ("vanilla", "plain", "bare", "absent")}}
-    lines = sentences(metrics, tmp_path / "metrics.json")
-    assert lines[-2:] == [
-        f"To look at, in {tmp_path}/vanilla: original.mp4, removal.png, viewer.html",
-        f"To look at, in {tmp_path}/plain: ghost_panel.png, edits/",
-    ]
-    assert sum("To look at" in line for line in lines) == 2
-    assert not any("compare.mp4" in line for line in lines)
-    (tmp_path / "compare.mp4").touch()
-    assert f"All methods beside the recording: {tmp_path}/compare.mp4" in sentences(metrics, tmp_path / "metrics.json")
-
-
-def test_ground_truth_figures_over_too_few_pixels_are_not_mentioned():
-    removal = {"box": None, "outside": {"psnr": 20.0}, "not_removed": {"box": None, "outside": {"psnr": 20.0}}}
-    metrics = {"methods": {"vanilla": {**method(), "lateral": {"2.0": {"static": None}}, "removal": removal}}}
-    lines = sentences(metrics, "m.json")
-    assert not any("truth" in line or "removed" in line for line in lines)
-
-
 def test_the_command_prints_the_summary_and_names_a_missing_file(tmp_path):
     file = tmp_path / "metrics.json"
     command = [sys.executable, "-m", "drivesplat.evaluation.summary", str(file)]

@@ -16,11 +16,10 @@ import pyarrow
 import pytest
 from helpers import REPOSITORY
 from helpers.drives import TILTED_CAMERA, TIMES, World, rays_at, seconds_of, seen_from, turning_world
-from helpers.mutations import CHANCE, fresh, mutate_file
+from helpers.mutations import damages, fresh, mutate_file
 from helpers.patience import PATIENCE_S
 from helpers.shown_drives import assert_shows, origin_of, require_refused_or_sound, world_points
 from helpers.table_files import time_limit
-from hypothesis import given, settings
 from PIL import Image
 from pyarrow import feather
 from scipy.spatial.transform import Rotation
@@ -419,6 +418,7 @@ def test_a_log_of_argoverse2_without_images_is_a_drive_of_lidar(argoverse, tmp_p
     np.testing.assert_allclose(moved, expected, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_recorded_fragment_of_argoverse2_is_converted(tmp_path):
     logs = list((REPOSITORY / "../shared/data/av2-log-fragment").glob("*/calibration"))
     if not logs:
@@ -454,44 +454,15 @@ def a_pipe(path: Path) -> None:
     [
         ("calib_velo_to_cam.txt", Path.unlink, "calib_velo_to_cam.txt is missing"),
         ("calib_velo_to_cam.txt", replaced("T:", "U:"), "calib_velo_to_cam.txt has no line that begins with T:"),
-        ("calib_velo_to_cam.txt", lambda p: p.write_text("R: 1 0 0\n"), "cannot be read: line 1 has 3 numbers"),
         ("calib_imu_to_velo.txt", replaced("R: ", "R: 7"), "calib_imu_to_velo.txt: its transform is not rigid"),
-        ("calib_cam_to_cam.txt", lambda p: p.write_text("P_rect_02: x\n"), "calib_cam_to_cam.txt cannot be read"),
         (f"{IMAGES}/timestamps.txt", lambda p: p.write_text("yesterday\n"), "timestamps.txt cannot be read: line 1 is"),
-        (
-            f"{IMAGES}/timestamps.txt",
-            lambda p: p.write_text(p.read_text()[:40]),
-            "timestamps.txt cannot be read: line 2",
-        ),
-        (f"{IMAGES}/timestamps.txt", a_pipe, "timestamps.txt is not a file"),
         (f"{SCANS}/timestamps_start.txt", without_the_last_line, "timestamps_start.txt: line 6 has no time, and there"),
         (f"{SCANS}/timestamps_end.txt", replaced("2018", "2019"), "line 1: the scan begins 0.05 s before"),
         (f"{OXTS}/timestamps.txt", replaced("2018", "2019"), "timestamps.txt: line 2 is not later than"),
-        (
-            f"{OXTS}/data/0000000003.txt",
-            lambda p: p.write_text("49 8 1"),
-            "0000000003.txt cannot be read: line 1 has 3",
-        ),
-        (f"{OXTS}/data/0000000003.txt", lambda p: p.write_text(""), "line 1 has 0 numbers; it must have 6"),
-        (f"{OXTS}/data/0000000003.txt", replaced("49.", "nan "), "line 1 has a number that is not finite"),
         (f"{OXTS}/data/0000000003.txt", replaced("49.", "149."), "no latitude and longitude"),
-        ("{drive}/tracklet_labels.xml", lambda p: p.write_text("<a>"), "tracklet_labels.xml cannot be read"),
-        (
-            "{drive}/tracklet_labels.xml",
-            replaced("<first_frame>0", "<first_frame>-3"),
-            "tracklet 0: its first_frame is",
-        ),
         ("{drive}/tracklet_labels.xml", replaced("Car", "Cart"), "tracklet 0: its objectType is 'Cart'"),
-        ("{drive}/tracklet_labels.xml", replaced("<tx>", "<tx>m"), "tracklet 0: pose 0: tx, ty, tz, rx, ry, rz: could"),
-        (f"{SCANS}/data/0000000000.bin", lambda p: p.write_bytes(b"123"), "0000000000.bin cannot be"),
-        (f"{SCANS}/data/0000000000.bin", lambda p: p.write_bytes(b""), "0000000000.bin holds no returns"),
         (f"{SCANS}/data/0000000000.bin", lambda p: p.write_bytes(b"\xff" * 160), "10 of its 10 returns have values"),
         (f"{SCANS}/data/0000000001.bin", a_pipe, "0000000001.bin is not a file"),
-        (
-            f"{SCANS}/data/0000000001.bin",
-            lambda p: p.rename(p.with_name("x.bin")),
-            "x.bin: the name of a recording must",
-        ),
         ("{drive}", lambda p: p.rename(p.with_name("x")), "there is no folder"),
     ],
 )
@@ -524,8 +495,7 @@ def damaged(random: Random, folder: Path) -> str:
     return mutate_file(random, random.choice(kinds[random.choice(list(kinds))]))
 
 
-@settings(max_examples=200)
-@given(random=CHANCE)
+@damages(50, 200)
 def test_damaged_days_of_kitti_are_refused_in_one_line_or_sound(kitti, tmp_path, capsys, random):
     with fresh(tmp_path) as folder:
         day, out = folder / "2011_09_26", folder / "out"
@@ -534,8 +504,7 @@ def test_damaged_days_of_kitti_are_refused_in_one_line_or_sound(kitti, tmp_path,
         require_refused_or_sound(lambda: kitti_raw.main([str(day), "5", str(out)]), out, capsys, done)
 
 
-@settings(max_examples=200)
-@given(random=CHANCE)
+@damages(50, 200)
 def test_damaged_logs_of_argoverse2_are_refused_in_one_line_or_sound(argoverse, tmp_path, capsys, random):
     with fresh(tmp_path) as folder:
         log, out = folder / "log", folder / "out"

@@ -13,9 +13,8 @@ import pandas
 import pytest
 from helpers import REPOSITORY
 from helpers.drives import TILTED_CAMERA, TIMES, World, rays_at, seconds_of, seen_from, turning_world
-from helpers.mutations import CHANCE, fresh, likely, mutate_file
+from helpers.mutations import damages, fresh, likely, mutate_file
 from helpers.shown_drives import assert_shows, require_refused_or_sound, world_points
-from hypothesis import given, settings
 from pandas.core.internals.managers import BlockManager
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -293,8 +292,7 @@ def test_a_damaged_sequence_ends_with_a_sentence(sequence, tmp_path, capsys):
     assert "has no folder roof; there are: front_camera, left_camera" in capsys.readouterr().err
 
 
-@settings(max_examples=200)
-@given(random=CHANCE)
+@damages(50, 200)
 def test_damaged_sequences_are_refused_in_one_line_or_sound(short_sequence, tmp_path, capsys, random):
     files = sorted(path.relative_to(short_sequence) for path in short_sequence.rglob("*") if path.is_file())
     chosen = random.choice([file for file in files if file.name != "00.jpg" or likely(random, 3)])

@@ -100,13 +100,6 @@ def test_every_image_has_its_split(record):
     assert {image["split"] for image in record["images"] if not image["is_key_frame"]} <= {"train", "excluded"}
 
 
-def test_the_record_names_scene_and_conventions(record, tiny_scene):
-    assert record["schema"] == 1 and record["scene"] == "0001" and record["dataset"] == "tiny"
-    assert record["version"] == "v1.0-mini" and record["poses"] == tiny_scene.poses
-    assert {"world", "global", "camera", "ego", "K", "timestamp", "split"} <= record["conventions"].keys()
-    assert all(sentence.endswith(".") for sentence in record["conventions"].values())
-
-
 def test_the_record_contains_no_paths_of_the_machine(record, tiny_root):
     assert str(tiny_root) not in json.dumps(record)
     assert all("/" not in image["image"] for image in record["images"])

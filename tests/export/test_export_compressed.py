@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from drivesplat.errors import DriveSplatError, ResultError
-from drivesplat.export.compressed import SOG_PROGRAM, export_sog, export_spz, fractional_bits
+from drivesplat.errors import DriveSplatError
+from drivesplat.export.compressed import SOG_PROGRAM, export_sog, export_spz
 from drivesplat.export.splat_ply import read_splat_ply, write_splat_ply
 from drivesplat.model.gaussians import Gaussians, with_sh_degree
 
@@ -80,26 +80,12 @@ def test_the_spz_is_a_quarter_of_the_ply_at_most(tmp_path, gsply):
     assert (tmp_path / "splat.spz").stat().st_size < (tmp_path / "splat.ply").stat().st_size / 4
 
 
-@pytest.mark.parametrize("largest", [0.0, 0.3, 999.0, 2047.9, 2048.0, 90_000.0])
-def test_positions_fit_into_24_bits(largest):
-    bits = fractional_bits(largest)
-    assert 1 <= bits <= 12 and round(largest * 2**bits) < 2**23
-    assert bits == 12 or round(largest * 2 ** (bits + 1)) >= 2**23
-
-
 def test_without_gsply_a_sentence_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsply", None)
     write_splat_ply(tmp_path / "splat.ply", splats(0), {})
     with pytest.raises(DriveSplatError, match=r"splat\.spz needs gsply, .*export\.formats"):
         export_spz(tmp_path / "splat.spz", tmp_path / "splat.ply")
     assert [path.name for path in tmp_path.iterdir()] == ["splat.ply"]
-
-
-def test_an_unwritable_spz_is_named(tmp_path, gsply):
-    (tmp_path / "file").write_text("")
-    write_splat_ply(tmp_path / "splat.ply", splats(0), {})
-    with pytest.raises(ResultError, match=r"file/splat\.spz: cannot be written"):
-        export_spz(tmp_path / "file/splat.spz", tmp_path / "splat.ply")
 
 
 def test_without_splat_transform_a_sentence_says_what_to_do(tmp_path, monkeypatch):

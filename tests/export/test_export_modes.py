@@ -6,7 +6,7 @@ import torch
 from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import TURNING, with_turning_track
-from helpers.samples import sampled, sampled_with
+from helpers.samples import sampled_with
 from helpers.viewer_pages import (
     HEIGHT,
     SHOWN_WITHOUT_WORDS,
@@ -89,25 +89,10 @@ def test_modes_give_the_shapes_of_the_model(people, group, modes, second, change
     assert far > 0.05 or second == 1.0, "the group shows the shape of second 1"
 
 
-def test_an_edited_gait_differs_from_the_recorded_one(modes):
-    second = np.array([1.0])
-    recorded, slowed = modes.weights(Gait(second)), modes.weights(Gait(second, np.array([0.7])))
-    assert np.abs(recorded - slowed).max() > 0.2
-    ahead = modes.weights(Gait(second, np.array([1.5]), phase=1.0))
-    np.testing.assert_allclose(ahead, modes.weights(Gait(second, np.array([1.5]))), atol=1e-4)
-
-
 def test_weights_are_of_similar_size(modes, group):
     """So that modes that are stored coarsely add little error."""
     weights = modes.weights(Gait(group.shapes.seconds))
     np.testing.assert_allclose(np.mean(weights**2, axis=0), 1.0, rtol=1e-4)
-
-
-def test_what_is_rigid_has_no_modes(model, group):
-    assert fitted_modes(model, {"background": SampledGroup(sampled(round_gaussians([[0.0, 0.0, 0.0]]), 0.0))}) == {}
-    nothing = group.of_rows(torch.zeros(len(group.gaussians), dtype=torch.bool))
-    assert fitted_modes(model, {TURNING: nothing}) == {}
-    assert all(part.shape_weights([0.0], [ActorPlacement("nobody")]) is None for part in model.parts)
 
 
 def test_bytes_hold_the_modes_of_all_groups_in_order(modes):

@@ -15,22 +15,18 @@ from helpers.hand_made_traffic import (
     Traffic,
     own_gaussians,
     placed,
-    some_gaussians,
     with_turning_track,
 )
 from helpers.records import EMPTY_CHECKPOINT
 
 from drivesplat.export import splat_asset
-from drivesplat.export.sampled_motion import sample_motion
-from drivesplat.export.splat_asset import SplatFiles, export_splat, write_parts
-from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
-from drivesplat.export.trained_parts import SampledGroup, trained_gaussians, trained_groups
+from drivesplat.export.splat_asset import SplatFiles, export_splat
+from drivesplat.export.splat_ply import read_splat_ply
+from drivesplat.export.trained_parts import trained_gaussians, trained_groups
 from drivesplat.export.unique_names import unique_names
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.rigid import rigid
 from drivesplat.settings.export import SplatJob
-from drivesplat.trajectories.motion import Motion
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {}}
@@ -90,15 +86,6 @@ def assert_same(found: Gaussians, expected: Gaussians, atol: float = 1e-6) -> No
     torch.testing.assert_close(found.sh, expected.sh, rtol=0, atol=1e-5)
 
 
-def test_every_group_has_a_file_and_an_entry(folder, record, parts):
-    assert list(parts) == ["background", TURNING, GONE_AT_TIMES]
-    files = {part["file"] for part in record["parts"]}
-    assert files == {"background.ply", f"{TURNING}.ply", f"{GONE_AT_TIMES}.ply"}
-    assert {path.name for path in (folder / "parts").iterdir()} == {"parts.json", *files}
-    assert [parts[name]["frame"] for name in parts] == ["world", "object", "object"]
-    assert [(parts[name]["gaussians"], parts[name]["sh_degree"]) for name in parts] == [(3, 0), (12, 1), (12, 1)]
-
-
 def test_objects_are_in_their_own_frame_with_the_colours_of_the_middle_image(folder, parts):
     for track_id in TRAJECTORIES:
         found = read_splat_ply(folder / "parts" / parts[track_id]["file"])
@@ -106,13 +93,6 @@ def test_objects_are_in_their_own_frame_with_the_colours_of_the_middle_image(fol
     background = read_splat_ply(folder / "parts/background.ply")
     np.testing.assert_allclose(background.means, STREET)
     assert background.sh_degree == 0
-
-
-def test_poses_are_those_of_the_closed_form_at_every_sample(parts):
-    for track_id, trajectory in TRAJECTORIES.items():
-        motion = parts[track_id]["motion"]
-        expected = np.stack([trajectory.pose(seconds) for seconds in motion["seconds"]])
-        np.testing.assert_allclose(motion["object_to_world"], expected, rtol=0, atol=1e-9)
 
 
 def test_samples_are_dense_while_an_object_is_present_and_absent_otherwise(parts):
@@ -127,17 +107,6 @@ def test_samples_are_dense_while_an_object_is_present_and_absent_otherwise(parts
         for inside, (low, high) in zip(held, expected, strict=True):
             np.testing.assert_allclose([inside[0], inside[-1]], [low, high], atol=1e-6)
             assert np.diff(inside).max() < 1 / 30 + 2e-6
-
-
-def test_every_image_and_every_annotation_has_a_sample(parts, scene):
-    first = min(frame.timestamp for frame in scene.frames)
-    for track_id, trajectory in TRAJECTORIES.items():
-        motion = parts[track_id]["motion"]
-        images = {f.timestamp for f in scene.frames if trajectory.is_there((f.timestamp - first) * 1e-6)}
-        assert len(images) > 5 and images <= set(motion["timestamps"])
-        assert np.abs(np.subtract.outer(trajectory.times, motion["seconds"])).min(axis=1).max() < 1e-9
-        elapsed = (np.array(motion["timestamps"]) - first) * 1e-6
-        np.testing.assert_allclose(elapsed, motion["seconds"], rtol=0, atol=1e-9)
 
 
 def test_the_groups_compose_the_drive_at_every_image(folder, parts, scene):
@@ -168,53 +137,12 @@ def test_splat_ply_holds_all_groups_present_at_the_middle_image(folder):
     assert not found.sh[:3, 1:].any()
 
 
-def test_class_and_size_of_an_object_come_from_the_scene(parts):
-    known, unknown, static = (parts[name] for name in (TURNING, GONE_AT_TIMES, "background"))
-    assert (known["category"], known["size"]) == ("vehicle.car", [4.0, 2.0, 1.6])
-    assert (unknown["category"], unknown["size"]) == (None, None)
-    assert (static["category"], static["size"], static["motion"]) == (None, None, None)
-
-
-def test_the_record_has_provenance_and_conventions(record, scene, folder):
-    first = min(frame.timestamp for frame in scene.frames)
-    assert (record["schema"], record["scene"], record["dataset"]) == (1, "0001", "tiny")
-    assert record["origin"] == scene.origin.tolist() and record["provenance"] == PROVENANCE
-    assert record["first_image"] == first and record["colors_timestamp"] == first + 2_250_000
-    assert all(sentence.endswith(".") for sentence in record["conventions"].values())
-    note = note_of(folder / f"parts/{TURNING}.ply")
-    assert note == {"scene": "0001", "piece": TURNING, "frame": "object", **DIGESTS}
-
-
 def test_vanilla_is_one_group_equal_to_splat_ply(tmp_path, tiny_scene, monkeypatch):
     record = export_all(tmp_path, SplatModel([round_gaussians(STREET)], None), tiny_scene, monkeypatch)
     assert [(part["file"], part["frame"], part["motion"]) for part in record["parts"]] == [
         ("background.ply", "world", None)
     ]
     assert_same(read_splat_ply(tmp_path / "parts/background.ply"), read_splat_ply(tmp_path / "splat.ply"))
-
-
-def test_only_files_of_dropped_groups_are_removed(tmp_path, scene, monkeypatch):
-    export_all(tmp_path, street(), scene, monkeypatch)
-    folder = tmp_path / "parts"
-    (folder / "mine.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment mine\nend_header\n")
-    (folder / "broken.ply").write_bytes(b'ply\ncomment drivesplat {"piece"\nend_header\n')
-    (folder / "notes.txt").write_text("mine")
-    write_splat_ply(folder / "together.ply", some_gaussians(2, 0, 0), {"scene": "0001"})
-    (folder / "parts.json").unlink()  # as Snakemake does before a job
-    export_all(tmp_path, SplatModel([round_gaussians(STREET)], None), scene, monkeypatch)
-    kept = {"mine.ply", "broken.ply", "notes.txt", "together.ply"}
-    assert {path.name for path in folder.iterdir()} == {"parts.json", "background.ply", *kept}
-
-
-def test_equal_file_names_are_made_unique(tmp_path, tiny_scene):
-    names = ["car 7", "car/7", "Car_7", "../up", ""]
-    groups = {name: SampledGroup(some_gaussians(i + 1, 0, i)) for i, name in enumerate(names)}
-    write_parts(tmp_path / "parts/parts.json", groups, tiny_scene, PROVENANCE)
-    record = json.loads((tmp_path / "parts/parts.json").read_text())
-    files = [part["file"] for part in record["parts"]]
-    assert files == ["car_7.ply", "car_7_2.ply", "Car_7_3.ply", "___up.ply", "_.ply"]
-    assert [len(read_splat_ply(tmp_path / "parts" / file)) for file in files] == [1, 2, 3, 4, 5]
-    assert [path.name for path in tmp_path.iterdir()] == ["parts"]
 
 
 def test_a_name_made_unique_does_not_collide_with_another():
@@ -244,34 +172,3 @@ def test_gaussians_with_nan_are_dropped_in_every_export(tiny_scene, monkeypatch,
 def test_a_transparent_static_gaussian_is_not_an_absent_object(tiny_scene):
     model = SplatModel([round_gaussians(STREET, opacities=[0.0, 0.5, 0.9])], None)
     assert len(trained_gaussians(model, tiny_scene)) == 3
-
-
-def ahead(x: float) -> np.ndarray:
-    return rigid(np.eye(3), np.array([x, 0.0, 0.0]))
-
-
-@pytest.mark.parametrize(
-    ("default_time", "x", "present"),
-    [
-        (0.2, 2.0, True),
-        (1.4, 14.0, True),
-        (2.0, 15.0, False),
-        (2.9, 80.0, False),
-        (3.1, 80.0, True),
-        (9.0, 80.0, False),
-    ],
-)
-def test_the_default_pose_of_an_absent_object_is_the_nearest_in_time(default_time, x, present):
-    """There from 0 to 1.5 s at ten metres a second, and standing from 3 to 4 s: its motion is not continued beyond."""
-    poses = np.stack([ahead(5.0), ahead(10.0), ahead(80.0)])
-    motion = sample_motion(Motion(np.array([0.5, 1.0, 3.5]), poses, ((0, 1), (2, 2)), 0.5), np.array([]), default_time)
-    assert motion.present_by_default == present
-    assert motion.default_pose[0, 3] == pytest.approx(x, abs=1e-9)
-
-
-def test_overlapping_spans_are_merged():
-    """Annotations 0.6 s apart that are not consecutive: each reaches half a second."""
-    poses = np.stack([ahead(0.0), ahead(1.0)])
-    motion = sample_motion(Motion(np.array([1.0, 1.6]), poses, ((0, 0), (1, 1)), 0.5), np.array([]), 0.0)
-    assert motion.spans == ((0.5, 2.1),)
-    assert np.diff(motion.seconds).max() < 1 / 30 + 2e-6

@@ -9,20 +9,15 @@ from helpers.samples import sampled
 from helpers.walkers import walker
 from pxr import Gf, Usd, UsdVol
 
-from drivesplat.errors import ConfigError
-from drivesplat.export.sampled_motion import SHAPES_PER_SECOND, SampledMotion, shape_seconds
-from drivesplat.export.splat_asset import write_parts
 from drivesplat.export.thinning import thinned_groups
 from drivesplat.export.trained_parts import shown_timestamp, trained_gaussians, trained_groups
 from drivesplat.export.usd import splat_stage, write_usdz
-from drivesplat.io.storage import read_json
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import TimeState
 from drivesplat.settings.train import GaussianSettings
 
 NO_TIMES = np.array([], dtype=np.int64)
-PROVENANCE = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64, "stages": {}}
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +51,6 @@ def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, 
 def test_what_is_rigid_has_no_shapes(model, scene):
     assert trained_groups(model, scene, NO_TIMES)["background"].shapes is None
     assert all(part.shapes("nobody", [0.0]) is None for part in model.parts)
-
-
-def test_shapes_are_sampled_while_the_object_is_present():
-    spans = ((0.05, 0.3), (1.0, 1.2))
-    seconds = shape_seconds(SampledMotion(np.zeros(1), np.eye(4)[None], spans, 0.0))
-    assert all(end in seconds for span in spans for end in span)
-    assert all(any(first <= second <= last for first, last in spans) for second in seconds)
-    within = seconds[seconds < 0.5]
-    assert np.diff(within).max() < 1.0 / SHAPES_PER_SECOND + 1e-5
 
 
 def test_thinning_leaves_each_gaussian_its_own_shapes(model, scene):
@@ -113,18 +99,3 @@ def test_a_ply_shows_the_time_that_was_asked_for(model, people, scene):
         together = trained_gaussians(model, scene, second)
         expected = sampled(people, second).means.detach()
         np.testing.assert_allclose(together.means[-30:].detach().numpy(), expected.numpy(), atol=1e-5)
-
-
-def test_the_record_of_parts_tells_what_deforms_and_when(model, scene, tmp_path):
-    groups = trained_groups(model, scene, NO_TIMES, 1.0)
-    write_parts(tmp_path / "parts.json", groups, scene, PROVENANCE, 1.0)
-    record = read_json(tmp_path / "parts.json", "export")
-    assert {part["name"]: part["deforms"] for part in record["parts"]} == {"background": False, TURNING: True}
-    assert record["colors_timestamp"] == record["first_image"] + 1_000_000
-
-
-def test_a_time_after_the_last_image_is_refused(scene):
-    last = scene.seconds(max(frame.timestamp for frame in scene.frames))
-    assert shown_timestamp(scene, last) == max(frame.timestamp for frame in scene.frames)
-    with pytest.raises(ConfigError, match=r"export\.time_s is 1000\.0, but the last image of scene"):
-        shown_timestamp(scene, 1000.0)

@@ -10,7 +10,7 @@ from helpers.hand_made import Own, looking_at, recording_of, round_gaussians
 from pxr import Usd, UsdGeom
 
 from drivesplat.errors import ResultError
-from drivesplat.export.far_gaussians import MAX_CHANGE, find_far, find_far_in, read_far, within_reach
+from drivesplat.export.far_gaussians import MAX_CHANGE, find_far, read_far, within_reach
 from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.export.usd import export_usd
@@ -20,7 +20,6 @@ from drivesplat.model.reach import reach_of
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.export import ExportJob, SplatJob
 from drivesplat.settings.train import TrainJob, TrainSettings
 
@@ -122,41 +121,6 @@ def test_a_bound_that_cannot_be_kept_is_reported_with_the_change(caplog):
     assert change == pytest.approx(far.largest_change, abs=1e-6) and change > MAX_CHANGE
     (message,) = caplog.messages
     assert f"a change of {255 * change:.2f}/255 at most" in message and "1 of 61 Gaussians" in message
-
-
-def test_moved_ones_stay_in_their_order():
-    """A red disc before a green one, on one line of sight: the red one stays the one that is seen."""
-    places, colors = [[6e4, 0.0, 1.0], [2e4, 0.0, 1.0]], [[0.0, 1.0, 0.0], RED]
-    checkpoint = checkpoint_of(places, sizes=[3e3, 1e3], opacities=0.95, colors=colors)
-    far = found(checkpoint, views())
-    assert far.moved.tolist() == [60, 61]
-    distances = np.linalg.norm(far.means, axis=1)
-    assert distances[1] < distances[0] <= LIMIT
-    assert (
-        float((images(within_reach(checkpoint, far), views()) - images(checkpoint, views())).abs().max()) <= MAX_CHANGE
-    )
-
-
-def test_a_model_within_the_limit_is_left_alone_without_rendering(monkeypatch):
-    monkeypatch.setattr(SplatModel, "render", None)
-    checkpoint = checkpoint_of([[999.0, 0.0, 0.0]], **INVISIBLE)
-    far = found(checkpoint, views())
-    assert len(far.removed) == len(far.moved) == far.views == 0
-    assert all(torch.equal(a, checkpoint.model[name]) for name, a in within_reach(checkpoint, far).model.items())
-
-
-@pytest.mark.parametrize(("metres", "too_far"), [(999.0, 0), (8e4, 1)])
-def test_the_device_is_opened_only_for_gaussians_too_far_away(metres, too_far, tiny_scene):
-    opened = []
-
-    def device_settings() -> DeviceSettings:
-        opened.append(metres)
-        return DeviceSettings(kind="cpu")
-
-    checkpoint, record = checkpoint_of([[metres, 0.0, 1.0]], **INVISIBLE), recording_of(tiny_scene).record
-    far = find_far_in(checkpoint, record, LIMIT, PROVENANCE, device_settings)
-    assert len(opened) == len(far.removed) + len(far.moved) == too_far
-    assert far.views == too_far * len(record.train_images)
 
 
 def test_a_long_drive_keeps_what_is_near_its_cameras():

@@ -5,7 +5,6 @@ import io
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made import recording_of
@@ -255,29 +254,3 @@ def test_one_finger_looks_and_two_pan_and_zoom(tmp_path):
         assert tab.complaints == []
     moved = pose[:3, 3] + pose[:3, :3] @ np.array([-10.0 * 15.0 / 205.0, 0.0, 10.0 * np.log(50.0 / 40.0)])
     assert psnr(pinched, rendered(model, rigid(pose[:3, :3], moved))) > 35.0
-
-
-@in_a_browser
-@pytest.mark.parametrize("size", [(390, 844), (320, 568), (844, 390)])
-def test_controls_stay_inside_a_small_window_and_apart(tmp_path, size):
-    groups = {"background": SampledGroup(splats(60, sh_degree=1)), CAR: driving_car()}
-    content = ViewerContent(
-        groups, None, False, path_from(oblique_frame()), edits=edits(), images=[plain_image(0.0, (9, 9, 9))],
-        method="street", methods=("street", "vanilla"),
-    )  # fmt: skip
-    (tmp_path / "street").mkdir()
-    file = tmp_path / "street/viewer.html"
-    file.write_text(viewer_page(content, "a scene with a long name · street", {}))
-    boxes = """["title", "shown", "hint", "bar", "play", "time", "clock", "speed", "image", "edit", "method", "help"]
-      .map((id) => document.getElementById(id).getBoundingClientRect())
-      .map(({ left, top, right, bottom }) => [left, top, right, bottom])"""
-    with chromium(tmp_path / "profile") as tab:
-        tab.open(file, *size)
-        settled(tab)
-        found = np.array(tab.run(boxes))
-        assert tab.complaints == []
-    assert (found[:, :2] >= 0.0).all() and (found[:, 2:] <= size).all()
-    title, shown, hint, bar = found[:4]
-    assert title[3] <= shown[1] and shown[3] <= hint[1] and hint[3] <= bar[1], "one below the other"
-    assert (found[4:, :2] >= bar[:2]).all() and (found[4:, 2:] <= bar[2:]).all()
-    assert (found[4:, 2] - found[4:, 0] > 10.0).all()

@@ -90,13 +90,6 @@ def test_a_file_that_ends_early_is_kept_for_the_next_run(archive, tmp_path, leng
     assert (tmp_path / "mini/v1.0-mini/scene.json").is_file()
 
 
-@pytest.mark.parametrize("after", [0, 1000])
-def test_a_silent_server_is_not_waited_for(archive, tmp_path, after):
-    with served(Site(archive, silent_after=after)) as site:
-        message = refused(site.job(tmp_path / "mini", attempts=1, timeout_s=0.3))
-    assert "timed out" in message and ("1,000 of" in message) == (after > 0)
-
-
 def test_a_server_that_trickles_is_left(archive, tmp_path):
     """A byte at a time never is silence; what has come is kept."""
     with served(Site(archive, trickle_s=0.05)) as site:
@@ -135,25 +128,6 @@ def test_a_full_disk_is_reported_before_anything_is_fetched(archive, tmp_path, m
         assert asked == [tmp_path / "disk/mini.download"] and site.asked == []
         monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 0, int(1e8) + len(archive)))
         download(site.job(tmp_path / "disk/mini"))
-
-
-def test_what_has_come_already_needs_no_room_twice(archive, tmp_path, monkeypatch):
-    with served(Site(archive, cut_after=[1000, 0])) as site:
-        refused(site.job(tmp_path / "mini", attempts=1))
-        monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 0, int(1e8) + len(archive) - 1000))
-        download(site.job(tmp_path / "mini"))
-
-
-def test_a_disk_that_others_have_filled_meanwhile_is_reported_before_anything_is_unpacked(
-    archive, tmp_path, monkeypatch
-):
-    free = [10**9, 1000]
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 0, free.pop(0)))
-    with served(Site(archive)) as site:
-        job = site.job(tmp_path / "mini")
-        with pytest.raises(DatasetError, match="unpacking nuScenes mini needs"):
-            download(job)
-    assert sorted(path.name for path in work_folder(job).iterdir()) == ["lock", "v1.0-mini.tgz"]
 
 
 def test_a_disk_that_fills_up_is_a_line_and_keeps_what_has_come(archive, tmp_path, monkeypatch):
@@ -346,17 +320,6 @@ def test_no_file_of_an_archive_may_run_as_another_user(archive, tmp_path):
     with served(Site(repacked(archive, member("samples/tool"), tmp_path))) as site:
         download(site.job(tmp_path / "mini"))
     assert not (tmp_path / "mini/samples/tool").stat().st_mode & (stat.S_ISUID | stat.S_ISGID | stat.S_IWOTH)
-
-
-def test_a_wrong_archive_that_a_user_put_there_is_named_and_left_alone(archive, tmp_path):
-    with served(Site(archive)) as site:
-        job = site.job(tmp_path / "mini")
-        work_folder(job).mkdir()
-        mine = work_folder(job) / "v1.0-mini.tgz"
-        mine.write_bytes(b"mine")
-        with pytest.raises(DatasetError, match=rf"{mine}.*4 bytes.*remove the file"):
-            download(job)
-    assert mine.read_bytes() == b"mine" and site.asked == []
 
 
 def only_complaint(done: subprocess.CompletedProcess) -> str:

@@ -79,10 +79,9 @@ def test_an_unknown_method_lists_those_there_are(copy):
     assert "vanila" in line and "vanilla" in line
 
 
-@pytest.mark.parametrize("target", ["nowhere.mp4", "nowhere.cameras.json"])
-def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy, target):
-    line = only_complaint(copy.run(f"results/0001/vanilla/{target}"))
-    assert f"'{target.split('.')[0]}'" in line and "original, lateral_2m" in line and "render.trajectories" in line
+def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy):
+    line = only_complaint(copy.run("results/0001/vanilla/nowhere.mp4"))
+    assert "'nowhere'" in line and "original, lateral_2m" in line and "render.trajectories" in line
     assert not (copy.folder / "results/0001").exists()
 
 
@@ -90,33 +89,7 @@ def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy, ta
     ("target", "words"),
     [
         ("vanilla/edits/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
-        pytest.param(
-            "vanilla/parts.mp4", ["'vanilla' has no moving parts", "those do: street"], marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "street/edits/halt.mp4",
-            ["no edit called 'halt'", "there are: gone, stop", "datasets.<name>.edits"],
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "vanilla/quad/stop.mp4", ["'vanilla' knows no actors", "those do: street"], marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "street/quad/halt.mp4", ["no edit called 'halt'", "there are: gone, stop"], marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "street/edits/halt.json", ["no edit called 'halt'", "there are: gone, stop"], marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "street/edits/halt/drive/drive.json",
-            ["no edit called 'halt'", "there are: gone, stop"],
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "vanilla/edits/stop/drive/drive.json",
-            ["'vanilla' knows no actors", "those do: street"],
-            marks=pytest.mark.slow,
-        ),
+        ("street/edits/halt.mp4", ["no edit called 'halt'", "there are: gone, stop", "datasets.<name>.edits"]),
     ],
 )
 def test_an_edit_that_there_is_none_of_stops_before_any_job(copy, target, words):
@@ -131,13 +104,14 @@ GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
 @pytest.mark.parametrize(
     ("edits", "subject", "target", "words", "extracted"),
     [
-        (GONE.format("0009"), None, "edits/gone.mp4",
-         ["edit 'gone', step 1 (remove): no track has an id starting with '0009'"], False),
         (GONE.format("0001 instance 1"), None, "edits/gone.mp4",
          ["edit 'gone'", "no editable track", "editable tracks: 0001", "people need presets/people.yaml"], True),
-        (EDITS, "0001", "removal.png", ["subjects.0001", "no track '0001'", "that move: 0001 instance 0"], False),
+        pytest.param(
+            EDITS, "0001", "removal.png", ["subjects.0001", "no track '0001'", "that move: 0001 instance 0"], False,
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["an edit of no track", "an edit of a parked car", "a subject"],
+    ids=["an edit of a parked car", "a subject"],
 )  # fmt: skip
 def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, target, words, extracted):
     copy.config["subjects"] = {"0001": {"track": subject}}
@@ -196,44 +170,19 @@ def edit_table(copy: WorkflowCopy, table: str, change) -> None:
     path.write_text(json.dumps(rows))
 
 
-SLOW = pytest.mark.slow
-"""For faults of tables and images that differ in their messages alone, which tests/readers/test_nuscenes.py has too."""
-
-
-@pytest.mark.parametrize(
-    ("table", "change", "token"),
-    [
-        ("ego_pose", lambda rows: rows[3].update(translation=[float("nan"), 0, 0]), "0001 CAM_FRONT 3"),
-        pytest.param("ego_pose", lambda rows: rows[2].update(rotation=[2.0, 0, 0, 0]), "0001 CAM_FRONT 2", marks=SLOW),
-        pytest.param(
-            "calibrated_sensor",
-            lambda rows: rows[0].update(camera_intrinsic=[[0] * 3] * 3),
-            "calibrated CAM_FRONT",
-            marks=SLOW,
-        ),
-        pytest.param(
-            "sample", lambda rows: rows[4].update(timestamp=rows[3]["timestamp"]), "0001 sample 4", marks=SLOW
-        ),
-    ],
-)
-def test_malformed_tables_are_rejected_with_the_token(copy, table, change, token):
-    edit_table(copy, table, change)
+@pytest.mark.slow
+def test_malformed_tables_are_rejected_with_the_token(copy):
+    edit_table(copy, "ego_pose", lambda rows: rows[3].update(translation=[float("nan"), 0, 0]))
     copy.config["sweeps"] = True
     copy.write_config()
-    assert token in only_complaint(copy.run("results/0001/scene.json"))
+    assert "0001 CAM_FRONT 3" in only_complaint(copy.run("results/0001/scene.json"))
     assert not (copy.folder / "results/0001/scene.json").exists()
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        pytest.param(lambda p: p.unlink(), id="missing", marks=SLOW),
-        pytest.param(lambda p: p.write_bytes(p.read_bytes()[:700]), id="truncated"),
-    ],
-)
-def test_a_bad_image_is_named_with_its_sample(copy, damage):
+@pytest.mark.slow
+def test_a_bad_image_is_named_with_its_sample(copy):
     path = copy.folder / "data/samples/CAM_FRONT/0001__0004.jpg"
-    damage(path)
+    path.write_bytes(path.read_bytes()[:700])
     line = only_complaint(copy.run("results/0001/scene.json"))
     assert "0001__0004.jpg" in line and "0001 CAM_FRONT 4" in line
     assert not (copy.folder / "results/0001/scene.json").exists()

@@ -30,7 +30,6 @@ class Site:
 
     content: bytes
     tag: str | None = '"first"'
-    date: str | None = None
     ranges: bool = True
     length: int | None = None
     """What it announces instead of the true length; -1: nothing."""
@@ -60,9 +59,8 @@ class Site:
         start = self._start(handler)
         body = self.content[start:]
         handler.send_response(206 if start else self.status)
-        for name, value in (("ETag", self.tag), ("Last-Modified", self.date)):
-            if value:
-                handler.send_header(name, value)
+        if self.tag:
+            handler.send_header("ETag", self.tag)
         if start:
             first = start + 1 if self.wrong_range else start
             handler.send_header("Content-Range", f"bytes {first}-{len(self.content) - 1}/{len(self.content)}")
@@ -93,7 +91,7 @@ class Site:
         """Where its answer begins: a condition that does not hold makes it send all."""
         wanted = re.fullmatch(r"bytes=(\d+)-", handler.headers.get("Range", ""))
         condition = handler.headers.get("If-Range")
-        same = condition is None or not self.heeds_conditions or condition in (self.tag, self.date)
+        same = condition is None or not self.heeds_conditions or condition == self.tag
         return int(wanted[1]) if wanted and self.ranges and same else 0
 
     @property
@@ -124,12 +122,7 @@ def served(site: Site) -> Iterator[Site]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            if self.path == "/moved":
-                self.send_response(302)
-                self.send_header("Location", site.address)
-                self.end_headers()
-            else:
-                site.answer(self)
+            site.answer(self)
 
         def log_message(self, *_):
             pass

@@ -6,14 +6,11 @@ from typing import Any
 import numpy as np
 
 from drivesplat.io.storage import canonical_json
-from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.world import WorldJob, WorldSettings
-from drivesplat.world.optics.rig import SENSORS, key_frame_time
-from drivesplat.world.output.tables import visibility_level
+from drivesplat.world.optics.rig import SENSORS
 from drivesplat.world.recorder import Recorder
 from drivesplat.world.street.objects import StreetObject
-from helpers.classed import classed
 
 RIG = {sensor.channel: sensor for sensor in SENSORS}
 FRONT, LIDAR = RIG["CAM_FRONT"], RIG["LIDAR_TOP"]
@@ -78,33 +75,3 @@ def meshes_at(item: StreetObject, seconds: float) -> np.ndarray:
     poses = item.piece_poses(np.array([seconds]))[0]
     pieces = zip(poses, item.body.pieces, strict=True)
     return np.concatenate([mesh.triangles @ pose[:3, :3].T + pose[:3, 3] for pose, mesh in pieces])
-
-
-def annotated(recorder: Recorder, key_frames: list[int]) -> Scene:
-    """The drive as a scene without files: the front camera's images at `key_frames`, the boxes of all key frames.
-
-    Visibilities are those of the tables at `key_frames`; at others every object is wholly visible.
-    """
-    world = recorder.world
-    times = np.array([key_frame_time(world, index) for index in range(world.key_frames)])
-    frames = []
-    for index in key_frames:
-        seconds = (times[index] + FRONT.delay_us) * 1e-6
-        camera, ego = recorder.camera(FRONT, seconds), recorder.ego_pose(seconds)
-        frames.append(
-            Frame(FRONT.channel, int(times[index] + FRONT.delay_us), "", camera.width, camera.height,
-                  camera.intrinsics, camera.pose, ego, True, index, str(index))
-        )  # fmt: skip
-    levels = np.full((len(recorder.objects), world.key_frames), 4)
-    for index in key_frames:
-        levels[:, index] = [int(visibility_level(fraction)) for fraction in recorder.visible_fractions(index)]
-    tracks = [
-        Track(item.name, *classed(item.category), item.size, times, np.arange(world.key_frames),
-              item.box_poses(times * 1e-6), levels[number])
-        for number, item in enumerate(recorder.objects)
-        if item.category
-    ]  # fmt: skip
-    return Scene(
-        "demo", "demo", "v1.0-mini", "", np.zeros(3), times, tuple(frames), (), tuple(tracks), "nuscenes",
-        float(world.key_frame_hz),
-    )  # fmt: skip

@@ -1,6 +1,8 @@
 """Damage to the files of a dataset, chosen by hypothesis: JSON tables, texts, packed files and files of bytes."""
 
+import functools
 import gzip
+import inspect
 import json
 import math
 import re
@@ -12,10 +14,35 @@ from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import pytest
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 CHANCE = st.randoms(use_true_random=False)
 """A generator whose every choice is hypothesis' own, so that it shortens damage that a test finds."""
+
+
+def damages(few: int, many: int) -> Callable[[Callable], Callable]:
+    """Runs a test on `few` choices of its argument `random`, and as a slow test on `many`."""
+
+    def decorate(test: Callable) -> Callable:
+        @pytest.mark.parametrize("examples", [few, pytest.param(many, marks=pytest.mark.slow)])
+        @functools.wraps(test)
+        def run(examples: int, **fixtures: Any) -> None:
+            @settings(max_examples=examples)
+            @given(random=CHANCE)
+            def example(random: Random) -> None:
+                test(**fixtures, random=random)
+
+            example()
+
+        own = inspect.signature(test).parameters.values()
+        examples = inspect.Parameter("examples", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        run.__signature__ = inspect.Signature([examples, *(one for one in own if one.name != "random")])
+        return run
+
+    return decorate
+
 
 JUNK: list[Any] = [
     None, True, False, 0, 1, -1, 2**31, 2**63, -(2**63) - 1, 10**30, 10**400, 0.5, -0.0, 1e-300, 1e300, math.nan,

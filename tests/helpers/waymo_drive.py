@@ -28,8 +28,6 @@ COLUMNS, BLOCK = 120, 6
 """Columns of the TOP laser, and how many of them share a time."""
 SWEEP_S = 0.1
 READOUT_S, SHUTTER_S = 0.04, 0.004
-FORWARD_LEFT_UP = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""The columns are Waymo's camera axes in OpenCV's: forward is z, left is -x, up is -y."""
 
 
 def transform(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:

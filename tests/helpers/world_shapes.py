@@ -6,7 +6,6 @@ import numpy as np
 
 from drivesplat.world.shapes import buildings, mesh, plants, scenery, vehicles
 from drivesplat.world.shapes.animals import Dog
-from drivesplat.world.shapes.bicycle import GEAR_RATIO, WHEEL_RADIUS
 from drivesplat.world.shapes.body import Body
 from drivesplat.world.shapes.cyclist import Cyclist
 from drivesplat.world.shapes.mesh import ColoredMesh, Material, SurfaceClass
@@ -68,7 +67,6 @@ STANDING: dict[str, Callable[[], ColoredMesh]] = {
 }
 ALL = {**STANDING, **IN_THE_AIR, **{name: (lambda make=make: make(seeded())) for name, make in PLANTS.items()}}
 TOP, TROUSERS = (0.4, 0.06, 0.05), (0.05, 0.06, 0.2)
-CRANK_TURN = 2.0 * np.pi * WHEEL_RADIUS * GEAR_RATIO
 WALKERS = {
     "walking": Person(1.75, TOP, TROUSERS),
     "short": Person(1.5, TOP, TROUSERS, phase=0.3),

@@ -57,21 +57,3 @@ def test_items_are_prefetched_by_one_thread_while_earlier_ones_are_used():
     assert list(given) == list(range(1, 20))
     assert len(set(made)) == 1 and made[0] != threading.get_ident()
     assert list(prefetch_items([])) == []
-
-
-def test_at_most_the_given_number_of_items_is_prefetched():
-    made = []
-    given = prefetch_items((made.append(item) or item for item in range(100)), at_most=3)
-    for taken in range(1, 6):
-        next(given)
-        time.sleep(0.01)
-        assert len(made) <= taken + 3
-    given.close()
-    assert len(made) < 10
-
-
-def test_an_exception_is_raised_in_place_of_its_item():
-    given = prefetch_items((1 // (item - 2) for item in range(5)), at_most=4)
-    assert [next(given), next(given)] == [-1, -1]
-    with pytest.raises(ZeroDivisionError):
-        next(given)

@@ -153,9 +153,7 @@ def of_poses(given: Given) -> Iterator[tuple[str, Operation]]:
     yield "about_vertical", (about_vertical, {"angles": given.uniform(n)})
     annotations = 2 * n
     actor = torch.arange(annotations) // 2
-    weights = torch.zeros(n, annotations, dtype=given.dtype)
-    weights[actor, torch.arange(annotations)] = given.uniform(annotations, low=0.1)
-    translations = given.uniform(n, 3)
+    weights, translations = given.uniform(annotations, low=0.1), given.uniform(n, 3)
     yield (
         "corrected",
         (
@@ -218,21 +216,28 @@ def test_single_precision_agrees_with_double(name):
         torch.testing.assert_close(rounded.double(), exact, rtol=1e-3, atol=1e-4 * float(exact.abs().max()) + 1e-6)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_nothing_gives_nothing_or_no_number_and_no_crash(name):
-    """Without rows, sums are 0 and means either 0 or NaN; gradients have the shape of their inputs."""
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("ssim", "color_difference")])
+def test_without_rows_gradients_are_empty(name):
+    """An image has at least one pixel; those of alpha may be of no rays."""
     operation = operations(torch.float32, 0)[name]
     _, found = gradients(operation)
     for key, values in operation[1].items():
         assert found[key].shape == values.shape
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "mean_depth_error"])
+SELECTIVE = {"mean_depth_error": ["depth"], "road_distance": ["means"], "view_colors 0": ["means"]}
+"""Inputs of which NaN has no effect: the largest errors do not count, nor Gaussians that are not near the road; without
+directions, places do not matter."""
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_nan_of_an_input_reaches_the_result(name):
-    """A training sees it in its loss. The depth error keeps the smallest errors alone."""
+    """A training sees it in its loss. Of a cube map all texels are NaN, since a few rays do not meet every one."""
     function, inputs = operations(torch.float64, 5)[name]
     for key, values in inputs.items():
+        if key in SELECTIVE.get(name, ()):
+            continue
         broken = values.clone()
-        broken.view(-1)[0] = torch.nan
+        broken.view(-1)[: None if key == "texels" else 1] = torch.nan
         outputs = flat(function(*(inputs | {key: broken}).values()))
         assert any(bool(output.isnan().any()) for output in outputs), key

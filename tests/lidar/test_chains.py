@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drivesplat.lidar.objects.clusters import Chain, Cluster, chains_of, connected
-from drivesplat.lidar.objects.merging import after_gaps, of_parts
+from drivesplat.lidar.objects.merging import after_gaps
 
 
 def cluster(scan: int, place: tuple[float, float], seconds: float | None = None) -> Cluster:
@@ -47,13 +47,3 @@ def test_chains_are_joined_where_one_goes_on_as_the_other_ended(velocity, joined
     found = after_gaps([after, before])
     assert len(found) == joined
     assert joined == 2 or (np.diff(found[0].seconds) > 0.0).all()
-
-
-def test_parts_of_a_fast_object_are_one_and_people_side_by_side_are_two():
-    front, rear = chain(range(20), (4.0, 0.0), (8.0, 0.0)), chain(range(20), (0.0, 0.2), (8.0, 0.0))
-    (whole,) = of_parts([front, rear])
-    assert len(whole.clusters) == 20 and {len(one.points) for one in whole.clusters} == {8}
-    people = [chain(range(20), (0.0, 0.9 * k), (1.3, 0.0)) for k in range(2)]
-    assert len(of_parts(people)) == 2
-    lanes = [chain(range(20), (0.0, 3.5 * k), (8.0, 0.0)) for k in range(2)]
-    assert len(of_parts(lanes)) == 2

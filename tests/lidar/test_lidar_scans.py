@@ -64,16 +64,6 @@ def test_the_demo_worlds_rays_are_rebuilt(recorder, rebuilt):
         np.testing.assert_allclose(found[:, columns], expected, atol=2e-3)
 
 
-def test_without_the_motion_rays_would_be_elsewhere(recorder, rebuilt):
-    """The car drives metres a second: its first ray, 50 ms before the timestamp, starts decimetres behind."""
-    rows = recorder.sweep(LIDAR, TIME_US).astype(np.float64)
-    lidar = Lidar("top", recorder.pattern.elevations, len(recorder.pattern.azimuths))
-    still = scan_of(LidarReturns(rows[:, :3], None, rows[:, 4].astype(np.int64)), lidar, standing)
-    both = still.returned & rebuilt.returned
-    assert np.abs(still.ranges - rebuilt.ranges)[both].max() > 0.1
-    assert not still.rays.offsets_s.any() and still.intensities is None
-
-
 def pattern_returns(beams: np.ndarray, steps: int, shifts: np.ndarray, keep: np.ndarray) -> LidarReturns:
     """Returns at 10 m + ring of the rays where `keep` (b, steps), each ring shifted in azimuth."""
     rings, columns = np.nonzero(keep)
@@ -109,27 +99,6 @@ def test_rings_steps_and_elevations_are_found_where_they_are_unknown(steps, ring
     np.testing.assert_allclose(steps_of, 2.0 * np.pi / 90, atol=1e-5)
 
 
-def test_holes_have_the_directions_of_the_grid_and_returns_their_own():
-    returns = pattern_returns(BEAMS, 90, SHIFTS, KEEP)
-    jitter = Rotation.from_euler("z", np.random.default_rng(1).normal(0.0, 2e-3, (len(returns.points), 1)))
-    scan = scan_of(replace(returns, points=jitter.apply(returns.points)), Lidar("top", BEAMS, 90), standing)
-    off = wrapped(scan.rays.azimuths - (-np.pi + (np.arange(90) + SHIFTS[:, None]) * 2.0 * np.pi / 90))
-    assert scan.returned.sum() == KEEP.sum()
-    assert np.abs(off[~scan.returned]).max() < 1e-3 < np.abs(off[scan.returned]).max()
-    found = scan.points()
-    assert max(np.linalg.norm(found - point, axis=1).min() for point in jitter.apply(returns.points)) < 1e-4
-
-
-def test_the_nearest_of_several_returns_is_kept():
-    points = np.array([[9.0, 0.0, 0.0], [4.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
-    returns = LidarReturns(points, np.array([0.1, 0.2, 0.3], np.float32), np.zeros(3, np.int64))
-    scan = scan_of(returns, Lidar("top", np.zeros(1), 8), standing)
-    assert scan.returned.sum() == 1 and scan.ranges.max() == 4.0
-    assert scan.intensities.max() == pytest.approx(0.2)
-    unknown = replace(returns, intensity=np.full(3, np.nan, np.float32))
-    assert not scan_of(unknown, Lidar("top", np.zeros(1), 8), standing).intensities.any()
-
-
 def test_more_rings_than_beam_elevations_are_measured():
     """As in a file of another sensor than the one that its table describes."""
     scan = scan_of(pattern_returns(BEAMS, 90, SHIFTS, KEEP), Lidar("top", BEAMS[:3], 90), standing)
@@ -155,15 +124,6 @@ def test_beams_on_which_returns_do_not_lie_are_refused():
             scan_of(returns, Lidar("top", MANY, 90), standing)
 
 
-def test_beams_between_which_returns_scatter_a_little_are_not():
-    returns = replace(pattern_returns(MANY, 90, np.zeros(32), ALL), rings=None)
-    tilt = np.random.default_rng(1).normal(0.0, 0.003, (len(returns.points), 1))  # a quarter of half a beam
-    scan = scan_of(
-        replace(returns, points=Rotation.from_euler("y", tilt).apply(returns.points)), Lidar("top", MANY, 90), standing
-    )
-    assert scan.returned.sum() > 0.95 * ALL.sum()
-
-
 @pytest.mark.parametrize("known", [MANY[::-1], MANY - 0.1, np.radians(np.linspace(-25.0, 15.0, 40))])
 def test_beams_of_another_sensor_than_the_rings_are_measured(known):
     scan = scan_of(
@@ -171,22 +131,6 @@ def test_beams_of_another_sensor_than_the_rings_are_measured(known):
     )
     assert scan.rays.shape == (len(known), 90) and (~scan.returned[:32]).sum() == 320
     np.testing.assert_allclose(scan.rays.elevations[:32], np.tile(MANY[:, None], 90), atol=1e-5)  # also of holes
-
-
-def test_times_of_returns_are_kept_and_holes_have_those_of_their_firing():
-    returns = pattern_returns(BEAMS, 90, np.zeros(5), KEEP)
-    columns = np.nonzero(KEEP)[1]
-    scan = scan_of(replace(returns, offsets_s=1e-3 * columns), Lidar("top", BEAMS, 90), standing)
-    np.testing.assert_allclose(scan.rays.offsets_s, np.tile(1e-3 * np.arange(90), (5, 1)), atol=1e-6)
-
-
-def test_a_sweep_without_returns_is_all_holes():
-    empty = LidarReturns(np.zeros((0, 3)), rings=np.zeros(0, np.int64))
-    scan = scan_of(empty, Lidar("top", BEAMS, 90), standing, Spin(0.1, -0.1, 0.0))
-    assert scan.rays.shape == (5, 90) and not scan.returned.any()
-    for lidar in (Lidar("top", None, 90), Lidar("top", BEAMS, None)):
-        with pytest.raises(DatasetError, match=r"LiDAR top: .* needs (beam_elevations|azimuth_steps)"):
-            scan_of(empty, lidar, standing)
 
 
 def test_the_motion_of_the_sensor_is_that_between_sweeps_and_extrapolated():

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.drives import LIDAR_AT, START_US, World, cast_lidar, scene_at, seconds_of, write_world
+from helpers.drives import LIDAR_AT, START_US, World, scene_at, seconds_of, write_world
 from helpers.small_runs import S, settings_of
 from PIL import Image
 
@@ -21,7 +21,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.ego_mask import ego_mask_record
 from drivesplat.preprocess.lidar_depth import lidar_depths
-from drivesplat.preprocess.lidar_seed import lidar_points, seed_points
+from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.masks import read_sky_mask
@@ -37,7 +37,6 @@ from drivesplat.settings.masks import EgoMaskJob, MaskJob
 HALF_AN_INTERVAL = 250_000
 WORLD = World(key_frames=8, sweeps_between=5, lidar_between=4)
 IMAGES, SWEEPS = 7 * 6 + 1, 7 * 5 + 1
-CAR = WORLD.things[0]
 EVERYTHING = {"lidar_sweeps": True}
 
 
@@ -196,67 +195,6 @@ def test_unevenly_spaced_key_frames_exclude_by_time(rich_root):
         assert {group for _, group in between} == {"excluded", "train"}
 
 
-HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}
-
-
-def training_seconds(scene: Scene) -> list[float]:
-    groups = sweep_groups(scene, HoldoutSettings(**HELD_OUT))
-    return [seconds_of(s.timestamp) for s, group in zip(scene.sweeps, groups, strict=True) if group == "train"]
-
-
-def test_the_seed_has_the_static_returns_of_all_training_sweeps(rich_root):
-    scene = scene_at(rich_root, **EVERYTHING)
-    settings = SeedJob(lidar_seed={"voxel_size": 0.0}, holdout=HELD_OUT, images={}, random_seed=0)
-    points, times, missing = lidar_points(scene, settings)
-    seconds = training_seconds(scene)
-    assert missing == 0 and len(seconds) == 23 and {round(s % 0.5, 1) for s in seconds} == {0.0, 0.1, 0.2, 0.3, 0.4}
-    assert set(seconds_of(times).round(6)) == set(np.round(seconds, 6))
-    for moment in seconds[::4]:
-        found = points[times == START_US + round(moment * 1e6)]
-        returns = cast_lidar(WORLD, moment)[:, :3].astype(float)
-        kept = np.hypot(returns[:, 0], returns[:, 1]) > 2.5
-        world = returns + WORLD.ego_at(moment) + LIDAR_AT
-        for thing in (CAR, WORLD.things[2]):
-            kept &= ~(np.abs(world - thing.at(moment)) < np.array(thing.size) / 2 + 0.2).all(axis=1)
-        np.testing.assert_allclose(found, world[kept], atol=1e-3)
-
-
-def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
-    """Five times as many sweeps as key frames, each in the car's own frame at its time."""
-    settings = ActorSeedJob(
-        actors={"min_points": 0, "box_margin": 0.0}, holdout=HELD_OUT, images={}, own_car_radius=2.5,
-        random_seed=0,
-    )  # fmt: skip
-    scene = scene_at(rich_root, **EVERYTHING)
-    few, many = (actors_record(s, settings).actors[0].points for s in (scene_at(rich_root), scene))
-    expected = []
-    for moment in training_seconds(scene):
-        own = cast_lidar(WORLD, moment)[:, :3].astype(float) + WORLD.ego_at(moment) + LIDAR_AT - CAR.at(moment)
-        inside = (np.abs(own[:, :2]) < np.array(CAR.size[:2]) / 2).all(axis=1) & (np.abs(own[:, 2] - 0.05) < 0.75)
-        expected.append(own[inside])
-    np.testing.assert_allclose(many, np.concatenate(expected), atol=1e-4)
-    assert len(many) > 3 * len(few) > 0
-
-
-def test_an_image_uses_the_training_sweep_nearest_in_time(rich_root):
-    """Only the nearest sweep in time is used, so dynamic returns move by at most half a sweep interval."""
-    scene = scene_at(rich_root, **EVERYTHING)
-    settings = LidarDepthJob(holdout=HELD_OUT, images={}, own_car_radius=2.5, box_margin=0.1, ray_spacing=(1.5, 1.65))
-    whole = lidar_depths(scene, settings)
-    training = [s for s in scene.sweeps if seconds_of(s.timestamp) in training_seconds(scene)]
-    groups = frame_groups(scene, settings.holdout)
-    for number in np.flatnonzero([group == "train" for group in groups])[::5]:
-        frame = scene.frames[number]
-        nearest = min(training, key=lambda sweep: abs(sweep.timestamp - frame.timestamp))
-        others = tuple(sweep for sweep in scene.sweeps if sweep is not nearest)
-        ((alone,), (without,)) = (
-            lidar_depths(dataclasses.replace(scene, frames=(frame,), sweeps=sweeps), settings)
-            for sweeps in ((nearest,), others)
-        )
-        assert abs(nearest.timestamp - frame.timestamp) <= 100_000
-        assert pickle.dumps(alone) == pickle.dumps(whole[number]) != pickle.dumps(without)
-
-
 def delete(root: Path, channel: str, count: int) -> list[Path]:
     """Deletes the first `count` recordings of a channel between key frames."""
     paths = sorted((root / "sweeps" / channel).iterdir())[:count]
@@ -284,15 +222,3 @@ def test_missing_images_between_key_frames_are_skipped_and_counted_with_on_missi
     messages = [record.getMessage() for record in caplog.records if "left out" in record.getMessage()]
     assert len(messages) == (3 if count == 3 else 11) and str(paths[0]) in messages[0]
     assert count == 3 or f"{count - 10} more of {IMAGES} images" in messages[-1]
-
-
-def test_a_missing_lidar_sweep_between_key_frames_stops_and_names_the_setting_to_skip_it(root):
-    (path,) = delete(root, "LIDAR_TOP", 1)
-    settings = SeedJob(lidar_seed={"far_points": 0}, holdout=HELD_OUT, images={}, random_seed=0)
-    with pytest.raises(DatasetError) as failure:
-        lidar_points(scene_at(root, **EVERYTHING), settings)
-    words = ("between key frames", "0001 LIDAR_TOP 1:", str(path), "lidar_seed.sweeps: false", "on_missing: warn")
-    assert all(word in str(failure.value) for word in words), failure.value
-    assert lidar_points(scene_at(root), settings)[2] == 0
-    going_on = settings.model_copy(update={"lidar_seed": settings.lidar_seed.model_copy(update={"on_missing": "warn"})})
-    assert lidar_points(scene_at(root, **EVERYTHING), going_on)[2] == 1

@@ -26,24 +26,6 @@ def test_returns_near_the_sensor_and_holes_among_them_say_nothing():
     assert np.argwhere(~third).tolist() == [[0, 10], [0, 11], [0, 12], [0, 13]]
 
 
-def test_holes_below_the_ego_vehicle_say_nothing_either():
-    """The roof is too near to be measured by the two lowest beams, which never return there."""
-    ranges = room()
-    ranges[2, 10:14] = 2.0
-    ranges[:2, 10:14] = ranges[3, 12] = ranges[:2, 40] = np.nan
-    for found in measured_rays(scans(ranges, ranges), ego_radius=2.5):
-        assert np.argwhere(~found).tolist() == [[beam, step] for beam in range(3) for step in range(10, 14)]
-
-
-def test_the_distance_is_horizontal():
-    ranges = room()
-    ranges[0, 5] = 2.6  # 20 degrees below: 2.44 m
-    ranges[2, 5] = 2.6
-    (found,) = measured_rays(scans(ranges), 2.5)
-    assert np.argwhere(~found).tolist() == [[0, 5]]
-    assert measured_rays([], 2.5) == []
-
-
 @pytest.mark.parametrize(("first", "count"), [(20, 2), (20, 30), (STEPS - 1, 2), (STEPS - 3, 10)])
 def test_sectors_of_five_degrees_without_any_return_were_skipped(first, count):
     """A firing takes 2.5 degrees; a sector may cross the last one."""
@@ -81,16 +63,6 @@ def test_rays_that_never_return_below_the_horizontal_are_blocked():
     assert len(found) == 12
     for blocked in found:
         assert np.argwhere(blocked).tolist() == [[0, step] for step in range(10, 14)]
-
-
-@pytest.mark.parametrize(
-    ("count", "metres"), [pytest.param(9, 20.0, id="few scans"), pytest.param(12, 4.0, id="a vehicle that stands")]
-)
-def test_without_motion_or_scans_nothing_is_blocked(count, metres):
-    drives = [room() for _ in range(count)]
-    for ranges in drives:
-        ranges[0, 10:14] = np.nan
-    assert not any(blocked.any() for blocked in blocked_rays(scans(*drives), poses(count, metres), [True] * count))
 
 
 def test_beams_that_mostly_do_not_return_are_not_blocked():

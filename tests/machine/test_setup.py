@@ -145,16 +145,6 @@ def test_an_interrupted_installation_is_remade_whole(machine):
     assert any("requirements.txt" in line for line in machine.done())
 
 
-def test_the_stamp_goes_first_where_a_venv_is_remade(machine):
-    """A removal that is interrupted must not leave a stamp beside missing packages."""
-    machine.run()
-    (machine.bin / "rm").unlink()
-    machine.program("rm", f'#!/usr/bin/env bash\n[ "$1" = -rf ] && exit 1\nexec {shutil.which("rm")} "$@"\n')
-    (machine.checkout / "requirements.txt").write_text("torch\n")
-    assert machine.run().returncode != 0
-    assert (machine.checkout / ".venv/bin/python").exists() and not machine.stamp.exists()
-
-
 def test_a_second_setup_in_the_same_checkout_is_refused_and_leaves_the_first_one_alone(machine):
     """pip of the first one runs the second one, and a third when the second has ended."""
     again = 'for run in 2 3; do "$FAKE_BIN/bash" scripts/setup.sh; echo "$run: $?" >&2; done'
@@ -175,12 +165,6 @@ def test_a_second_setup_in_the_same_checkout_is_refused_and_leaves_the_first_one
 def test_pip_that_fails_points_to_proxies(machine):
     done = machine.run(FAKE_PIP_FAILS="1")
     assert done.returncode == 1 and "docs/installation.md" in done.stderr and "proxy" in done.stderr
-
-
-def test_python_without_venv_is_distinguished_from_no_python(machine):
-    done = machine.run(FAKE_NO_VENV="1")
-    assert done.returncode == 1 and "sudo apt-get install python3.11-venv" in done.stderr
-    assert not (machine.checkout / ".venv").exists()
 
 
 @pytest.mark.parametrize(
@@ -225,18 +209,6 @@ def test_too_little_disk_is_refused_before_anything_is_removed(machine, free_mb,
         assert machine.done() == []
 
 
-def test_a_small_folder_for_downloads_is_named(machine):
-    machine.program("df", df(9000).replace("echo disk", 'case "$2" in /small) set 1;; esac\necho disk').replace(
-        str(9000 * 1024), "$([ $1 = 1 ] && echo 1024 || echo 9216000)"))  # fmt: skip
-    done = machine.run(TMPDIR="/small")
-    assert done.returncode == 1 and "TMPDIR=" in done.stderr
-
-
-def test_a_gpu_that_the_default_build_suits_is_not_mentioned(machine):
-    done = machine.run(**machine.gpus(ADA))
-    assert done.returncode == 0 and "TORCH_CUDA" not in done.stderr
-
-
 @pytest.mark.parametrize(
     ("gpu", "expected"),
     [
@@ -265,28 +237,12 @@ def test_the_build_asked_for_comes_from_pytorchs_index_and_is_remembered(machine
     assert not [line for line in machine.done() if line.startswith("pip")], "make test keeps the build"
 
 
-def test_another_build_remakes_it_and_back(machine):
-    machine.run()
-    machine.done()
-    assert machine.run(TORCH_CUDA="cpu").returncode == 0
-    assert any("whl/cpu" in line for line in machine.done())
-    assert machine.run(TORCH_CUDA="cu130").returncode == 0
-    lines = machine.done()
-    assert lines and not any("--index-url" in line for line in lines)
-    assert len(machine.stamp.read_text().split()) == 1
-
-
 def test_changed_requirements_keep_the_build_that_was_chosen(machine):
     machine.run(TORCH_CUDA="cpu")
     machine.done()
     (machine.checkout / "requirements.txt").write_text("torch\n")
     assert machine.run().returncode == 0
     assert any("whl/cpu" in line for line in machine.done())
-
-
-def test_a_mirror_of_pytorchs_index_is_taken(machine):
-    machine.run(TORCH_CUDA="cpu", TORCH_INDEX="https://mirror.example/whl")
-    assert any("--index-url https://mirror.example/whl/cpu" in line for line in machine.done())
 
 
 def test_an_index_that_gives_another_torch_is_noticed(machine):

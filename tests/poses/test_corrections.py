@@ -8,13 +8,11 @@ from helpers.classed import classed
 from helpers.hand_made_views import drive_of, ego_at
 from scipy.spatial.transform import Rotation
 
-from drivesplat.io.point_cloud import PointCloud
 from drivesplat.poses.corrections import Corrections, apply_corrections
-from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep, Track, read_scene, write_scene
 from drivesplat.scene.splits import frame_groups
-from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
+from drivesplat.settings.images import HoldoutSettings
 
 TIMES = np.array([100_000, 600_000, 1_100_000])
 GIVEN = np.stack([ego_at(time * 1e-6) for time in TIMES])
@@ -53,13 +51,6 @@ def test_corrections_are_interpolated_between_images(share):
     np.testing.assert_allclose(between[:3, :3] @ between[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_large_rotations_are_interpolated_the_shorter_way():
-    """From 170 degrees to 190: rotation vectors, linear in time, would pass 0."""
-    turned = np.stack([correction((0.0, 0.0, 170.0)), correction((0.0, 0.0, -170.0))])
-    (middle,) = Corrections.from_poses(TIMES[:2], GIVEN[:2], GIVEN[:2] @ turned).at(TIMES[:2].mean(keepdims=True))
-    np.testing.assert_allclose(middle[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-9)
-
-
 def test_extrapolation_continues_the_motion_beyond_both_ends():
     """8 m/s ahead, an image every half second and one 10 ms after the last, which is 1 m off: no motion of 100 m/s."""
     times = np.array([0, 500_000, 1_000_000, 1_010_000])
@@ -74,15 +65,6 @@ def test_extrapolation_continues_the_motion_beyond_both_ends():
 def test_corrections_are_constant_beyond_the_ends():
     early, late = CORRECTIONS.at(np.array([0, 9_000_000]))
     np.testing.assert_allclose([early, late], STEPS[[0, 2]], atol=1e-9)
-
-
-def test_equal_timestamps_count_once_and_a_single_image_applies_everywhere():
-    twice = Corrections.from_poses(TIMES[[0, 0, 1]], GIVEN[[0, 0, 1]], (GIVEN @ STEPS)[[0, 0, 1]])
-    np.testing.assert_allclose(twice.at(TIMES[:2]), STEPS[:2], atol=1e-9)
-    single = Corrections.from_poses(TIMES[:1], GIVEN[:1], (GIVEN @ STEPS)[:1])
-    at = np.array([0, 100_000, 5_000_000])
-    np.testing.assert_allclose(single.at(at), np.stack([STEPS[0]] * 3), atol=1e-9)
-    assert np.isfinite(single.in_world(at)).all()
 
 
 def test_in_world_moves_objects_placed_by_the_ego_pose():
@@ -131,13 +113,6 @@ def test_images_rotate_with_the_ego_vehicle():
         np.testing.assert_array_equal(after.intrinsics, before.intrinsics)
 
 
-def test_images_between_key_frames_take_interpolated_corrections():
-    frame = REFINED.frames[-1]
-    share = (frame.timestamp - TIMES[0]) / 500_000
-    change = vector(inverse(SCENE.frames[-1].ego_to_world) @ frame.ego_to_world)
-    np.testing.assert_allclose(change, (1 - share) * vector(STEPS[0]) + share * vector(STEPS[1]), atol=1e-6)
-
-
 def test_sweeps_and_boxes_keep_their_poses_relative_to_the_ego_vehicle():
     """As seen from the car at their times, nothing has moved: neither returns, nor boxes, nor returns in boxes."""
     refined = GIVEN @ STEPS
@@ -167,13 +142,6 @@ def test_only_poses_of_the_scene_change_and_their_source_is_recorded(tmp_path):
     np.testing.assert_array_equal(again.frames[1].camera_to_world, REFINED.frames[1].camera_to_world)
     holdout = HoldoutSettings(every_nth=0, last_block=1)
     assert frame_groups(again, holdout) == frame_groups(SCENE, holdout)
-
-
-def test_the_training_record_says_refined():
-    """Evaluation takes protocol.poses from here."""
-    seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    job = ParserJob(holdout=HoldoutSettings(every_nth=0, last_block=1), images=ImageSettings())
-    assert [training_record(scene, seed, job).scene.poses for scene in (SCENE, REFINED)] == ["nuscenes", "refined"]
 
 
 def test_identity_corrections_change_nothing():

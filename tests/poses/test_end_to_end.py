@@ -83,7 +83,7 @@ def test_images_of_a_street_reduce_the_errors_of_noisy_poses(tmp_path):
     assert on_street.mean() > 0.9, "points are of the street, not of the sky"
 
 
-@pytest.mark.parametrize("pose_noise", [False, True])
+@pytest.mark.parametrize("pose_noise", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_boxes_are_annotated_relative_to_the_ego_vehicle(pose_noise):
     """Under noisy poses they are still exact relative to the ego vehicle."""
     recorder = recorder_of(pose_noise)
@@ -110,6 +110,7 @@ def seeded(tmp_path_factory) -> WorkflowCopy:
     return copy
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("workflow")
 class TestAmongTheOtherStages:

@@ -7,7 +7,6 @@ import pytest
 from helpers.classed import classed
 from helpers.hand_made_views import HEADINGS, SIZE, drive_of, job_of
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.features import (
     detect_features,
@@ -44,15 +43,6 @@ def test_of_six_cameras_those_side_by_side_overlap():
     assert overlap == {frozenset(pair) for pair in around}
 
 
-@pytest.mark.parametrize(("heading", "expected"), [(69.0, True), (71.0, False), (-69.0, True), (-71.0, False)])
-def test_overlap_begins_where_fields_of_view_meet(heading, expected):
-    frame = AROUND.scene.frames[0]
-    turned = rigid(Rotation.from_euler("z", heading, degrees=True).as_matrix(), np.zeros(3))
-    mount = inverse(frame.ego_to_world) @ frame.camera_to_world
-    other = dataclasses.replace(frame, camera_to_world=frame.ego_to_world @ turned @ mount)
-    assert views_overlap(frame, other) is views_overlap(other, frame) is expected
-
-
 def test_neighbours_of_a_camera_are_matched_and_those_across():
     found = pairs_of(AROUND.scene, neighbours=2, across=1)
     front = {(a[1], b[1]) for a, b in found if a[0] == b[0] == "CAM_FRONT"}
@@ -62,13 +52,6 @@ def test_neighbours_of_a_camera_are_matched_and_those_across():
     assert len(beside) == len(reach) and all(pair in reach for pair in beside)
     assert not any({a[0], b[0]} == {"CAM_FRONT", "CAM_BACK"} for a, b in found)
     assert not any(a[0] != b[0] and a[1] != b[1] for a, b in pairs_of(AROUND.scene, across=0))
-
-
-def test_a_camera_that_misses_key_frames_is_matched_with_the_next_it_has():
-    drive = drive_of(6)
-    frames = tuple(frame for frame in drive.scene.frames if frame.sample_index not in (1, 2))
-    found = pairs_of(dataclasses.replace(drive.scene, frames=frames), neighbours=1)
-    assert {(a[1], b[1]) for a, b in found} == {(0, 3), (3, 4), (4, 5)}
 
 
 def brute(origin: np.ndarray, direction: np.ndarray, reach: np.ndarray) -> bool:
@@ -152,16 +135,6 @@ def test_a_camera_inside_a_moving_box_sees_nothing_static():
     assert not static_of(car(0.9, ahead=1.6, category="human.pedestrian.adult"), job_of())[1].any()
 
 
-def test_a_box_beside_the_camera_is_left_out_where_it_passes_the_image_plane():
-    """A long lorry that reaches from behind the camera to far ahead: the left of the image is its side."""
-    lorry = dataclasses.replace(car(3.0, ahead=5.0), size=np.array([30.0, 2.0, 3.0]))
-    poses = lorry.object_to_world.copy()
-    poses[:, 1, 3], poses[:, 2, 3] = 3.0, 1.5
-    pixels, static = static_of(dataclasses.replace(lorry, object_to_world=poses), job_of())
-    level = np.abs(pixels[:, 1] - SIZE[1] / 2) < 20
-    assert not static[level & (pixels[:, 0] < 100)].any() and static[pixels[:, 0] > SIZE[0] / 2 + 20].all()
-
-
 def test_the_ego_vehicle_is_left_out():
     outline = {"CAM_BACK": ((0.0, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0))}
     ego_mask = EgoMask({camera: (corners,) for camera, corners in outline.items()})
@@ -210,19 +183,6 @@ def test_features_lie_where_things_are_in_the_recorded_image_and_on_static_conte
     assert static_pixels(scene, scene.frames[0], pixels, NO_EGO_MASK, margin_of(job)).all()
     inside = ((places > 30) & (places < np.array([290, 150]))).all(axis=1)
     assert (apart.min(axis=0)[still & inside] < 1.5).mean() > 0.8
-
-
-def test_for_poses_from_images_every_box_is_left_out(tmp_path, dotted):
-    """No pose says which of them move."""
-    scene, _ = dotted
-    images = RigImages.of(dataclasses.replace(scene, tracks=(car(0.0),)), [0])
-    middle = np.array([scene.frames[0].width, scene.frames[0].height]) / 2
-    near = {}
-    for start in ("recorded", "images"):
-        found = detect_features(images, job_of(start=start), tmp_path / f"{start}.db", 1).images[1]
-        near[start] = sum(np.abs(point.xy - middle).max() < 10 for point in found.points2D)
-        assert found.num_points2D() > 40
-    assert near["recorded"] > 0 == near["images"]
 
 
 def test_features_are_no_more_than_asked_for(tmp_path, dotted):

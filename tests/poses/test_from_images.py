@@ -9,12 +9,10 @@ import numpy as np
 import pycolmap
 import pytest
 from helpers import drives
-from helpers.hand_made_views import FRONT, HEADINGS, Drive, Seen, drive_of, error_at, views, write_database
+from helpers.hand_made_views import FRONT, Drive, Seen, drive_of, error_at, views, write_database
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.storage import canonical_json
-from drivesplat.poses import mapping
 from drivesplat.poses.from_images import align_poses
 from drivesplat.poses.mapping import MappingProgress
 from drivesplat.poses.refine import estimate_from_matches
@@ -179,16 +177,6 @@ def test_a_drive_folder_without_poses_is_recovered_in_metres(unlocated, tmp_path
         np.testing.assert_allclose(sweep.sensor_to_world, expected, atol=0.03)
 
 
-def test_the_record_describes_the_placement(unlocated_made):
-    record = unlocated_made.record
-    placement = record["placement"]
-    assert (record["start"], record["refined"], record["kept_because"]) == ("images", True, None)
-    assert placement["images_placed"] == 10 and placement["models"] == [10] and placement["camera"] == "CAM_FRONT"
-    assert placement["scale_from"] == "LiDAR" and placement["aligned_to"] == "first image"
-    assert 1.0 <= placement["scale_drift"] < 1.001 and placement["scale"] > 0
-    assert record["trial"] is record["shift_m"] is record["turn_deg"] is None and canonical_json(record)
-
-
 def test_its_points_lie_at_true_positions(unlocated, unlocated_made):
     """They lie where the truth has them, as seen from the first image."""
     truth = apply(inverse(unlocated.drive.truth[0]), points_along(curve))
@@ -211,18 +199,6 @@ def test_two_runs_agree_whatever_the_threads(unlocated, unlocated_made):
         np.testing.assert_allclose(poses_of(again), poses_of(unlocated_made), atol=1e-9 if threads == 1 else 1e-3)
 
 
-def test_the_best_camera_places_the_others(tmp_path):
-    case = case_of(tmp_path, cameras=tuple(HEADINGS), key_frames=6)
-    made = case.made()
-    truth = case.drive.truth
-    origin = poses_of(made)[0] @ inverse(truth[0])
-    assert made.record["placement"]["images_placed"] == 6 and made.record["images"] == 36
-    assert apart(origin @ truth, poses_of(made))[0] < 0.02
-    for before, after in zip(case.drive.scene.frames, made.scene.frames, strict=True):
-        mounts = [inverse(frame.ego_to_world) @ frame.camera_to_world for frame in (before, after)]
-        np.testing.assert_allclose(mounts[1], mounts[0], atol=1e-9)
-
-
 def test_estimated_poses_are_aligned_to_recorded_poses_that_move(tmp_path):
     """They are as noisy as nuScenes' poses; only their best fit is used."""
     case = case_of(tmp_path, error=error_at, noise=0.1)
@@ -236,18 +212,6 @@ def test_estimated_poses_are_aligned_to_recorded_poses_that_move(tmp_path):
     change = inverse(recorded) @ poses_of(made)
     angles = np.degrees(Rotation.from_matrix(change[:, :3, :3]).magnitude())
     assert reported == pytest.approx([np.median(np.linalg.norm(change[:, :3, 3], axis=1)), np.median(angles)], rel=1e-3)
-
-
-def test_without_lidar_recorded_positions_give_the_scale(tmp_path):
-    case = case_of(tmp_path, error=lambda seconds: np.eye(4))
-    made = case.made(lidar=False)
-    assert made.record["placement"]["scale_from"] == "recorded positions"
-    assert apart(case.drive.truth, poses_of(made))[0] < 0.05
-
-
-def test_without_either_there_is_no_scale(unlocated):
-    with pytest.raises(DatasetError, match=r"scene made: .* alone, because their scale is unknown: .*start: recorded"):
-        unlocated.made(lidar=False)
 
 
 def stands(seconds: float) -> np.ndarray:
@@ -265,15 +229,6 @@ def test_a_vehicle_without_translation_is_refused(tmp_path, ego_path):
     case = case_of(tmp_path, ego_path, noise=0.3, points=points_along(curve, 400, 5.0))
     with pytest.raises(DatasetError, match=r"scene made: .*far enough apart, as where the vehicle.*start: recorded"):
         case.made()
-
-
-@pytest.mark.slow
-def test_disconnected_models_are_listed(tmp_path):
-    """Images before the sixth see other points than those after it."""
-    case = case_of(tmp_path, shows=lambda i, points: points % 2 == (i > 5), points=points_along(curve, 1400))
-    with pytest.raises(DatasetError, match=r"CAM_FRONT.* 2 models \(6, 4 images\); .* 6 of 10 key frames.*0\.7; "):
-        case.made()
-    assert case.made(limits={"min_images": 0.6}).record["placement"]["models"] == [6, 4]
 
 
 def test_unplaced_images_are_interpolated(tmp_path):
@@ -321,12 +276,3 @@ def test_progress_of_the_mapper_is_logged_with_the_time_left(caplog):
         "camera CAM_FRONT: model 1, 4 of 20 images placed, about 64 s left",
         "camera CAM_FRONT: model 1, 7 of 20 images placed, about 52 s left",
     ]
-
-
-def test_the_mapper_reports_its_images(unlocated, caplog, monkeypatch):
-    monkeypatch.setattr(mapping, "LOG_INTERVAL_S", 0.0)
-    with caplog.at_level(logging.INFO):
-        unlocated.made()
-    count = len(unlocated.drive.scene.key_frame_timestamps)
-    lines = [record.message for record in caplog.records]
-    assert any(f"model 1, {count} of {count} images placed, about 0 s left" in line for line in lines)

@@ -8,11 +8,10 @@ import pytest
 from helpers.hand_made_views import Drive, Seen, drive_of, job_of, street_points, views, write_database
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.lens import LensTrial, lens_trial, with_tested_images
+from drivesplat.poses.lens import LensTrial, lens_trial
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import rigid
-from drivesplat.scene.scene import UNPOSED
 
 KEY_FRAMES = 16
 
@@ -99,22 +98,3 @@ def test_a_wrong_focal_length_is_warned_of_where_the_vehicle_turns(tmp_path):
 
 def test_too_few_points_are_not_judged(tmp_path):
     assert trial_of(tmp_path, curve, points_around(60), k1=-0.25) is None
-
-
-def test_tested_images_are_from_different_places_of_the_sharpest_turn():
-    """Sixty images, with a stop and then a turn; a second camera has too few."""
-
-    def path(seconds: float) -> np.ndarray:
-        if seconds < 10.0:
-            return rigid(np.eye(3), np.array([4.0 * min(seconds, 8.0), 0.0, 0.0]))
-        return rigid(np.eye(3), np.array([32.0, 0.0, 0.0])) @ curve(seconds - 10.0)
-
-    scene = drive_of(60, ego_path=path, error=lambda _: np.eye(4)).scene
-    few = drive_of(5, ("CAM_BACK",), ego_path=path).scene.frames
-    tested = with_tested_images(dataclasses.replace(scene, frames=(*scene.frames, *few)))
-    assert {frame.camera for frame in tested.frames} == {"CAM_FRONT"} and len(tested.frames) == 20
-    assert [frame.sample_index for frame in tested.frames] == list(range(20))
-    assert min(frame.timestamp for frame in tested.frames) >= 8_000_000
-    places = np.stack([frame.ego_to_world[:3, 3] for frame in tested.frames])
-    assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 1.0
-    assert not with_tested_images(dataclasses.replace(scene, poses=UNPOSED)).frames

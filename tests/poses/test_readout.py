@@ -8,7 +8,7 @@ import pytest
 from helpers.hand_made_views import FRONT, SIZE, Drive, Seen, drive_of, job_of, street_points, write_database
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.readout import RollingFeatures, at_timestamp
+from drivesplat.poses.readout import at_timestamp
 from drivesplat.poses.refine import refine_from_matches
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
@@ -95,20 +95,3 @@ def test_true_poses_are_kept_which_a_global_shutter_would_turn(tmp_path, views):
     assert not known["refined"]
     assert known["reprojection_px"] < 0.8 * unknown["reprojection_px"]
     assert known["turn_deg"]["median"] < 0.4 * unknown["turn_deg"]["median"]
-
-
-def test_features_without_a_point_count_as_far_away(tmp_path, views):
-    """Only the turning of the camera moves them; a global shutter moves none."""
-    drive = rolling_drive()
-    images = images_of(drive.scene)
-    start = write_database(tmp_path / "features.db", images, views, job_of())
-    rolling = RollingFeatures.of(images, start)
-    rolling.move_to_timestamp(start)
-    frame, (_, shutter) = images.frames[4], rolling.recorded[5]
-    k = continuous_intrinsics(frame, SIZE)
-    found = np.array([feature.xy for feature in start.images[5].points2D])
-    expected = at_timestamp(views[4].pixels, np.full(len(found), 1e7), shutter, k, SIZE)
-    np.testing.assert_allclose(found, expected, atol=0.02)
-    assert np.abs(found - views[4].pixels).max() > 1.0
-    RollingFeatures.of(images_of(rolling_drive(None).scene), start).move_to_timestamp(start)
-    np.testing.assert_array_equal(found, [feature.xy for feature in start.images[5].points2D])

@@ -5,14 +5,13 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.drives import CAMERA_AT, HELD_OUT, NOTHING_HELD_OUT, TRAINING, World, cast, scene_at
+from helpers.drives import CAMERA_AT, HELD_OUT, TRAINING, World, cast, scene_at
 from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
 from drivesplat.poses.triangulated import (
     MAX_MEAN_ERROR,
-    MIN_VIEWS,
     Observations,
     TriangulatedPoints,
     no_points,
@@ -21,7 +20,7 @@ from drivesplat.poses.triangulated import (
 )
 from drivesplat.preprocess import lidar_seed
 from drivesplat.preprocess.lidar_seed import seed_points
-from drivesplat.scene.scene import Scene, read_scene
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.lidar_seed import SeedJob
 
 
@@ -73,15 +72,6 @@ def test_the_record_keeps_sharp_points_and_says_which_frames_see_them():
     assert record.seen_point.tolist() == [0, 0, 1, 1, 2, 2]
 
 
-def test_points_count_where_enough_of_the_images_see_them():
-    record = record_of(np.zeros((3, 3)), [[0, 4], [0, 5, 6], [4, 6]])
-    assert MIN_VIEWS == 2
-    assert record.seen_in(np.array([0, 4, 5])).tolist() == [True, True, False]
-    means = record.mean_over_views(np.array([0, 4, 5]), np.array([10.0, 0, 0, 0, 20.0, 40.0, 1e9]))
-    np.testing.assert_allclose(means, [15.0, 25.0, 20.0])
-    assert no_points().seen_in(np.array([0])).tolist() == []
-
-
 def test_only_points_of_two_training_images_become_seeds(tiny_scene):
     points = wall(17.0, 19.0, 21.0, 23.0)
     seen_by = [frames_of(tiny_scene, *at) for at in ((0, 1), (1, 2), (2, 6), (3, 4, 6))]
@@ -93,22 +83,6 @@ def test_only_points_of_two_training_images_become_seeds(tiny_scene):
     assert seed.note["triangulated"] == 2
     for point, expected in zip(points, (True, False, False, True), strict=True):
         assert (np.abs(seed.positions - point).max(axis=1) < 1e-4).any() == expected
-
-
-def test_another_hold_out_chooses_others(tiny_scene):
-    record = record_of(wall(19.0), [frames_of(tiny_scene, 2, 6)])
-    assert seed_points(tiny_scene, job(NOTHING_HELD_OUT), triangulated=record).note["triangulated"] == 1
-    assert seed_points(tiny_scene, job(), triangulated=record).note["triangulated"] == 0
-    none = {"every_nth": 0, "last_block": 4}
-    late = record_of(wall(40.0), [frames_of(tiny_scene, 6, 7, 8, 9)])
-    assert seed_points(tiny_scene, job(none), triangulated=late).note["triangulated"] == 0
-
-
-def test_without_them_the_seed_is_as_it_was(tiny_scene):
-    plain, none = (seed_points(tiny_scene, job(voxel_size=0.5), triangulated=record) for record in (None, no_points()))
-    np.testing.assert_array_equal(plain.positions, none.positions)
-    np.testing.assert_array_equal(plain.colors, none.colors)
-    assert plain.note == none.note and plain.note["triangulated"] == 0 < plain.note["lidar"]
 
 
 def test_their_colours_are_those_of_training_images(tiny_root, tmp_path):
@@ -141,18 +115,3 @@ def test_a_broken_file_is_named_with_its_rule(tmp_path, content):
         write_arrays(path, content)
     with pytest.raises(ResultError, match=r"triangulated.npz: .*the rule 'refine_poses' rebuilds it"):
         read_triangulated(path)
-
-
-def test_what_is_written_is_read(tmp_path):
-    record = record_of(wall(1.0, 2.0), [[0, 1], [1, 2]])
-    write_arrays(tmp_path / "triangulated.npz", record)
-    again = read_triangulated(tmp_path / "triangulated.npz")
-    assert all(np.array_equal(value, vars(record)[name]) for name, value in vars(again).items())
-
-
-@pytest.mark.parametrize(("name", "rule"), [("scene.json", "extract"), ("scene_refined.json", "refine_poses")])
-@pytest.mark.parametrize("content", ["{", '{"schema": 0}'])
-def test_a_broken_scene_is_named_with_the_rule_that_made_it(tmp_path, name, rule, content):
-    (tmp_path / name).write_text(content)
-    with pytest.raises(ResultError, match=rf"{name}: .*the rule '{rule}' rebuilds it"):
-        read_scene(tmp_path / name)

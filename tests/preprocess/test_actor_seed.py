@@ -4,7 +4,7 @@ import dataclasses
 import pickle
 import shutil
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +25,6 @@ from helpers.drives import (
 )
 from helpers.records import write_invalid
 from PIL import Image
-from pydantic import ValidationError
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
@@ -36,13 +35,12 @@ from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.splits import frame_groups, sweep_groups
-from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, ObjectClassName
+from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.trajectories.actor_record import ActorRecord, ActorRecords, read_actors
 from drivesplat.trajectories.motion import Motion
 
 CAR = World().things[0]
 """A car ahead of the ego vehicle: 4 x 2 x 1.6 m, its rear initially 4.8 m from the camera."""
-ONCOMING = Thing("vehicle.car", (4.4, 1.8, 1.5), (32.0, 3.5, 0.75), (-3.0, 0.0), heading=np.pi, color=(90, 200, 90))
 FLOOR = 0.1
 
 
@@ -115,28 +113,6 @@ def test_points_are_exactly_the_training_returns_in_the_box_in_its_frame(tiny_sc
     np.testing.assert_allclose(actor.points, expected, atol=1e-4)
 
 
-@pytest.mark.parametrize(("thing", "seen", "hidden"), [(CAR, (0, -1), (0, 1)), (ONCOMING, (1, 1), (1, -1))])
-def test_points_lie_on_the_faces_visible_to_the_lidar(tmp_path, thing, seen, hidden):
-    """This holds however far it moved between sweeps. A car ahead shows its rear and not its front (x), an oncoming car
-    on the left its left side and not its right (y)."""
-    actor = the_actor(drive(tmp_path, thing), job(NOTHING_HELD_OUT))
-    half = np.array(thing.size) / 2
-    points = actor.points.astype(float)
-    assert len(points) > 100
-    outside = np.abs(points) - half
-    np.testing.assert_allclose(outside.max(axis=1), 0.0, atol=0.01)
-    on_face = [np.abs(points[:, axis] - sign * half[axis]) < 0.01 for axis, sign in (seen, hidden)]
-    assert on_face[0].mean() > 0.25 and on_face[1].mean() < 0.03, "but for edges"
-    assert points[:, 2].min() > FLOOR - half[2]
-
-
-@pytest.mark.parametrize("margin", [0.0, 1.0])
-def test_the_margin_enlarges_the_box_sideways_and_excludes_the_road(tiny_scene, margin):
-    actor = the_actor(tiny_scene, job(box_margin=margin))
-    np.testing.assert_allclose(actor.points, returns_of(World(), CAR, TRAINING, margin=margin), atol=1e-4)
-    assert actor.points[:, 2].min() > FLOOR - 0.8
-
-
 def test_missing_or_corrupt_sweeps_are_skipped(root):
     scene = scene_at(root)
     (root / "samples/LIDAR_TOP/0001__0001.pcd.bin").unlink()
@@ -154,13 +130,6 @@ def test_few_lidar_points_are_complemented_by_random_points_in_the_box(tiny_scen
     for axis in range(3):
         np.testing.assert_allclose(np.quantile(share[:, axis], [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.04)
     assert np.abs(np.corrcoef(share.T)[[0, 0, 1], [1, 2, 2]]).max() < 0.06
-
-
-@pytest.mark.parametrize(("less", "count"), [(0, None), (1, 4000)])
-def test_enough_lidar_points_get_no_random_ones(tiny_scene, less, count):
-    lidar = len(returns_of(World(), CAR, TRAINING))
-    actor = the_actor(tiny_scene, job(min_points=lidar + less, random_points=4000))
-    assert len(actor.points) == (count or lidar)
 
 
 def raised(scene: Scene, metres: float, object_class: str = "truck") -> Scene:
@@ -197,38 +166,6 @@ def test_the_sides_and_the_roof_of_a_truck_above_its_returns_have_points(tiny_sc
             (on_face[:, axis] & (above[:, axis] < 0)).mean(), abs=0.05
         )
     assert on_face.mean(axis=0).min() > 0.05, "two sides, two ends and the roof"
-
-
-@pytest.mark.parametrize("object_class", ["bicycle", "rider", "construction_vehicle"])
-def test_what_does_not_fill_its_box_has_no_points_above_its_returns(tiny_scene, object_class):
-    scene = raised(tiny_scene, 2.4, object_class)
-    actor = the_actor(scene, job(random_points=3000))
-    assert len(actor.points) == actor.lidar_points
-
-
-def test_points_above_the_returns_leave_room_for_fewer_returns(tiny_scene):
-    actor = the_actor(raised(tiny_scene, 2.4), job(random_points=3000, max_points=100))
-    assert len(actor.points) == 100 and 30 < actor.lidar_points < 70
-
-
-def test_random_points_respect_the_maximum(tiny_scene):
-    actor = the_actor(tiny_scene, job(min_points=10**6, random_points=4000, max_points=1000))
-    assert len(actor.points) == 1000 and 0 < actor.lidar_points < 1000
-
-
-def test_too_many_points_are_subsampled_at_random(tiny_scene):
-    whole = returns_of(World(), CAR, TRAINING).round(3)
-    actor = the_actor(tiny_scene, job(max_points=100))
-    assert actor.lidar_points == len(actor.points) == 100
-    numbers = [int(np.abs(whole - point).max(axis=1).argmin()) for point in actor.points]
-    np.testing.assert_allclose(actor.points, whole[numbers], atol=2e-3)
-    assert len(set(numbers)) == 100 and max(numbers) > len(whole) / 2 > 100
-
-
-def test_an_actor_without_lidar_points_has_random_ones(root):
-    shutil.rmtree(root / "samples" / "LIDAR_TOP")
-    actor = the_actor(scene_at(root), job(min_points=1, random_points=300))
-    assert (actor.lidar_points, len(actor.points)) == (0, 300)
 
 
 PARKED = Thing("vehicle.car", (4.0, 1.8, 1.5), (12.0, -4.0, 0.75))
@@ -342,14 +279,6 @@ def test_a_point_has_the_colour_of_its_nearest_training_camera_that_sees_the_act
     np.testing.assert_array_equal(actor.points_rgb[~shown], round(expected[shown].mean()))
 
 
-def test_colours_match_the_surface_of_the_car(tmp_path):
-    """The drive's geometry gives the expected colours, up to JPEG, pixel size and the stripes' edges."""
-    actor = the_actor(drive(tmp_path, *World().things, width=384, height=216), job())
-    stripes = 0.75 + 0.25 * np.sign(np.sin(5.0 * actor.points.sum(axis=1)))
-    off = np.abs(actor.points_rgb - np.array(CAR.color) * stripes[:, None]).max(axis=1)
-    assert (off < 25).mean() > 0.85
-
-
 SPEEDING = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0), gain=(1.0, 0.0))
 
 
@@ -365,38 +294,6 @@ def test_occluders_do_not_colour_an_actor(tmp_path):
     pixels, _ = pixels_of(world, CAR, scene.frames[0], actor.points.astype(float))
     assert inside(pixels, masks[scene.frames[0].token]).sum() > 100
     np.testing.assert_array_equal(actor.points_rgb, np.broadcast_to([0, 0, 255], (2000, 3)))
-
-
-LEFT_HALF = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
-WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
-
-
-def test_the_ego_vehicle_does_not_colour_actors_and_hides_them(tmp_path):
-    scene = drive(tmp_path, CAR)
-    painted(scene, lambda frame: np.where(np.arange(96)[:, None] <= 48, (255, 0, 0), (0, 0, 255)))
-    colors = the_actor(scene, job(), EgoMask({"CAM_FRONT": (LEFT_HALF,)})).points_rgb
-    assert {tuple(color) for color in colors} == {(0, 0, 255)}
-    assert {tuple(color) for color in the_actor(scene, job()).points_rgb} == {(0, 0, 255), (255, 0, 0)}
-    assert actors_of(scene, job(), EgoMask({"CAM_FRONT": (WHOLE,)})) == []
-
-
-def test_a_visible_actor_without_visible_points_is_grey(tmp_path):
-    """All of its points are hidden by the ego vehicle's body, but part of it is visible."""
-    scene = drive(tmp_path, dataclasses.replace(CAR, position=(8.5, 0.0, 0.8)))
-    outline = ((0.0, 0.0), (0.52, 0.0), (0.52, 1.0), (0.0, 1.0))
-    left = [
-        dataclasses.replace(sweep, path=_left_half(Path(sweep.path), tmp_path / f"left{number}.bin"))
-        for number, sweep in enumerate(scene.sweeps)
-    ]
-    actor = the_actor(dataclasses.replace(scene, sweeps=tuple(left)), job(), EgoMask({"CAM_FRONT": (outline,)}))
-    assert len(actor.points) > 50
-    assert {tuple(color) for color in actor.points_rgb} == {(127, 127, 127)}
-
-
-def _left_half(path: Path, copy: Path) -> str:
-    returns = np.fromfile(path, dtype=np.float32).reshape(-1, 5)
-    returns[returns[:, 1] > 0.0].tofile(copy)
-    return str(copy)
 
 
 def test_held_out_images_and_sweeps_contribute_nothing(root):
@@ -418,40 +315,6 @@ def test_held_out_images_and_sweeps_contribute_nothing(root):
     assert_same(actors_record(scene_at(root), settings), before)
     nothing = settings.model_copy(update={"holdout": job(NOTHING_HELD_OUT).holdout})
     assert len(actors_record(scene_at(root), nothing).actors[0].points) > 1500, "the garbage lies in its box"
-
-
-@pytest.mark.parametrize("what", ["image", "sweep"])
-def test_training_images_and_sweeps_do_contribute(root, what):
-    scene = scene_at(root)
-    before = the_actor(scene, job())
-    if what == "image":
-        Image.new("RGB", (96, 54), (255, 0, 255)).save(scene.frames[0].image_path)
-    else:
-        Path(scene.sweeps[0].path).write_bytes(Path(scene.sweeps[3].path).read_bytes())
-    after = the_actor(scene_at(root), job())
-    key = {"image": "points_rgb", "sweep": "points"}[what]
-    assert vars(before)[key].tobytes() != vars(after)[key].tobytes()
-
-
-def test_the_random_seed_determines_the_actors(tiny_scene):
-    settings = {"min_points": 10**6, "random_points": 1000}
-    first, again, other = (actors_record(tiny_scene, job(random_seed=seed, **settings)) for seed in (0, 0, 1))
-    assert_same(first, again)
-    assert first.actors[0].points.tobytes() != other.actors[0].points.tobytes()
-
-
-def test_actors_are_sorted_by_id_and_their_random_points_are_independent(tmp_path):
-    twins = [dataclasses.replace(CAR, position=(9.0, y, 0.8)) for y in (-2.0, 2.0)]
-    walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (8.0, 0.0, 0.95), (4.2, 0.0))
-    scene = drive(tmp_path, *twins, walker)
-    renamed = [dataclasses.replace(track, id=name) for track, name in zip(scene.tracks, "cab", strict=True)]
-    scene = dataclasses.replace(scene, tracks=tuple(renamed), sweeps=())
-    settings = {"min_points": 1, "random_points": 500}
-    alone, all_three = actors_of(scene, job(**settings)), actors_of(scene, job(humans=True, **settings))
-    assert [actor.id for actor in alone] == ["a", "c"] and [actor.id for actor in all_three] == ["a", "b", "c"]
-    assert alone[0].points.tobytes() != alone[1].points.tobytes()
-    for one, same in zip(alone, all_three[::2], strict=True):
-        np.testing.assert_array_equal(one.points, same.points)
 
 
 def test_each_actor_names_the_parts_that_can_represent_it(tmp_path):
@@ -497,20 +360,6 @@ def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
     np.testing.assert_array_equal(motion.present(at), expected.present(at))
 
 
-def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, tmp_path):
-    record = dataclasses.replace(actors_record(tiny_scene, job()), provenance={"stages": {}, "inputs": {"a": "b"}})
-    write_arrays(tmp_path / "actors.npz", record)
-    read = read_actors(tmp_path / "actors.npz")
-    assert_same(read, record)
-    (actor,) = read.actors
-    fields = {**vars(actor), **field_values(actor.motion)}
-    kinds = {name: (value.dtype, value.ndim) for name, value in fields.items() if isinstance(value, np.ndarray)}
-    assert kinds == {
-        "size": (np.float64, 1), "times": (np.float64, 1), "object_to_world": (np.float64, 3),
-        "points": (np.float32, 2), "points_rgb": (np.uint8, 2),
-    }  # fmt: skip
-
-
 def test_a_static_drive_has_an_empty_record_of_actors(tmp_path):
     write_arrays(tmp_path / "actors.npz", actors_record(drive(tmp_path, PARKED), job()))
     assert read_actors(tmp_path / "actors.npz").actors == []
@@ -529,6 +378,7 @@ def test_an_invalid_record_is_named_with_its_rule(tmp_path, content):
         read_actors(path)
 
 
+@pytest.mark.slow
 def test_visible_dynamic_vehicles_of_the_real_scene_become_actors(real_scene_root):
     scene = drives.scene_at(real_scene_root, dataset="nuscenes", scene="0061", sweeps=False)
     found = actors_of(scene, job({}, min_points=2000))
@@ -536,34 +386,3 @@ def test_visible_dynamic_vehicles_of_the_real_scene_become_actors(real_scene_roo
     for actor in found:
         assert len(actor.points) == 8000 and actor.lidar_points < 100, "all but one of its sweeps are missing"
         assert len(np.unique(actor.points_rgb, axis=0)) > 50
-
-
-def test_class_names_in_settings_equal_those_of_objects():
-    assert get_args(ObjectClassName) == tuple(known.value for known in ObjectClass)
-
-
-@pytest.mark.parametrize("known", ObjectClass)
-def test_by_default_vehicles_are_actors_and_nothing_else_is(known):
-    assert ActorSeedSettings().parts_of(known) == (("actors",) if known.is_vehicle else ())
-
-
-@pytest.mark.parametrize(
-    ("settings", "changed"),
-    [
-        ({"cycles": False}, {"motorcycle": (), "bicycle": (), "rider": ()}),
-        ({"humans": True}, {"pedestrian": ("actors",)}),
-        ({"classes": {"bus": "background", "pedestrian": "actors"}}, {"bus": (), "pedestrian": ("actors",)}),
-        ({"classes": {"car": ("deformable", "background", "actors")}}, {"car": ("deformable",)}),
-        ({"classes": {"bicycle": "actors"}, "cycles": False}, {"motorcycle": (), "bicycle": (), "rider": ()}),
-    ],
-)
-def test_a_setting_changes_the_parts_of_its_class_only(settings, changed):
-    chosen, default = ActorSeedSettings.model_validate(settings), ActorSeedSettings()
-    assert {known.value: chosen.parts_of(known) for known in ObjectClass} == {
-        known.value: changed.get(known.value, default.parts_of(known)) for known in ObjectClass
-    }
-
-
-def test_an_unknown_class_is_refused():
-    with pytest.raises(ValidationError, match="lorry"):
-        ActorSeedSettings.model_validate({"classes": {"lorry": "actors"}})

@@ -11,17 +11,15 @@ from helpers.rig_drives import KEY_FRAMES, rig_drive, true_body
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import write_json
 from drivesplat.preprocess import ego_mask as search_module
 from drivesplat.preprocess.ego_mask import (
     ComparedImages,
     camera_outlines,
-    contrasts,
     ego_mask_record,
     find_outlines,
     outlines_of,
 )
-from drivesplat.scene.ego_mask import EgoMask, enclosed, read_ego_mask
+from drivesplat.scene.ego_mask import enclosed, read_ego_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.config import load
@@ -157,39 +155,9 @@ def test_an_even_road_with_lidar_returns_is_not_a_body(unseen, tmp_path):
     assert reason_without_body(even) == "LiDAR has returns all along the edge of the images"
 
 
-def without_returns_below(scene: Scene, folder: Path) -> Scene:
-    """A scene without LiDAR returns from the road near the car, as when it is wet."""
-    sweeps = []
-    for number, sweep in enumerate(scene.sweeps):
-        returns = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, 5)
-        path = folder / f"dry{number}.bin"
-        returns[np.hypot(returns[:, 0], returns[:, 1]) > 9.0].tofile(path)
-        sweeps.append(dataclasses.replace(sweep, path=str(path)))
-    return dataclasses.replace(scene, sweeps=tuple(sweeps))
-
-
-@pytest.mark.parametrize("level", [0, 255])
-def test_black_and_overexposed_areas_are_not_a_body(unseen, tmp_path, level):
-    """The same area in a medium grey is detected as a body."""
-    missed = without_returns_below(unseen, tmp_path)
-    for grey in (level, 120):
-        (folder := tmp_path / str(grey)).mkdir()
-        edge = np.arange(90)[:, None, None] > 80
-        scene = painted(missed, folder, lambda p, _, grey=grey, edge=edge: np.where(edge, float(grey), p))
-        assert body_in(scene).any() == (grey == 120)
-
-
 def test_dark_images_are_refused(seen, tmp_path):
     dark = painted(seen, tmp_path, lambda pixels, _: 0.05 * pixels)
     assert "too little to detect" in reason_without_body(dark)
-
-
-def test_a_body_is_cut_at_the_horizon(unseen, tmp_path):
-    """Dirt covers the right edge of the image up to the sky, without LiDAR returns."""
-    missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
-    dirty = painted(missed, tmp_path, lambda p, _: np.where(np.arange(160)[None, :, None] > 150, 120.0, p))
-    found = body_in(dirty)
-    assert found[60:, 152:].all() and not found[:40].any()
 
 
 def _empty(sweep, folder: Path):
@@ -202,15 +170,6 @@ def test_a_constant_area_that_is_too_large_is_not_a_body(unseen, tmp_path):
     missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
     even = painted(missed, tmp_path, lambda p, _: np.where(np.arange(90)[:, None, None] > 60, 120.0, p))
     assert "more than a body fills" in reason_without_body(even)
-
-
-def test_a_gradual_increase_of_variation_is_not_a_border(unseen):
-    """Variation jumps at a body's border, but increases gradually along a road."""
-    drive = ComparedImages.of(unseen, "CAM_BACK", LOOKING)
-    rows = np.arange(90.0)[:, None].repeat(160, axis=1)
-    lower = rows >= 70
-    assert contrasts(lower, np.where(lower, 4.0, 20.0), drive)
-    assert not contrasts(lower, 4.0 + 0.5 * (89.0 - rows), drive)
 
 
 # ---- messages
@@ -243,22 +202,6 @@ def test_a_setting_chooses_the_cameras_to_search(kind, outlined, searched):
     assert (job.search.cameras if job.search else None) == searched
 
 
-def test_the_evaluated_camera_is_not_searched_by_default():
-    """Figures then do not depend on the search, nor on its settings if there is no other camera."""
-    default = load({})
-    assert default.masks.own_car == "auto"
-    assert stage_settings(default, "own_car", "0061") == '{"polygons":{},"search":null}'
-
-
-def test_a_record_survives_a_round_trip(seen, tmp_path):
-    record = ego_mask_record(seen, JOB)
-    write_json(tmp_path / "own_car.json", {**record, "provenance": {"stages": {}}})
-    ego_mask, provenance = read_ego_mask(tmp_path / "own_car.json")
-    assert provenance == {"stages": {}} and ego_mask.source == {"CAM_BACK": "images"}
-    np.testing.assert_array_equal(ego_mask.pixels("CAM_BACK", SIZE), body_in(seen))
-    assert ego_mask.pixels("CAM_FRONT", SIZE).shape == (90, 160) and not ego_mask.pixels("CAM_FRONT", SIZE).any()
-
-
 @pytest.mark.parametrize(
     "content", [None, "", "[]", "{}", '{"cameras": {"A": {}}, "provenance": {}}', '{"cameras": {}}']
 )
@@ -267,17 +210,6 @@ def test_a_foreign_record_is_named_with_its_rule(tmp_path, content):
         (tmp_path / "own_car.json").write_text(content)
     with pytest.raises(ResultError, match=r"own_car\.json.*'own_car'"):
         read_ego_mask(tmp_path / "own_car.json")
-
-
-@pytest.mark.parametrize("size", [(160, 90), (400, 225), (1600, 900)])
-def test_outlines_enclose_their_mask_at_any_size(size):
-    y, x = np.mgrid[:90, :160]
-    mask = (y > 70 + 0.002 * (x - 80) ** 2) | ((x < 20) & (y > 40))
-    drawn = EgoMask({"A": outlines_of(mask)}).pixels("A", size)
-    rows, columns = (np.arange(n) * m // n for n, m in ((size[1], 90), (size[0], 160)))
-    expected = mask[rows][:, columns]
-    assert (drawn != expected).mean() < 0.015
-    assert drawn[-1, expected[-1]].mean() > 0.97 and drawn[expected[:, 0], 0].mean() > 0.97, "up to the image's edge"
 
 
 def test_each_of_two_bodies_has_its_outline():

@@ -7,17 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.classed import classed
-from helpers.drives import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar, scene_at
+from helpers.drives import LIDAR_AT, START_US, World, cast_lidar, scene_at
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud
-from drivesplat.io.prefetch import prefetch
-from drivesplat.lidar import coloring
-from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility
-from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
+from drivesplat.lidar.coloring import ColorView, color_by_visibility
+from drivesplat.lidar.sweeps import thin, without_ego_vehicle
 from drivesplat.preprocess import lidar_seed
 from drivesplat.preprocess.lidar_seed import color_view, far_points, lidar_points, seed_points, uncovered
 from drivesplat.readers.sweeps import read_returns
@@ -26,7 +23,7 @@ from drivesplat.scene.images import project
 from drivesplat.scene.regions import fill, hull_of
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.splits import frame_groups, sweep_groups
-from drivesplat.scene.tracks import Box, box_at, moving_tracks
+from drivesplat.scene.tracks import box_at, moving_tracks
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 
@@ -87,42 +84,10 @@ def test_lidar_points_are_exactly_the_static_returns_of_training_sweeps(tiny_sce
         assert rows(found) == rows(everything[kept])
 
 
-def test_a_larger_margin_removes_more_points_around_dynamic_objects(tiny_scene):
-    none, wide = (lidar_points(tiny_scene, job(voxel_size=0.0, box_margin=margin))[0] for margin in (0.0, 2.0))
-    assert rows(wide) < rows(none)
-
-
 def test_returns_of_the_ego_vehicle_are_those_horizontally_near_the_sensor():
     points = np.array([[0.5, 0.3, -0.4], [2.6, 0.0, 0.0], [1.8, 1.8, 5.0], [1.7, 1.7, 0.0], [0.0, 0.0, 9.0]])
     np.testing.assert_array_equal(without_ego_vehicle(points, 2.5), points[[1, 2]])
     np.testing.assert_array_equal(without_ego_vehicle(points[:2], 0.0), points[:2])
-
-
-def test_returns_of_the_ego_vehicle_exist_unless_removed(tiny_scene):
-    settings = {"voxel_size": 0.0, "box_margin": 0.0}
-    with_car, _, _ = lidar_points(tiny_scene, job(own_car_radius=0.0, **settings))
-    without, _, _ = lidar_points(tiny_scene, job(own_car_radius=2.5, **settings))
-    assert len(with_car) - len(without) == 2 * 6, "two own-car returns in each of six training sweeps"
-
-
-def turned_box(angle: float) -> Box:
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-    return Box(
-        "it", *classed("vehicle.car"), np.array([4.0, 2.0, 1.5]), rigid(turn, np.array([10.0, 5.0, 1.0])), 5.0, 4
-    )
-
-
-@pytest.mark.parametrize("margin", [0.0, 0.2, 1.0])
-def test_a_rotated_box_is_tested_along_its_own_axes(margin):
-    box = turned_box(0.7)
-    offsets = np.random.default_rng(0).uniform(-5.0, 5.0, (2000, 3))
-    points = offsets + box.object_to_world[:3, 3]
-    x = offsets @ np.array([np.cos(0.7), np.sin(0.7), 0.0])
-    y = offsets @ np.array([-np.sin(0.7), np.cos(0.7), 0.0])
-    inside = (abs(x) < 2.0 + margin) & (abs(y) < 1.0 + margin) & (abs(offsets[:, 2]) < 0.75 + margin)
-    assert 0 < inside.sum() < 2000
-    np.testing.assert_array_equal(outside_boxes(points, [box], margin), ~inside)
-    assert outside_boxes(points, [], margin).all()
 
 
 def test_a_dynamic_track_leaves_no_points_even_while_it_stands_still(tiny_scene):
@@ -140,20 +105,6 @@ def test_a_dynamic_track_leaves_no_points_even_while_it_stands_still(tiny_scene)
     assert on_truck[0] > 20 and on_truck[1] == 0
 
 
-@pytest.mark.parametrize("voxel", [0.1, 0.5, 3.0])
-def test_thinning_keeps_the_first_point_of_every_occupied_voxel(voxel):
-    points = np.random.default_rng(1).normal(0.0, 3.0, (3000, 3))
-    first: dict[tuple, int] = {}
-    for i, cell in enumerate(map(tuple, np.floor(points / voxel).astype(int))):
-        first.setdefault(cell, i)
-    assert thin(points, voxel).tolist() == sorted(first.values())
-
-
-def test_thinning_accepts_voxel_size_0_and_empty_input():
-    assert thin(np.zeros((3, 3)), 0.0).tolist() == [0, 1, 2]
-    assert len(thin(np.empty((0, 3)), 0.1)) == len(thin(np.empty((0, 3)), 0.0)) == 0
-
-
 def test_thinning_works_over_the_extent_of_a_long_drive():
     points = np.array([[-2000.0, -2000.0, -50.0], [-2000.0, -2000.0, -49.95], [2000.0, 2000.0, 50.0]])
     assert thin(points, 0.1).tolist() in ([0, 1, 2], [0, 2])
@@ -168,12 +119,6 @@ def view(color, timestamp: int, at=(0.0, 0.0, 0.0), size=(80, 60)) -> ColorView:
     pixels = np.broadcast_to(np.array(color, dtype=np.uint8), (size[1], size[0], 3)).copy()
     usable = np.ones((size[1], size[0]), dtype=bool)
     return ColorView(pixels, K, rigid(np.eye(3), -np.array(at, dtype=float)), timestamp, usable)
-
-
-def full_size(small: ColorView) -> ColorView:
-    """The view with the focal length of a camera of 640 x 360 pixels."""
-    wide = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 180.0], [0.0, 0.0, 1.0]])
-    return dataclasses.replace(small, intrinsics=wide)
 
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
@@ -198,60 +143,12 @@ def test_a_hidden_point_takes_no_colour_from_that_view():
     assert seen.tolist() == [1, 2]
 
 
-def test_without_the_occluder_the_nearer_view_colours_it():
-    left, right = view(RED, 0), view(BLUE, 100, at=(4.0, 0.0, 0.0))
-    colors, seen = color_by_visibility(np.array([[0.0, 0.0, 10.0]]), np.zeros(1), [left, right])
-    assert tuple(colors[0]) == RED and seen[0] == 2
-
-
-def test_points_of_one_surface_do_not_occlude_each_other():
-    """A wall that recedes at 45 degrees, and ground near the camera: neighbours in a cell differ a little in depth."""
-    along, across = (grid.ravel() for grid in np.meshgrid(np.linspace(-4.0, 4.0, 200), np.linspace(-1.0, 1.0, 20)))
-    wall = np.stack([along, across, 20.0 + along], axis=1)
-    ground = np.stack([along / 2.0, np.full_like(along, 1.5), 9.0 + 4.0 * across], axis=1)
-    for surface in (wall, ground):
-        _, seen = color_by_visibility(surface, np.zeros(len(surface)), [full_size(view(RED, 0, size=(640, 360)))])
-        assert seen.all()
-
-
-@pytest.mark.parametrize("point", [(0.0, 0.0, -10.0), (9.0, 0.0, 10.0), (0.0, 7.0, 10.0), (0.0, 0.0, 0.1)])
-def test_a_point_behind_or_beside_the_image_is_not_seen(point):
-    _, seen = color_by_visibility(np.array([point]), np.zeros(1), [view(RED, 0)])
-    assert seen.tolist() == [0]
-
-
-def test_a_point_takes_the_pixel_it_lies_in():
-    source = view(RED, 0)
-    source.pixels[...] = np.random.default_rng(0).integers(0, 256, source.pixels.shape)
-    columns, rows_ = np.array([0, 79, 40, 13]), np.array([0, 59, 30, 57])
-    depth = np.array([4.0, 9.0, 7.0, 30.0])
-    points = np.stack([(columns + 0.3 - 40.0) / 50.0, (rows_ + 0.8 - 30.0) / 50.0, np.ones(4)], axis=1) * depth[:, None]
-    colors, _ = color_by_visibility(points, np.zeros(4), [source])
-    np.testing.assert_array_equal(colors, source.pixels[rows_, columns])
-
-
 def test_unusable_pixels_give_no_colour():
     unusable = view(RED, 0)
     unusable.usable[:, :41] = False
     points = np.array([[0.0, 0.0, 10.0], [2.0, 0.0, 10.0]])
     colors, seen = color_by_visibility(points, np.zeros(2), [unusable, view(BLUE, 100)])
     assert [tuple(c) for c in colors] == [BLUE, RED] and seen.tolist() == [1, 2]
-
-
-def test_empty_points_and_views_are_accepted():
-    colors, seen = color_by_visibility(np.empty((0, 3)), np.empty(0), [view(RED, 0)])
-    assert colors.shape == (0, 3) and seen.shape == (0,)
-    assert color_by_visibility(np.ones((2, 3)), np.zeros(2), [])[1].tolist() == [0, 0]
-
-
-@pytest.mark.parametrize(("kept_bytes", "read"), [(2**30, 4), (6000, 7), (0, 8)])
-def test_kept_views_are_read_once_as_far_as_memory_allows(monkeypatch, kept_bytes, read):
-    monkeypatch.setattr(coloring, "KEPT_BYTES", kept_bytes)
-    requested: list[int] = []
-    views = KeptViews(lambda i: requested.append(i) or view(RED, i, size=(50, 20)))  # 4000 bytes
-    for _ in range(2):
-        assert [found.timestamp for found in prefetch(views.__getitem__, range(4))] == [0, 1, 2, 3]
-    assert len(requested) == read and set(requested) == {0, 1, 2, 3}
 
 
 def test_pixels_of_moving_objects_are_not_usable_and_those_of_parked_ones_are(tiny_scene):
@@ -298,38 +195,6 @@ def test_far_points_have_distinct_pixels_with_their_colours_and_depths_in_range(
     assert (depth[above] >= 3.0 - 1e-9).all() and (depth <= 300.0 + 1e-6).all()
 
 
-def test_far_points_are_log_uniform_in_depth_above_the_horizon():
-    positions, _ = some_far_points(2640, np.empty((0, 3)))
-    pixels, depth = project(positions, far_view().world_to_camera, K)
-    sky = np.log(depth[pixels[:, 1] < 30.0])
-    quartiles = np.quantile(sky, [0.25, 0.5, 0.75])
-    expected = np.log(3.0) + np.array([0.25, 0.5, 0.75]) * np.log(100.0)
-    np.testing.assert_allclose(quartiles, expected, atol=0.2)
-
-
-def test_far_points_are_never_below_the_ground():
-    positions, _ = some_far_points(2640, np.empty((0, 3)))
-    assert len(positions) == 60 * 44
-    assert positions[:, 2].min() > GROUND - 1e-6
-    assert (np.abs(positions[:, 2] - GROUND) < 1e-6).any(), "some rays must meet the ground for this to mean anything"
-
-
-def test_far_points_skip_covered_cells():
-    """Cells are 8 x 8 pixels. The first, one in the middle, and the partial ones at the right and lower edges are
-    covered."""
-    cells = [(0, 0), (3, 2), (7, 5)]
-    rays = np.array([[(8 * x + 1.2 - 40.0) / 50.0, (8 * y + 1.7 - 30.0) / 50.0, 1.0] for x, y in cells])
-    in_camera = 12.0 * rays
-    behind = np.array([[0.0, 0.0, -5.0], [400.0, 0.0, 5.0]])
-    pose = inverse(far_view().world_to_camera)
-    covered = np.concatenate([in_camera, behind]) @ pose[:3, :3].T + pose[:3, 3]
-    positions, _ = some_far_points(60 * 44, covered)
-    pixels, _ = project(positions, far_view().world_to_camera, K)
-    used = {(int(x) // 8, int(y) // 8) for x, y in pixels}
-    assert used == {(x, y) for x in range(8) for y in range(6)} - set(cells)
-    assert len(positions) == 60 * 44 - 64 - 64 - 4 * 4
-
-
 def above(covered: np.ndarray, near: float = 0.0) -> dict[tuple[int, int], np.ndarray]:
     """The depths of far points along all pixels, by cell (x, y), where LiDAR met the points `covered` (n, 3): columns
     and rows in pixels, and depth along the axis."""
@@ -371,24 +236,6 @@ def test_far_points_may_have_depths_of_what_is_near_in_the_image(near, monkeypat
     assert np.ptp(np.log(depths[3, 3])) > 0.5, "too far from all of them"
 
 
-def test_depths_near_need_a_covered_cell():
-    """Without one all points have random depths."""
-    positions, _ = some_far_points(2640, np.empty((0, 3)), near=1.0)
-    _, depth = project(positions, far_view().world_to_camera, K)
-    assert np.ptp(np.log(depth)) > 3.0
-
-
-@pytest.mark.parametrize("near", [0.0, 1.0])
-def test_without_free_pixels_there_are_no_far_points(near):
-    everywhere = far_view()
-    unusable = dataclasses.replace(everywhere, usable=np.zeros_like(everywhere.usable))
-    for covered in (np.empty((0, 3)), np.array([[112.0, 20.0, GROUND + 1.0]])):
-        candidates = uncovered(unusable, covered, GROUND)
-        assert np.isfinite(candidates.nearest).any() == bool(len(covered))
-        positions, colors = far_points(unusable, GROUND, candidates, 10, (3.0, 300.0), np.random.default_rng(0), near)
-        assert positions.shape == (0, 3) and colors.shape == (0, 3)
-
-
 def assert_same_seed(a: PointCloud, b: PointCloud) -> None:
     np.testing.assert_array_equal(a.positions, b.positions)
     np.testing.assert_array_equal(a.colors, b.colors)
@@ -413,20 +260,6 @@ def test_held_out_images_and_sweeps_contribute_nothing(root):
     assert_same_seed(seed_points(scene_at(root), settings), before)
 
 
-@pytest.mark.parametrize("what", ["image", "sweep"])
-def test_training_images_and_sweeps_do_contribute(root, what):
-    scene = scene_at(root)
-    before = seed_points(scene, job())
-    if what == "image":
-        Image.new("RGB", (96, 54), (255, 0, 255)).save(scene.frames[0].image_path)
-    else:
-        np.random.default_rng(0).uniform(-30.0, 30.0, (500, 5)).astype(np.float32).tofile(scene.sweeps[0].path)
-    after = seed_points(scene_at(root), job())
-    assert rows(np.column_stack([before.positions, before.colors])) != rows(
-        np.column_stack([after.positions, after.colors])
-    )
-
-
 def test_every_seed_point_is_seen_by_a_training_image(tiny_scene):
     seed = seed_points(tiny_scene, job())
     groups = frame_groups(tiny_scene, job().holdout)
@@ -437,28 +270,6 @@ def test_every_seed_point_is_seen_by_a_training_image(tiny_scene):
             x, y = (0.62 * 96 * in_camera[:, :2] / in_camera[:, 2:]).T
             seen |= (in_camera[:, 2] > 0) & (np.abs(x) <= 48.01) & (np.abs(y) <= 27.01)
     assert seen.all()
-
-
-def test_seed_colours_match_the_surfaces(tiny_scene):
-    """Static LiDAR points have the colours of the drive's geometry, up to JPEG and pixel size."""
-    seed = seed_points(tiny_scene, job(far_points=0))
-    assert len(seed.positions) == seed.note["lidar"] > 200
-    rays = seed.positions.astype(float) - CAMERA_AT
-    world = dataclasses.replace(World(), things=[t for t in World().things if t.velocity == (0.0, 0.0)])
-    distance, true = cast(world, CAMERA_AT, rays, 0.0)
-    plain = np.abs(distance - 1.0) < 0.01  # seen from the first camera: the colour there is the surface's
-    close = np.abs(seed.colors[plain].astype(float) - true[plain]).max(axis=1) < 40
-    assert plain.sum() > 50
-    assert close.mean() > 0.7
-
-
-@pytest.mark.parametrize("limit", [100, 250])
-def test_points_are_subsampled_to_the_limit_at_random(tiny_scene, limit):
-    whole = seed_points(tiny_scene, job(far_points=0))
-    thinned = seed_points(tiny_scene, job(far_points=0, max_points=limit))
-    assert len(whole.positions) > 250
-    assert len(thinned.positions) == thinned.note["lidar"] == limit
-    assert rows(thinned.positions) < rows(whole.positions)
 
 
 def test_memory_of_lidar_points_grows_with_voxels_and_their_points_are_the_same(tiny_scene, monkeypatch):
@@ -484,10 +295,6 @@ def test_the_seed_has_lidar_points_before_far_points_and_its_note_counts_them(ti
     assert seed.positions.dtype == np.float32 and seed.colors.dtype == np.uint8
     assert np.isfinite(seed.positions).all()
     assert seed.positions[lidar:, 2].min() > -1e-3, "the tiny drive's ground is at z = 0"
-
-
-def test_far_points_can_be_disabled(tiny_scene):
-    assert seed_points(tiny_scene, job(far_points=0)).note["far"] == 0
 
 
 def test_the_random_seed_determines_the_seed_points(tiny_scene):
@@ -565,22 +372,6 @@ def test_a_scene_without_seed_points_is_refused(tiny_scene):
     scene = dataclasses.replace(tiny_scene, sweeps=())
     with pytest.raises(DatasetError, match=r"0001.*no seed points.*far_points"):
         seed_points(scene, job(on_missing="warn", far_points=0))
-
-
-def test_with_all_sweeps_missing_far_points_remain_and_the_note_counts_the_sweeps(root):
-    scene = scene_at(root)
-    shutil.rmtree(root / "samples" / "LIDAR_TOP")
-    seed = seed_points(scene, job(on_missing="warn"))
-    assert (seed.note["lidar"], seed.note["lidar_missing"], seed.note["far"]) == (0, 10, 200)
-
-
-def test_returns_that_are_not_finite_are_left_out(root):
-    sweep = scene_at(root).sweeps[0]
-    returns = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, 5)
-    returns[3, 0], returns[7, 2] = np.nan, np.inf
-    returns.tofile(sweep.path)
-    expected = np.delete(returns, [3, 7], axis=0)[:, :3]
-    np.testing.assert_array_equal(read_returns(sweep).points, expected.astype(np.float64))
 
 
 def test_the_real_scene_is_seeded_from_its_only_sweep_and_a_file(real_scene_root):

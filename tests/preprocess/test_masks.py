@@ -12,15 +12,14 @@ from helpers import REPOSITORY, drives
 from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 from PIL import Image
 
-from drivesplat.errors import ConfigError, DatasetError, ResultError
-from drivesplat.preprocess.masks import NO_SKY, make_masks, sky_mask, users_file
-from drivesplat.readers.sweeps import read_returns
-from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
-from drivesplat.scene.images import project, read_image
+from drivesplat.errors import DatasetError, ResultError
+from drivesplat.preprocess.masks import NO_SKY, make_masks, sky_mask
+from drivesplat.scene.ego_mask import EgoMask
+from drivesplat.scene.images import read_image
 from drivesplat.scene.masks import UNLABELLED, mask_name, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import LABELS, fill, hulls_in, label_image, region_mask
-from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene, Track, write_scene
 from drivesplat.settings.masks import MaskJob
 
@@ -56,26 +55,10 @@ def true_sky(frame: Frame, size: tuple[int, int]) -> np.ndarray:
     return ~np.isfinite(distance).reshape(size[1], size[0])
 
 
-def test_every_image_has_labels_and_a_sky_mask(tiny_scene, made):
-    folder, record = made
-    expected = {f"{kind}/CAM_FRONT/{f.timestamp}.png" for kind in ("regions", "sky") for f in tiny_scene.frames}
-    assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == expected
-    assert (record.images, record.regions, record.sky) == (19, "boxes", "heuristic")
-    assert record.labels == LABELS and record.visibility == "annotated"
-
-
 def test_labels_survive_a_round_trip(tiny_scene, made):
     for frame in tiny_scene.frames[::5]:
         labels = read_labels(made[0], "CAM_FRONT", frame.timestamp, SIZE)
         np.testing.assert_array_equal(labels, label_image(tiny_scene, frame, SIZE))
-
-
-def test_masks_have_the_size_at_which_images_are_used(tiny_scene, tmp_path):
-    scene = dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:1])
-    make_masks(scene, job(width=48), tmp_path)
-    for kind in ("regions", "sky"):
-        with Image.open(tmp_path / mask_name(kind, "CAM_FRONT", scene.frames[0].timestamp)) as image:
-            assert image.size == (48, 27)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -93,16 +76,6 @@ def test_the_sky_of_the_tiny_drive_is_found(tiny_scene, made, index):
 def test_the_record_has_the_share_of_sky(tiny_scene, made):
     true = np.mean([true_sky(frame, SIZE).mean() for frame in tiny_scene.frames])
     assert made[1].sky_share == pytest.approx(true, abs=0.1)
-
-
-def test_pixels_with_lidar_returns_are_not_sky(tiny_scene, made):
-    for frame in tiny_scene.frames[::2]:
-        sweep = min(tiny_scene.sweeps, key=lambda s: abs(s.timestamp - frame.timestamp))
-        at, depth = project(apply(sweep.sensor_to_world, read_returns(sweep).points), inverse(frame.camera_to_world), K)
-        inside = (depth > 1.0) & (at >= 0).all(axis=1) & (at < SIZE).all(axis=1)
-        columns, rows = at[inside].astype(int).T
-        assert len(rows) > 100
-        assert not read_sky_mask(made[0], "CAM_FRONT", frame.timestamp, SIZE)[rows, columns].any()
 
 
 K = np.array([[0.62 * 96, 0.0, 48.0], [0.0, 0.62 * 96, 27.0], [0.0, 0.0, 1.0]])
@@ -139,14 +112,6 @@ def test_sky_is_bright_or_blue_and_never_below_the_horizon(tiny_scene, color, is
     assert not mask[27:].any()
 
 
-@pytest.mark.parametrize("width", [96, 640, 1600])
-def test_a_clear_sky_reaches_into_the_corners_of_the_image(tiny_scene, width):
-    height = width * 9 // 16
-    pixels = np.full((height, width, 3), (150, 190, 240), dtype=np.uint8)
-    k = np.diag([width / 96, width / 96, 1.0]) @ K
-    assert sky_mask(pixels, k, tiny_scene.frames[0].camera_to_world, None)[: height // 3].all()
-
-
 @pytest.mark.parametrize(
     ("object_class", "is_sky"), [("truck", False), ("trailer", False), ("rider", True), ("construction_vehicle", True)]
 )
@@ -178,16 +143,6 @@ def test_a_bright_patch_not_connected_to_the_top_is_not_sky(tiny_scene):
 def test_masks_are_made_without_lidar(tiny_scene, tmp_path):
     scene = dataclasses.replace(tiny_scene, sweeps=(), frames=tiny_scene.frames[:2])
     assert make_masks(scene, job(), tmp_path).images == 2
-
-
-@pytest.mark.parametrize("damage", ["missing", "cut"])
-def test_masks_do_not_require_readable_lidar(tiny_root, tmp_path, damage):
-    """`lidar_seed.on_missing` decides whether a run continues without LiDAR; masks only use it where available."""
-    root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
-    scene = extracted(root)
-    path = Path(scene.sweeps[0].path)
-    path.unlink() if damage == "missing" else path.write_bytes(path.read_bytes()[:-7])
-    assert make_masks(scene, job(), tmp_path / "masks").images == len(scene.frames)
 
 
 def test_the_sky_of_training_images_is_independent_of_held_out_sweeps(tiny_scene, tmp_path):
@@ -227,13 +182,6 @@ def two_images(tiny_scene) -> Scene:
     return dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:2])
 
 
-def test_the_record_says_where_visibility_is_estimated(two_images, tmp_path):
-    first, *others = two_images.tracks
-    unknown = dataclasses.replace(first, visibility=np.zeros_like(first.visibility))
-    scene = dataclasses.replace(two_images, tracks=(unknown, *others))
-    assert make_masks(scene, job(), tmp_path).visibility == "estimated"
-
-
 def test_masks_of_the_user_are_used(two_images, tmp_path):
     labels = np.random.default_rng(0).integers(0, 10, (54, 96)).astype(np.uint8)
     sky = np.where(labels > 4, 255, 0).astype(np.uint8)
@@ -270,23 +218,6 @@ def test_sky_is_unknown_if_none_is_found_unless_the_user_gives_masks(two_images,
     assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
 
 
-def test_masks_that_the_workflow_wrote_are_accepted_back(two_images, tmp_path):
-    """Copies of its own files, one of them edited; the ego vehicle's label among them."""
-    outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0))
-    make_masks(two_images, job(), tmp_path / "masks", seen_in_front(outline))
-    shutil.copytree(tmp_path / "masks", tmp_path / "mine")
-    at = ("CAM_FRONT", two_images.frames[1].timestamp, SIZE)
-    before, sky = read_labels(tmp_path / "masks", *at), read_sky_mask(tmp_path / "masks", *at)
-    edited = before.copy()
-    edited[:5] = LABELS["left_out"]
-    Image.fromarray(edited).save(tmp_path / f"mine/regions/CAM_FRONT/{at[1]}.png")
-    settings = job(regions_folder=str(tmp_path / "mine/regions"), sky_folder=str(tmp_path / "mine/sky"))
-    record = make_masks(two_images, settings, tmp_path / "again", NO_EGO_MASK)
-    np.testing.assert_array_equal(read_labels(tmp_path / "again", *at), edited)
-    np.testing.assert_array_equal(read_sky_mask(tmp_path / "again", *at), sky)
-    assert record.own_car == {"CAM_FRONT": "masks"} and (edited != before).any()
-
-
 def test_the_example_of_the_documentation_writes_masks_that_are_accepted(two_images, tmp_path, monkeypatch):
     page = (REPOSITORY / "docs/masks.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
@@ -299,21 +230,6 @@ def test_the_example_of_the_documentation_writes_masks_that_are_accepted(two_ima
     np.testing.assert_array_equal(read_sky_mask(*at), classes == 10)
     np.testing.assert_array_equal(read_classes(*at), classes)
     assert record.semantic_classes == 12 and record.sky == "masks"
-
-
-def test_the_name_of_the_image_comes_before_its_timestamp(two_images, tmp_path):
-    frame = two_images.frames[0]
-    folder = users_masks(two_images, tmp_path / "mine", np.full((54, 96), 1, dtype=np.uint8))
-    Image.fromarray(np.full((54, 96), 2, dtype=np.uint8)).save(folder / f"CAM_FRONT/{frame.timestamp}.png")
-    assert users_file(str(folder), frame).stem == Path(frame.image_path).stem
-
-
-@pytest.mark.parametrize("kind", ["regions", "sky", "semantic"])
-def test_the_folder_of_the_masks_themselves_is_refused(two_images, tmp_path, kind):
-    folder = tmp_path / "masks" / kind
-    with pytest.raises(ConfigError) as failure:
-        make_masks(two_images, job(**{f"{kind}_folder": str(folder)}), tmp_path / "masks")
-    assert f"masks.{kind}_folder: {folder}" in str(failure.value) and "copy it" in str(failure.value)
 
 
 def test_masks_of_the_user_are_resized_to_the_images(two_images, tmp_path):
@@ -347,14 +263,6 @@ def test_a_mask_of_another_aspect_ratio_is_refused_with_both_sizes(two_images, t
         make_masks(two_images, job(**{kind: str(folder)}), tmp_path / "masks")
     for part in (str(folder), f"is {size[0]}x{size[1]}", "96x54", "aspect ratio"):
         assert part in str(failure.value)
-
-
-@pytest.mark.parametrize("size", [(96, 55), (48, 27), (32, 18), (50, 28), (51, 28), (1920, 1080)])
-@pytest.mark.parametrize("width", [None, 40])
-def test_a_mask_whose_sides_are_rounded_is_scaled(two_images, tmp_path, size, width):
-    folder = users_masks(two_images, tmp_path / "mine", np.zeros(size[::-1], dtype=np.uint8))
-    record = make_masks(two_images, job(width, regions_folder=str(folder)), tmp_path / "masks")
-    assert record.regions == "masks"
 
 
 def test_a_mask_in_colours_is_refused_and_one_with_equal_channels_accepted(two_images, tmp_path):
@@ -405,15 +313,6 @@ def test_the_outline_of_the_ego_vehicle_is_excluded_from_every_region(two_images
         np.testing.assert_array_equal(labels[outside], label_image(two_images, frame, SIZE)[outside])
 
 
-def test_the_outline_of_the_ego_vehicle_is_excluded_from_masks_of_the_user(two_images, tmp_path):
-    folder = users_masks(two_images, tmp_path / "mine", np.full((54, 96), LABELS["moving_car"], dtype=np.uint8))
-    outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0))
-    make_masks(two_images, job(regions_folder=str(folder)), tmp_path / "masks", seen_in_front(outline))
-    labels = read_labels(tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
-    assert set(np.unique(labels)) == {LABELS["moving_car"], LABELS["own_car"]}
-    assert (labels[50:] == LABELS["own_car"]).all() and (labels[:47] == LABELS["moving_car"]).all()
-
-
 def test_the_ego_vehicle_is_neither_sky_nor_of_any_class(two_images, tmp_path):
     """The user's masks say that all is sky, and of class 3."""
     full = users_masks(two_images, tmp_path / "full", np.full((54, 96), 255, dtype=np.uint8))
@@ -446,14 +345,6 @@ def test_an_invalid_mask_is_named_with_its_rule(two_images, tmp_path, kind, dama
     with pytest.raises(ResultError, match=rf"{timestamp}\.png.*'masks'"):
         read(tmp_path, "CAM_FRONT", timestamp, SIZE)
     assert read(tmp_path, "CAM_FRONT", two_images.frames[0].timestamp, SIZE).shape == (54, 96)
-
-
-@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"images": 3}', '{"regions"'])
-def test_an_invalid_record_of_masks_is_named_with_its_rule(tmp_path, content):
-    if content is not None:
-        (tmp_path / "masks.json").write_text(content)
-    with pytest.raises(ResultError, match=r"masks\.json.*'masks'"):
-        read_masks_record(tmp_path)
 
 
 def test_a_record_of_masks_is_read(made, tmp_path):

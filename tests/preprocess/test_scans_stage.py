@@ -26,12 +26,11 @@ from helpers.scan_drives import (
 from helpers.waymo_drive import NAME, SWEEP_S, tiny_drive
 from helpers.waymo_files import write_v2
 
-from drivesplat.errors import ConfigError, DatasetError, ResultError
-from drivesplat.io.array_file import write_arrays
+from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.scans import firings, scan_records, spin_of
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.scene.scan_record import NO_OBJECT, read_scans
+from drivesplat.scene.scan_record import NO_OBJECT
 from drivesplat.scene.sensors import Lidar, LidarReturns
 from drivesplat.settings.config import load
 
@@ -73,19 +72,6 @@ def test_a_scan_holds_the_rays_of_the_pattern_with_and_without_a_return(tmp_path
     np.testing.assert_allclose(scan.intensities, 0.5 * np.isfinite(ranges))
     assert record.measured.all() and (record.objects == NO_OBJECT).all() and not scan.rays.offsets_s.any()
     assert not record.linear.any() and not record.angular.any() and record.group == "train"
-
-
-def test_the_record_of_a_file_is_the_one_that_was_written(tmp_path):
-    records = scan_records(drive_of(tmp_path, [room(), room()], lidar=dataclasses.replace(LIDAR, spin=SPIN)), job())
-    path = tmp_path / "scans.npz"
-    write_arrays(path, records)
-    again = read_scans(path)
-    assert again.tracks == [] and len(again.scans) == 2
-    np.testing.assert_array_equal(again.scans[1].scan.rays.offsets_s, records.scans[1].scan.rays.offsets_s)
-    assert again.scans[1].objects.dtype == np.int16
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ResultError, match="the rule 'scans' rebuilds it"):
-        read_scans(path)
 
 
 def test_each_return_has_the_object_that_it_lay_in_at_its_own_time(tmp_path):
@@ -158,13 +144,6 @@ def test_a_moving_sensor_has_its_mean_velocity_and_sees_walls_where_they_are(tmp
     assert np.ptp(scan.ranges[scan.returned]) > 0.5
 
 
-def test_the_number_of_firings_may_be_set(tmp_path):
-    (record,) = scan_records(drive_of(tmp_path, [room()]), job(azimuth_steps=STEPS // 2)).scans
-    assert record.scan.rays.shape == (len(BEAMS), STEPS // 2) and record.scan.returned.all()
-    unknown = drive_of(tmp_path, [room()], lidar=Lidar("top"))
-    assert scan_records(unknown, job()).scans[0].scan.rays.shape == (len(BEAMS), STEPS), "as gaps suggest"
-
-
 @pytest.mark.parametrize(
     ("times", "stated", "expected"),
     [
@@ -204,14 +183,6 @@ def test_a_sweep_that_gives_no_scan_stops_and_is_named_or_is_left_out(fault, tmp
     assert [scan.sample_index for scan in records.scans] == [0, 2]
     assert any("1.npz" in line and reason in line for line in caplog.messages)
     assert "1 of 3 sweeps of LiDAR top give no scan; they are left out" in caplog.messages
-
-
-def test_known_beams_without_any_return_of_a_ray_are_no_scan_either(tmp_path):
-    nothing = {axis: np.full(4 * STEPS, 0.01) for axis in "xyz"}
-    scene = drive_of(tmp_path, [room()])
-    write_returns(tmp_path / "0.npz", room(), **nothing)
-    with pytest.raises(DatasetError, match=r"0\.npz has no return of a ray"):
-        scan_records(scene, job())
 
 
 def test_a_sweep_without_intensities_and_one_with_duplicated_azimuths_are_scans(tmp_path):

@@ -7,13 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive.check import check
-from drivesplat.readers.drive.conversion import pose_at, reading, timed_poses, write_folder
-from drivesplat.readers.files import link_or_copy
-from drivesplat.scene.rigid import rigid
+from drivesplat.readers.drive.conversion import reading, timed_poses, write_folder
 
 
 @pytest.fixture
@@ -40,16 +37,6 @@ def test_a_folder_holds_the_record_the_images_and_the_sweeps(image, tmp_path):
     assert path == tmp_path / "out/drive.json" and json.loads(path.read_text())["frames"][0]["file"] == "front/1.png"
     assert (tmp_path / "out/front/1.png").samefile(image), "linked where the file system allows it"
     assert check(tmp_path / "out", None) == []
-
-
-def test_a_file_that_is_a_link_is_replaced_and_not_written_into(image, tmp_path):
-    other, target = tmp_path / "other.png", tmp_path / "target.png"
-    other.write_bytes(b"other")
-    for _ in range(2):
-        link_or_copy(image, target)
-    assert target.samefile(image)
-    link_or_copy(other, target)
-    assert target.read_bytes() == b"other" and image.stat().st_size > 5
 
 
 def test_a_scan_that_cannot_be_read_leaves_no_drive(image, tmp_path):
@@ -90,16 +77,6 @@ def test_a_missing_image_is_named_before_anything_is_written(tmp_path):
     with pytest.raises(DatasetError, match=r"1 of 1 images are missing \(first: .*none\.png\)"):
         write_folder(tmp_path / "out", record(), {"front/1.png": tmp_path / "none.png"})
     assert not (tmp_path / "out").exists()
-
-
-def test_poses_between_and_outside_those_given():
-    """A vehicle that turns by 0.2 rad and moves 1 m in 100 ms."""
-    times = np.array([100_000, 200_000])
-    poses = rigid(Rotation.from_euler("z", [[0.0], [0.2]]).as_matrix(), np.array([[2.0, 0, 0], [3.0, 0, 0]]))
-    for time, place, angle in ((150_000, 2.5, 0.1), (200_000, 3.0, 0.2), (230_000, 3.3, 0.26), (90_000, 1.9, -0.02)):
-        expected = rigid(Rotation.from_euler("z", angle).as_matrix(), np.array([place, 0.0, 0.0]))
-        np.testing.assert_allclose(pose_at(times, poses, time), expected, atol=1e-12)
-    np.testing.assert_array_equal(pose_at(times[:1], poses[:1], 900_000), poses[0])
 
 
 def test_what_goes_wrong_with_a_file_names_it(tmp_path):

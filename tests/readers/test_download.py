@@ -79,13 +79,6 @@ def test_a_valid_archive_becomes_the_dataset_and_leaves_no_other_files(site, wor
     assert len(drives.scene_at(root, dataset="nuscenes", sweeps=False).frames) == 3
 
 
-def test_an_empty_folder_and_a_link_to_one_are_filled(site, world, tmp_path):
-    (tmp_path / "large disk/mini").mkdir(parents=True)
-    (tmp_path / "mini").symlink_to(tmp_path / "large disk/mini")
-    download(site.job(tmp_path / "mini"))
-    assert (tmp_path / "mini").is_symlink() and files(tmp_path / "large disk/mini") == files(world)
-
-
 def test_an_existing_dataset_is_left_unchanged_and_nothing_is_fetched(site, tmp_path, capsys):
     download(site.job(tmp_path / "mini"))
     (tmp_path / "mini/mine.txt").write_text("mine")
@@ -93,13 +86,6 @@ def test_an_existing_dataset_is_left_unchanged_and_nothing_is_fetched(site, tmp_
     download(site.job(tmp_path / "mini"))
     assert "already: nothing to do" in capsys.readouterr().err
     assert site.asked == [] and (tmp_path / "mini/mine.txt").read_text() == "mine"
-
-
-def test_nothing_is_fetched_if_another_run_finished_first(site, tmp_path, monkeypatch):
-    looks = [False, True]
-    monkeypatch.setattr(nuscenes_mini, "is_present", lambda _: looks.pop(0))
-    download(site.job(tmp_path / "mini"))
-    assert site.asked == [] and list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("part_only", [False, True])
@@ -153,20 +139,6 @@ def broken_off(site: Site, path: Path, at: int = 400_000) -> None:
     site.asked.clear()
 
 
-def test_the_next_call_resumes_an_interrupted_download(plain, tmp_path):
-    broken_off(plain, tmp_path / "file")
-    fetch(plain.settings(), tmp_path / "file")
-    assert plain.ranges_asked == ["bytes=400000-"]
-    assert (tmp_path / "file").read_bytes() == CONTENT
-
-
-@pytest.mark.parametrize("tag", [None, 'W/"first"'])
-def test_a_file_without_a_validator_is_fetched_anew(plain, tmp_path, tag):
-    plain.tag, plain.cut_after = tag, [400_000]
-    fetch(plain.settings(), tmp_path / "file")
-    assert plain.ranges_asked == [None, None] and (tmp_path / "file").read_bytes() == CONTENT
-
-
 @pytest.mark.parametrize("kind", ["no ranges", "another tag", "another address"])
 def test_a_download_that_cannot_be_resumed_restarts(plain, tmp_path, kind):
     broken_off(plain, tmp_path / "file")
@@ -184,13 +156,6 @@ def test_a_download_that_cannot_be_resumed_restarts(plain, tmp_path, kind):
     assert ("Range" in plain.asked[0]) == (kind in ("no ranges", "another tag"))
 
 
-def test_last_modified_is_the_validator_without_an_etag(plain, tmp_path):
-    plain.tag, plain.date = None, "Wed, 21 Oct 2015 07:28:00 GMT"
-    broken_off(plain, tmp_path / "file")
-    fetch(plain.settings(), tmp_path / "file")
-    assert plain.asked[0]["If-Range"] == plain.date and (tmp_path / "file").read_bytes() == CONTENT
-
-
 @pytest.mark.parametrize("kind", ["another part", "part of another file", "no such part"])
 def test_bytes_outside_the_requested_range_are_not_appended(plain, tmp_path, kind):
     broken_off(plain, tmp_path / "file")
@@ -199,18 +164,6 @@ def test_bytes_outside_the_requested_range_are_not_appended(plain, tmp_path, kin
         plain.tag, plain.content, plain.heeds_conditions = '"second"', CONTENT[::-1], False
     fetch(plain.settings(attempts=2), tmp_path / "file")
     assert plain.ranges_asked == ["bytes=400000-", None] and (tmp_path / "file").read_bytes() == plain.content
-
-
-def test_a_complete_file_that_is_not_yet_verified_is_not_fetched_again(plain, tmp_path):
-    fetching.part_of(tmp_path / "file").write_bytes(CONTENT)
-    fetch(plain.settings(), tmp_path / "file")
-    assert plain.asked == [] and (tmp_path / "file").read_bytes() == CONTENT
-
-
-def test_a_part_that_is_too_long_restarts_the_download(plain, tmp_path):
-    fetching.part_of(tmp_path / "file").write_bytes(CONTENT + b"more")
-    fetch(plain.settings(), tmp_path / "file")
-    assert plain.ranges_asked == [None] and (tmp_path / "file").read_bytes() == CONTENT
 
 
 def test_a_checksum_of_null_warns_and_checks_the_size_only(site, tmp_path, caplog):
@@ -239,13 +192,6 @@ def test_a_run_killed_while_fetching_is_resumed(site, world, tmp_path):
     site.silent_after = None
     download(job)
     assert site.ranges_asked == [None, f"bytes={len(site.content) // 2}-"] and files(tmp_path / "mini") == files(world)
-
-
-def test_a_redirected_download_is_resumed(plain, tmp_path):
-    plain.cut_after = [400_000]
-    moved = plain.settings(url=plain.address.replace("v1.0-mini.tgz", "moved"))
-    fetch(moved, tmp_path / "file")
-    assert plain.ranges_asked == [None, "bytes=400000-"] and (tmp_path / "file").read_bytes() == CONTENT
 
 
 def test_a_proxy_in_the_environment_is_used(plain, tmp_path, monkeypatch):
@@ -282,14 +228,6 @@ def test_progress_counts_what_earlier_calls_received(monkeypatch, capsys):
         progress.update(1_000_000_000)
     lines = capsys.readouterr().err.replace("\r", "\n")
     assert re.search(r"^download: +50%.*\b2\.00G/4\.00G .*B/s\]", lines, re.MULTILINE)
-
-
-def test_progress_is_shown_at_intervals(capsys):
-    with console.byte_progress("download", 1000) as progress:
-        for _ in range(1000):
-            progress.update(1)
-        shown = capsys.readouterr().err.count("download:")
-    assert shown == 1 and "100%" in capsys.readouterr().err
 
 
 def test_the_first_recorded_dataset_of_the_mini_split_is_the_destination():

@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import json
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,26 +13,20 @@ import numpy as np
 import pytest
 from helpers import REPOSITORY, drives
 from helpers.drives import scene_at
-from helpers.mutations import CHANCE, mutate_json
+from helpers.mutations import damages, mutate_json
 from helpers.patience import PATIENCE_S
-from hypothesis import given, settings
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.readers.drive.__main__ import main
-from drivesplat.readers.drive.check import seen_from_above
-from drivesplat.readers.drive.format import Drive, DriveTrack
 from drivesplat.readers.drive.layout import camera_names, find_root
-from drivesplat.readers.drive.reader import chosen_recordings, max_track_gap, read
+from drivesplat.readers.drive.reader import chosen_recordings, read
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.images import HoldoutSettings, ImageSettings
-from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 
 pytestmark = pytest.mark.usefixtures("uncompared")
 
@@ -90,36 +83,6 @@ def test_a_track_that_is_absent_at_one_key_frame_stays_absent(recorded, tmp_path
     (again,) = read(tmp_path / "again", source()).tracks
     np.testing.assert_array_equal(again.sample_indices, broken.sample_indices)
     np.testing.assert_array_equal(again.object_to_world, broken.object_to_world)
-
-
-@pytest.mark.parametrize(
-    ("steps", "usual", "expected"),
-    [
-        ([500_000, 1_000_000], 500_000, 1_000_000),
-        ([500_000, 500_000, 1_000_000], 500_000, 750_000),
-        ([100_000] * 9, 100_000, 300_000),
-        ([500_000] * 4, 100_000, 750_000),
-        ([2_000_000], 100_000, 300_000),
-        ([900_000] * 2, 900_000, 1_000_000),
-        ([], 0, 300_000),
-    ],
-)
-def test_tracks_are_interpolated_over_little_more_than_the_usual_interval(steps, usual, expected):
-    times = np.cumsum([0, *steps]).tolist()
-    poses = [{"timestamp": t, "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]} for t in times]
-    track = DriveTrack.model_validate({"id": "a", "class": "car", "size": [4, 2, 1.5], "poses": poses})
-    assert max_track_gap(track, float(usual)) == expected
-
-
-def test_seed_points_are_the_same_to_the_last_bit(recorded, folder):
-    again = extract_scene(source(), folder)
-    job = SeedJob(
-        lidar_seed=LidarSeedSettings(max_points=500, far_points=50), images=ImageSettings(),
-        holdout=HoldoutSettings(), random_seed=0,
-    )  # fmt: skip
-    one, other = seed_points(again, job), seed_points(recorded, job)
-    np.testing.assert_array_equal(one.positions, other.positions)
-    np.testing.assert_array_equal(one.colors, other.colors)
 
 
 def test_a_frame_range_renumbers_key_frames(recorded, folder):
@@ -209,13 +172,8 @@ def test_the_recording_of_a_key_frame_is_the_nearest_within_half_an_interval(tim
 FAULTS = {
     "not a drive": (lambda d: d.update(format="nuscenes"), "format is 'nuscenes'"),
     "another key": (lambda d: d.update(camera={}), "camera is no key of the format"),
-    "a text for a time": (lambda d: d["frames"][3].update(timestamp="now"), "frames[3].timestamp is 'now'"),
     "seconds": (
         lambda d: [f.update(timestamp=f["timestamp"] // 10**6) for f in d["frames"]],
-        "timestamps must be microseconds",
-    ),
-    "milliseconds": (
-        lambda d: [f.update(timestamp=f["timestamp"] // 1000) for f in d["frames"]],
         "timestamps must be microseconds",
     ),
     "nanoseconds of a camera": (
@@ -235,17 +193,9 @@ FAULTS = {
         lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
         "cameras.CAM_FRONT: its transform mirrors",
     ),
-    "a scaled camera": (
-        lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]),
-        "its transform is not rigid",
-    ),
     "K of another image": (
         lambda d: d["cameras"]["CAM_FRONT"].update(K=[[1e-300, 0, 40], [0, 60, 27], [0, 0, 1]]),
         "its focal length is 1e-300 pixels; images of 96x54",
-    ),
-    "a principal point outside": (
-        lambda d: d["cameras"]["CAM_FRONT"].update(K=[[60, 0, 800], [0, 60, 450], [0, 0, 1]]),
-        "its principal point (800, 450) is outside its images",
     ),
     "coefficients": (
         lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "fisheye", "coefficients": [0.1]}),
@@ -265,10 +215,6 @@ FAULTS = {
         lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "radius_to_angle", "coefficients": [0.3]}),
         "cameras.CAM_FRONT: K states a focal length of",
     ),
-    "a pose far away": (
-        lambda d: d["frames"][0]["ego_to_world"].update(translation=[1e12, 0, 0]),
-        "frames[0]: its translation is",
-    ),
     "another camera": (lambda d: d["frames"][0].update(camera="left"), "camera 'left' is not in cameras"),
     "a file outside": (
         lambda d: d["frames"][0].update(file="../x.jpg"),
@@ -286,7 +232,6 @@ FAULTS = {
     ),
     "an unknown class": (lambda d: d["tracks"][0].update({"class": "lorry"}), "tracks[0].class is 'lorry'"),
     "no frames": (lambda d: d.update(frames=[], sweeps=[]), "frames: there is none"),
-    "no calibration": (lambda d: d.update(cameras={}), "images need their calibration"),
 }
 
 
@@ -306,9 +251,8 @@ def test_every_fault_is_a_sentence_of_the_checker_and_stops_the_reader(fault, co
     assert "drive.json" in str(stopped.value)
 
 
-@settings(max_examples=200)
-@given(random=CHANCE)
-def test_200_mutated_files_end_with_a_sound_scene_or_sentences(content, tmp_path, random):
+@damages(60, 200)
+def test_mutated_files_end_with_a_sound_scene_or_sentences(content, tmp_path, random):
     """Whatever is accepted is finite, in order, and of the drive's cameras."""
     path = tmp_path / "drive.json"
     path.write_text(json.dumps(mutate_json(random, content)), encoding="utf-8")
@@ -338,16 +282,6 @@ def test_a_file_that_is_no_record_is_refused_in_a_sentence(text, words, tmp_path
     assert words in str(stopped.value)
 
 
-def test_a_track_that_jumps_is_a_warning_of_the_checker(content, folder, tmp_path, capsys):
-    changed = copy.deepcopy(content)
-    changed["tracks"][0]["poses"][1]["translation"] = [900.0, 0.0, 0.0]
-    shutil.copytree(folder / "0001", tmp_path / "0001")
-    (tmp_path / "0001/drive.json").write_text(json.dumps(changed), encoding="utf-8")
-    assert main(["check", str(tmp_path / "0001")]) == 0
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: "))
-    assert f"track {changed['tracks'][0]['id']}" in line and "jumps" in line
-
-
 def test_the_checker_draws_a_picture_of_a_sound_folder(folder, tmp_path, capsys):
     picture = tmp_path / "check.png"
     assert main(["check", str(folder / "0001"), "--picture", str(picture)]) == 0
@@ -357,20 +291,6 @@ def test_the_checker_draws_a_picture_of_a_sound_folder(folder, tmp_path, capsys)
     assert pixels.shape == (2 * 540, 960, 3), "the sweep of the image's time, and sweeps of other times"
     boxes = (pixels == (255, 90, 0)).all(axis=2)
     assert 100 < boxes.sum() < 20_000
-
-
-def test_files_that_are_missing_or_no_images_are_faults_too(folder, content, tmp_path, capsys):
-    mine = tmp_path / "0001"
-    mine.mkdir()
-    (mine / "drive.json").write_text(json.dumps(content), encoding="utf-8")
-    for frame in content["frames"][1:]:
-        (mine / frame["file"]).parent.mkdir(parents=True, exist_ok=True)
-        (mine / frame["file"]).write_bytes((folder / "0001" / frame["file"]).read_bytes())
-    deep = np.full((54, 96), 40_000, dtype=np.uint16)
-    Image.fromarray(deep).save(mine / content["frames"][1]["file"], format="PNG")
-    assert main(["check", str(mine)]) == 1
-    said = capsys.readouterr().out
-    assert "is missing" in said and "more than 8 bits per channel (I;16)" in said
 
 
 @pytest.mark.parametrize(
@@ -476,18 +396,6 @@ def test_lidar_alone_is_checked_and_drawn_from_above(lidar_alone, capsys):
     assert (pixels[20:].max(axis=2) > 0).sum() > 1000, "returns"
 
 
-def test_returns_from_above_are_where_the_world_has_them(lidar_alone, recorded):
-    """A return 10 m east and 20 m north of the LiDAR, and nothing else."""
-    sweep = dataclasses.replace(
-        recorded.sweeps[0], path=str(lidar_alone / "one.npz"), reader="drive", sensor_to_world=np.eye(4)
-    )
-    np.savez(sweep.path, x=[10.0], y=[20.0], z=[0.0])
-    scene = dataclasses.replace(recorded, sweeps=(sweep,), tracks=())
-    drawn = np.asarray(seen_from_above(scene, 960))[40:]
-    ((row, column, *_), *_) = np.argwhere(drawn)
-    assert (drawn.max(axis=2) > 0).sum() == 1 and (row + 40, column) == (288, 576)
-
-
 @pytest.fixture
 def unposed(content, folder, tmp_path) -> Path:
     """The drive without any pose."""
@@ -522,11 +430,6 @@ def test_a_drive_without_poses_is_read_where_they_are_estimated(unposed, caplog)
     assert "there are no poses; refine_poses estimates them" in said and "hardly moves" not in said
 
 
-def test_the_checker_says_what_a_drive_without_poses_needs(unposed, capsys):
-    assert main(["check", str(unposed)]) == 0
-    assert "no poses: set refine_poses: {enabled: true, start: images}" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("lacking", ["sweeps", "frames"])
 def test_without_poses_a_drive_needs_images_and_lidar(unposed, lacking, capsys):
     path = unposed / "drive.json"
@@ -535,11 +438,6 @@ def test_without_poses_a_drive_needs_images_and_lidar(unposed, lacking, capsys):
     assert "poses can be estimated only where there are both images and LiDAR sweeps" in capsys.readouterr().out
     with pytest.raises(DatasetError, match="only where there are both"):
         read(unposed, source(poses_from_images=True))
-
-
-def test_the_schema_is_that_of_the_records(capsys):
-    assert main(["schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(Drive.model_json_schema(by_alias=True)))
 
 
 def test_the_command_runs_as_documented(folder, tmp_path):

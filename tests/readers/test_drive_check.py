@@ -132,17 +132,6 @@ def test_a_short_drive_without_lidar_gets_the_settings_that_it_needs(content, fo
     assert not any("surfaces" in line or "boxes around" in line for line in lines)
 
 
-def test_one_key_frame_is_counted_as_one(content, folder, capsys):
-    time = content["key_frames"][0]
-    changed = {**content, "key_frames": [time]}
-    changed["frames"] = [min(content["frames"], key=lambda one: abs(one["timestamp"] - time))]
-    changed["sweeps"] = [min(content["sweeps"], key=lambda one: abs(one["timestamp"] - time))]
-    _, lines = checked(changed, folder, capsys)
-    (line,) = (line for line in lines if "key frame" in line)
-    assert line.startswith("1 key frame, 1 image of 1 camera, 1 LiDAR sweep, "), line
-    assert load(settings_in(lines)).holdout.last_block == 0
-
-
 def test_a_picture_that_cannot_be_written_is_one_sentence_after_the_faults(content, folder, tmp_path, capsys):
     taken = tmp_path / "check.png"
     taken.mkdir()
@@ -173,16 +162,3 @@ def test_six_cameras_are_drawn_in_a_grid(content, folder, tmp_path, capsys):
     changed["frames"] = [{**frame, "camera": name} for name in names for frame in content["frames"]]
     checked(changed, folder, capsys, tmp_path / "six.png")
     assert Image.open(tmp_path / "six.png").size == (1920, 4 * 360)
-
-
-def test_the_image_nearest_to_a_sweep_is_drawn(content, folder, tmp_path, capsys):
-    """Sweeps at the first two key frames only: the middle key frame has none."""
-    changed = {**content, "sweeps": [s for s in content["sweeps"] if s["timestamp"] <= content["key_frames"][1] + 10]}
-    assert changed["sweeps"]
-    checked(content, folder, capsys, tmp_path / "all.png")
-    checked(changed, folder, capsys, tmp_path / "two.png")
-    every, two = (np.asarray(Image.open(tmp_path / name))[60:540] for name in ("all.png", "two.png"))
-    second = content["key_frames"][1]
-    image = min(content["frames"], key=lambda frame: abs(frame["timestamp"] - second))["file"]
-    scaled = np.asarray(Image.open(folder / image).convert("RGB").resize((960, 540)))[60:]
-    assert np.median(np.abs(two.astype(int) - scaled)) < np.median(np.abs(every.astype(int) - scaled))

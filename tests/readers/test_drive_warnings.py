@@ -186,6 +186,7 @@ def test_a_mistake_is_named_with_its_cause(name, sound):
 SHARED = REPOSITORY.parent / "shared/data"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ddad-02", "nuscenes-sixcam-frame", "kitti-odometry-1"])
 def test_recorded_drives_are_not_warned_of(name):
     folder = SHARED / name

@@ -12,7 +12,7 @@ from helpers.table_files import copy_of, edit, extracted, row
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive_checks import jumps
-from drivesplat.readers.nuscenes.layout import TABLES, camera_names
+from drivesplat.readers.nuscenes.layout import camera_names
 from drivesplat.readers.nuscenes.scene_tables import index_tables
 
 SAMPLE, IMAGE, SWEEP = "0001 sample 1", "0001 CAM_FRONT 2", "0001 LIDAR_TOP 1"
@@ -32,10 +32,6 @@ def refusal(root: Path, **changes) -> str:
     assert "\n" not in str(failure.value)
     assert len(str(failure.value)) < 600, "a long value is shortened"
     return str(failure.value)
-
-
-def test_the_undamaged_drive_is_read(root):
-    assert len(extracted(root).frames) == 5
 
 
 DEEP, NAN, FAR = [[[[[[[[1.0]]]]]]]], float("nan"), [1.0, 2.0, 3.0]
@@ -85,11 +81,19 @@ NAMES = [
     ("calibrated_sensor", CAMERA, "sensor_token"), ("sensor", "CAM_FRONT", "channel"),
     ("category", "category vehicle.car", "name"),
 ]  # fmt: skip
+
+
+def all_and_two(records: list[tuple], values: list) -> list[tuple]:
+    """Every value for the first record, two of them for each of the others, which the same check reads."""
+    return [(record, values[2:4] if i else values) for i, record in enumerate(records)]
+
+
 MALFORMED = [
-    *((*record, "translation", NOT_A_POSITION, "its translation is") for record in POSES),
-    *((*record, "rotation", NOT_A_ROTATION, "its rotation is") for record in POSES),
-    *((*record, "timestamp", NOT_A_TIME, ": its timestamp is .*microseconds") for record in TIMED),
-    *((*name, NOT_A_TOKEN, name[2]) for name in NAMES),
+    *((*record, "translation", values, "its translation is") for record, values in all_and_two(POSES, NOT_A_POSITION)),
+    *((*record, "rotation", values, "its rotation is") for record, values in all_and_two(POSES, NOT_A_ROTATION)),
+    *((*record, "timestamp", values, ": its timestamp is .*microseconds")
+      for record, values in all_and_two(TIMED, NOT_A_TIME)),
+    *((*name, values, name[2]) for name, values in all_and_two(NAMES, NOT_A_TOKEN)),
     ("sample_annotation", BOX, "size", NOT_A_SIZE, r" \(instance 0001 instance 1\): its size is"),
     ("sample_annotation", BOX, "visibility_token", [4, ["4"], {}, True], ": its visibility_token is"),
     *(("sample_data", IMAGE, name, NOT_A_NUMBER_OF_PIXELS, ": its image size is") for name in ("width", "height")),
@@ -129,12 +133,6 @@ def test_a_malformed_direction_of_the_readout_is_refused(root):
     assert refusal(root).startswith(f"calibrated_sensor {CAMERA}: its readout direction")
 
 
-@pytest.mark.parametrize("value", [4.9, 960.0])
-def test_focal_lengths_within_the_range_are_accepted(root, value):
-    edit(root, "calibrated_sensor", lambda rows: row(rows, CAMERA).update(camera_intrinsic=k(value, value, 0.0, 27.0)))
-    assert extracted(root).frames[0].intrinsics[0, 0] == value
-
-
 def scaled(root: Path, convert) -> None:
     for table in ("sample", "sample_data", "ego_pose"):
         edit(root, table, lambda rows: [{**it, "timestamp": convert(it["timestamp"])} for it in rows])
@@ -162,51 +160,33 @@ def test_a_recording_far_from_its_key_frame_is_refused_naming_it(root):
     assert message.startswith("sample_data 0001 CAM_FRONT 0") and "from that of its sample" in message
 
 
-@pytest.mark.parametrize("value", NOT_A_TOKEN[:4], ids=lambda value: repr(value)[:20])
-@pytest.mark.parametrize("table", [table for table in TABLES if table not in ("attribute", "log", "map")])
-def test_a_row_with_a_malformed_token_is_refused_naming_its_table(root, table, value):
-    edit(root, table, lambda rows: rows[0].update(token=value))
-    assert table in refusal(root)
-
-
-@pytest.mark.parametrize("value", ["absent", None])
-def test_a_scene_without_a_description_has_an_empty_one(root, value):
-    edit(root, "scene", lambda rows: without_description(rows, value))
-    assert extracted(root).description == ""
-
-
-def without_description(rows: list[dict], value: str | None) -> None:
-    rows[0].pop("description") if value else rows[0].update(description=None)
-
-
-def test_a_description_may_be_long_and_have_lines(root):
-    edit(root, "scene", lambda rows: rows[0].update(description="Rain.\nNight. " * 100))
-    assert extracted(root).description == "Rain.\nNight. " * 100
+@pytest.mark.parametrize("description", ["absent", None, "Rain.\nNight. " * 100])
+def test_a_description_may_be_missing_or_long_and_have_lines(root, description):
+    edit(root, "scene", lambda rows: rows[0].update(description=description))
+    if description == "absent":
+        edit(root, "scene", lambda rows: rows[0].pop("description") and None)
+    assert extracted(root).description == ("" if description in ("absent", None) else description)
 
 
 COLUMNS = [
-    ("scene", "name"), ("scene", "log_token"), ("scene", "first_sample_token"), ("sample", "next"),
-    ("sample", "timestamp"), ("sample", "scene_token"), ("sample_data", "next"), ("sample_data", "sample_token"),
-    ("sample_data", "is_key_frame"), ("sample_data", "filename"), ("sample_data", "width"), ("ego_pose", "rotation"),
-    ("ego_pose", "translation"), ("calibrated_sensor", "camera_intrinsic"), ("calibrated_sensor", "rotation"),
-    ("sample_annotation", "size"), ("sample_annotation", "translation"), ("sample_annotation", "sample_token"),
+    ("scene", "name"), ("sample", "timestamp"), ("sample_data", "is_key_frame"), ("sample_data", "filename"),
+    ("ego_pose", "rotation"), ("calibrated_sensor", "camera_intrinsic"), ("sample_annotation", "size"),
     ("instance", "category_token"), ("sensor", "channel"), ("category", "name"), ("map", "log_tokens"),
-    ("map", "filename"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("table", "column"), COLUMNS)
-def test_rows_without_a_column_are_refused_naming_table_and_token(root, table, column):
-    token = json.loads((root / f"v1.0-mini/{table}.json").read_text())[0]["token"]
-    edit(root, table, lambda rows: [rows[0].pop(column), rows][1])
-    assert f"{table} {token}" in refusal(root)
+def test_rows_without_a_column_are_refused_naming_table_and_token(root):
+    for table, column in COLUMNS:
+        original = json.loads((root / f"v1.0-mini/{table}.json").read_text())
+        edit(root, table, lambda rows, column=column: [rows[0].pop(column), rows][1])
+        assert f"{table} {original[0]['token']}" in refusal(root), column
+        edit(root, table, lambda _, original=original: original)
 
 
-@pytest.mark.parametrize("table", ["scene", "sample_data", "sensor", "map"])
 @pytest.mark.parametrize(
-    "content",
-    ["{}", '"table"', "7", "null", "", "[1, 2]", '["a"]', "[null]", "[[]]", "[", '[{"token": ', "nothing",
-     "[" * 200_000, '[{"token": ' + "[" * 200_000, "[" + "9" * 5000 + "]", "\ufeff[]"],
+    ("table", "content"),
+    [("scene", "{}"), ("scene", "7"), ("sample_data", ""), ("sample_data", '[{"token": '), ("sensor", "[null]"),
+     ("sensor", "[[]]"), ("map", "[" * 200_000), ("map", "\ufeff[]"), ("sample_data", "[" + "9" * 5000 + "]")],
     ids=lambda content: content[:12] or "empty",
 )  # fmt: skip
 def test_a_table_that_is_no_list_of_rows_is_refused_with_its_folder(root, table, content):
@@ -215,7 +195,7 @@ def test_a_table_that_is_no_list_of_rows_is_refused_with_its_folder(root, table,
     assert f"nuScenes v1.0-mini in {root} cannot be read" in message and table in message
 
 
-@pytest.mark.parametrize("content", ["{}", '"table"', "[1]", "[{}]", "[" * 200_000, '[{"modality": "camera"}]'])
+@pytest.mark.parametrize("content", ["{}", "[1]", "[{}]", "[" * 200_000, '[{"modality": "camera"}]'])
 def test_cameras_of_a_malformed_table_are_refused_with_the_table(root, content):
     (root / "v1.0-mini/sensor.json").write_text(content)
     if content == "{}":
@@ -232,97 +212,63 @@ def test_a_row_nested_too_deeply_in_an_unused_column_is_refused(root):
     assert "sample.json is nested too deeply" in refusal(root)
 
 
-@pytest.mark.parametrize("back_to", ["0001 sample 0", "0001 sample 1"])
-def test_a_circle_of_samples_is_refused_naming_where_it_closes(root, back_to):
-    edit(root, "sample", lambda rows: row(rows, SAMPLE).update(next=back_to))
-    assert refusal(root).startswith(f"sample {SAMPLE}: its next is {back_to}, which comes before it")
+FIRST_IMAGE, LAST_SAMPLE = "0001 CAM_FRONT 1", "sample 0001 sample 2"
+CHANGED = {
+    "a circle of samples": ("sample", SAMPLE, {"next": SAMPLE}, f"sample {SAMPLE}: its next is {SAMPLE}, which comes"),
+    "a circle to an earlier sample": (
+        "sample", SAMPLE, {"next": "0001 sample 0"}, f"sample {SAMPLE}: its next is 0001 sample 0, which comes before",
+    ),
+    "a circle of images": ("sample_data", BETWEEN, {"next": IMAGE}, f"sample_data {IMAGE}"),
+    "an image that follows itself": ("sample_data", BETWEEN, {"next": BETWEEN}, f"sample_data {BETWEEN}"),
+    "a key frame at the time of another": ("sample", SAMPLE, {"timestamp": START_US}, f"sample {SAMPLE}"),
+    "a key frame too early": ("sample", SAMPLE, {"timestamp": START_US - KEY_FRAME_US}, f"sample {SAMPLE}"),
+    "an image too early": ("sample_data", IMAGE, {"timestamp": START_US - 10 * KEY_FRAME_US}, f"sample_data {IMAGE}"),
+    "a sweep too early": ("sample_data", SWEEP, {"timestamp": START_US - 10 * KEY_FRAME_US}, f"sample_data {SWEEP}"),
+    "an image between two too early": ("sample_data", BETWEEN, {"timestamp": START_US}, f"sample_data {BETWEEN}"),
+    "a chain that ends between key frames": ("sample_data", BETWEEN, {"next": ""}, f"sample_data {BETWEEN}"),
+    "an ego pose of no row": ("sample_data", IMAGE, {"ego_pose_token": "nowhere"}, "nowhere"),
+    "a next image of no row": ("sample_data", IMAGE, {"next": "nowhere"}, "nowhere"),
+    "a next sample of no row": ("sample", SAMPLE, {"next": "nowhere"}, "nowhere"),
+    "a chain of samples that ends early": ("sample", SAMPLE, {"next": ""}, f"{LAST_SAMPLE}: it is in the scene, but"),
+    "a key frame that a chain leaves out": (
+        "sample_data", FIRST_IMAGE, {"next": BETWEEN}, f"sample_data {IMAGE}: the chain of CAM_FRONT leaves it out",
+    ),
+    "a chain that leads to another sensor": (
+        "sample_data", FIRST_IMAGE, {"next": SWEEP}, f"sample_data {SWEEP}: it stands in the chain of another sensor",
+    ),
+    "two key frames of a sensor in a sample": (
+        "sample_data", BETWEEN, {"is_key_frame": True},
+        f"sample_data {BETWEEN}: its sample 0001 sample 1 has another recording",
+    ),
+}  # fmt: skip
+"""Otherwise a drive would be shorter, or another one, without a word."""
 
 
-@pytest.mark.parametrize("back_to", ["0001 CAM_FRONT 0", "0001 CAM_FRONT 2", BETWEEN])
-def test_a_circle_of_images_is_refused_naming_a_record_of_it(root, back_to):
-    edit(root, "sample_data", lambda rows: row(rows, BETWEEN).update(next=back_to))
-    assert refusal(root).startswith(f"sample_data {back_to}")
+@pytest.mark.parametrize("name", CHANGED)
+def test_times_and_links_that_cannot_be_are_refused_naming_the_record(root, name):
+    table, token, change, said = CHANGED[name]
+    edit(root, table, lambda rows: row(rows, token).update(change))
+    assert said in refusal(root)
 
 
-@pytest.mark.parametrize("delay", [-KEY_FRAME_US, -2 * KEY_FRAME_US])
-def test_key_frames_out_of_order_are_refused_naming_the_sample(root, delay):
-    edit(root, "sample", lambda rows: row(rows, SAMPLE).update(timestamp=START_US + KEY_FRAME_US + delay))
-    assert f"sample {SAMPLE}" in refusal(root)
+REPEATED = {
+    "ego_pose": (IMAGE, {}, f"ego_pose {IMAGE}: two records have this token"),
+    "sample_data": (IMAGE, {}, f"sample_data {IMAGE}: two records have this token"),
+    "instance": ("0001 instance 1", {}, "instance 0001 instance 1: two records have this token"),
+    "category": ("category vehicle.car", {}, "category category vehicle.car: two records have this token"),
+    "scene": ("scene 0001", {"token": "again"}, "scene again: its name scene-0001 is that of another scene"),
+    "sample_annotation": (
+        BOX, {"token": "again"},
+        "sample_annotation again: instance 0001 instance 1 has another box in sample 0001 sample 1",
+    ),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("sweeps", [False, True])
-@pytest.mark.parametrize("token", [IMAGE, SWEEP])
-def test_a_sensors_records_out_of_order_are_refused_naming_one(root, token, sweeps):
-    edit(root, "sample_data", lambda rows: row(rows, token).update(timestamp=START_US - 10 * KEY_FRAME_US))
-    assert f"sample_data {token}" in refusal(root, sweeps=sweeps)
-
-
-@pytest.mark.parametrize("change", [{"timestamp": START_US}, {"next": ""}])
-def test_an_image_between_key_frames_out_of_order_or_at_the_end_of_a_chain_is_refused_naming_it(root, change):
-    edit(root, "sample_data", lambda rows: row(rows, BETWEEN).update(change))
-    assert f"sample_data {BETWEEN}" in refusal(root)
-
-
-@pytest.mark.parametrize(
-    ("table", "token", "key"),
-    [("sample_data", IMAGE, "ego_pose_token"), ("sample_data", IMAGE, "next"), ("sample", SAMPLE, "next")],
-)
-def test_a_token_without_a_row_is_refused_naming_it(root, table, token, key):
-    edit(root, table, lambda rows: row(rows, token).update({key: "nowhere"}))
-    assert "nowhere" in refusal(root)
-
-
-def test_samples_outside_of_the_chain_are_refused_naming_one(root):
-    """Otherwise the drive would be shorter without a word."""
-    edit(root, "sample", lambda rows: row(rows, SAMPLE).update(next=""))
-    assert refusal(root).startswith("sample 0001 sample 2: it is in the scene, but")
-
-
-def test_key_frames_outside_of_a_sensors_chain_are_refused_naming_one(root):
-    edit(root, "sample_data", lambda rows: row(rows, "0001 CAM_FRONT 1").update(next=BETWEEN))
-    assert refusal(root).startswith(f"sample_data {IMAGE}: the chain of CAM_FRONT leaves it out")
-
-
-def test_a_chain_that_leads_to_another_sensor_is_refused_naming_where(root):
-    edit(root, "sample_data", lambda rows: row(rows, "0001 CAM_FRONT 1").update(next=SWEEP))
-    assert refusal(root).startswith(f"sample_data {SWEEP}: it stands in the chain of another sensor")
-
-
-@pytest.mark.parametrize(
-    ("table", "token"),
-    [
-        ("ego_pose", IMAGE),
-        ("sample_data", IMAGE),
-        ("sample", SAMPLE),
-        ("sample_annotation", BOX),
-        ("instance", "0001 instance 1"),
-        ("calibrated_sensor", CAMERA),
-        ("sensor", "CAM_FRONT"),
-        ("category", "category vehicle.car"),
-        ("log", "log"),
-    ],
-)
-def test_two_rows_with_one_token_are_refused_naming_it(root, table, token):
-    edit(root, table, lambda rows: [*rows, row(rows, token)])
-    assert refusal(root).startswith(f"{table} {token}: two records have this token")
-
-
-def test_two_scenes_of_one_name_are_refused_naming_it(root):
-    edit(root, "scene", lambda rows: [*rows, {**rows[0], "token": "again"}])
-    assert "scene again: its name scene-0001 is that of another scene" in refusal(root)
-
-
-def test_two_boxes_of_one_instance_in_a_sample_are_refused_naming_the_second(root):
-    edit(root, "sample_annotation", lambda rows: [*rows, {**row(rows, BOX), "token": "again"}])
-    message = refusal(root)
-    assert message.startswith(
-        "sample_annotation again: instance 0001 instance 1 has another box in sample 0001 sample 1"
-    )
-
-
-def test_two_key_frames_of_one_sensor_in_a_sample_are_refused_naming_the_second(root):
-    edit(root, "sample_data", lambda rows: row(rows, BETWEEN).update(is_key_frame=True))
-    assert refusal(root).startswith(f"sample_data {BETWEEN}: its sample 0001 sample 1 has another recording")
+@pytest.mark.parametrize("table", REPEATED)
+def test_a_row_that_repeats_another_is_refused_naming_it(root, table):
+    token, change, said = REPEATED[table]
+    edit(root, table, lambda rows: [*rows, {**row(rows, token), **change}])
+    assert said in refusal(root)
 
 
 def test_a_damaged_row_of_a_sensor_that_is_not_read_refuses_no_drive(root):
@@ -369,12 +315,6 @@ def test_an_ego_vehicle_that_jumps_is_warned_of(root, caplog):
     with caplog.at_level(logging.WARNING):
         extracted(root)
     assert sum("the ego vehicle jumps, " in it.getMessage() for it in caplog.records) == 1
-
-
-def test_an_undamaged_drive_jumps_nowhere(root, caplog):
-    with caplog.at_level(logging.WARNING):
-        extracted(root)
-    assert "jumps" not in caplog.text
 
 
 @pytest.mark.parametrize("table", ["sample_annotation", "sample_data"])

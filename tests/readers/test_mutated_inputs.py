@@ -9,9 +9,8 @@ from random import Random
 import numpy as np
 import pytest
 from helpers.drives import uncompared
-from helpers.mutations import CHANCE, fresh, likely, mutate_bytes, mutate_table, some_bytes
+from helpers.mutations import damages, fresh, likely, mutate_bytes, mutate_table, some_bytes
 from helpers.table_files import VERSION, copy_of, extracted, time_limit
-from hypothesis import given, settings
 from PIL import Image
 
 from drivesplat.errors import DatasetError
@@ -71,8 +70,7 @@ def require_rigid(poses: np.ndarray, bound: float) -> None:
     )
 
 
-@settings(max_examples=140)
-@given(random=CHANCE)
+@damages(40, 140)
 def test_damaged_tables_are_refused_in_one_line_or_give_a_sound_scene(small_root, tmp_path, random):
     with fresh(tmp_path) as folder:
         root = copy_of(small_root, folder / "data")
@@ -86,8 +84,7 @@ def test_damaged_tables_are_refused_in_one_line_or_give_a_sound_scene(small_root
             require_sound(scene, root, folder)
 
 
-@settings(max_examples=15)
-@given(random=CHANCE)
+@damages(8, 15)
 def test_damaged_images_are_refused_in_one_line_or_read(small_root, tmp_path, random):
     with fresh(tmp_path) as folder:
         root = Path(shutil.copytree(small_root, folder / "data"))
@@ -99,8 +96,7 @@ def test_damaged_images_are_refused_in_one_line_or_read(small_root, tmp_path, ra
             assert "image" in str(error), done
 
 
-@settings(max_examples=20)
-@given(random=CHANCE)
+@damages(10, 20)
 def test_damaged_sweeps_are_refused_in_one_line_or_have_returns_near_the_sensor(small_scene, tmp_path, random):
     with fresh(tmp_path) as folder:
         sweep = small_scene.sweeps[random.randrange(len(small_scene.sweeps))]
@@ -131,8 +127,7 @@ def bytes_of(mode: str, size: tuple[int, int]) -> int:
     return (size[0] + 7) // 8 * size[1] if mode == "1" else per_pixel * size[0] * size[1]
 
 
-@settings(max_examples=25)
-@given(random=CHANCE)
+@damages(12, 25)
 def test_damaged_masks_are_refused_in_one_line_or_give_labels_of_the_image(small_scene, tmp_path, random):
     kind = random.choice(["sky_folder", "semantic_folder", "regions_folder"])
     with fresh(tmp_path) as empty:

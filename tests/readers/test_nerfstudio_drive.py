@@ -6,14 +6,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from helpers.hand_made import recording_of
-from helpers.mutations import CHANCE, fresh, mutate_bytes, mutate_json, mutate_words
+from helpers.mutations import damages, fresh, mutate_bytes, mutate_json, mutate_words
 from helpers.shown_drives import require_refused_or_sound
 from helpers.table_files import time_limit
-from hypothesis import given, settings
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -204,13 +202,6 @@ def test_cameras_that_fire_at_other_times_are_mounted_where_they_are(folder, val
         np.testing.assert_allclose(frame.ego_to_world[:3, 3] + scene.origin, expected[:3, 3], atol=1e-4)
 
 
-def test_another_camera_can_be_the_one_that_looks_ahead(folder, values):
-    assert converted(values, folder, [*HALF_METRES, "--ego-camera", "right"]) == 0
-    frame = scene_in(folder).frames[0]
-    ahead = rig(0)[:3, :3] @ Rotation.from_euler("z", -0.8).as_matrix() @ [1.0, 0.0, 0.0]
-    np.testing.assert_allclose(frame.ego_to_world[:3, 0], ahead, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("model", "given", "coefficients"),
     [
@@ -230,37 +221,6 @@ def test_distortion_is_that_of_opencv(model, given, coefficients, at_the_top, fo
     camera = read_drive(folder / "out").cameras["left"]
     expected = {"OPENCV": "opencv", "OPENCV_FISHEYE": "fisheye", "PINHOLE": "none"}[model]
     assert (camera.distortion.model, list(camera.distortion.coefficients)) == (expected, coefficients)
-    if model == "OPENCV":
-        k1, k2, p1, p2, k3 = coefficients
-        x, y = 0.3, -0.2
-        r2 = x * x + y * y
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        by_formula = [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-        ]
-        found, _ = cv2.projectPoints(
-            np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), np.eye(3), np.array(coefficients)
-        )
-        np.testing.assert_allclose(found.ravel(), by_formula, atol=1e-12)
-
-
-def test_images_of_a_folder_with_other_intrinsics_are_another_camera(folder, values):
-    for frame in values["frames"]:
-        frame["fl_x"] = 70.0 if "/left/" in frame["file_path"] or frame["time"] < 100.15 else 75.0
-    del values["fl_x"]
-    assert converted(values, folder, HALF_METRES) == 0
-    scene = scene_in(folder)
-    assert {camera.name: camera.intrinsics[0, 0] for camera in scene.cameras} == {
-        "left": 70.0, "right_0": 70.0, "right_1": 75.0,
-    }  # fmt: skip
-
-
-def test_frames_name_their_camera_by_a_number(folder, values):
-    for frame in values["frames"]:
-        frame["camera_id"] = 1 if "/left/" in frame["file_path"] else 2
-    assert converted(values, folder, HALF_METRES) == 0
-    assert [camera.name for camera in scene_in(folder).cameras] == ["camera_1", "camera_2"]
 
 
 def test_an_applied_transform_is_undone_where_asked_for(folder, values, capsys):
@@ -315,12 +275,6 @@ def test_what_the_file_does_not_say_must_be_stated(arguments, words, folder, val
     assert not (folder / "out").exists()
 
 
-def test_the_scale_that_was_applied_is_a_hint(folder, values, capsys):
-    values["applied_scale"] = 0.25
-    assert converted(values, folder, HALF_METRES[2:]) == 1
-    assert "were multiplied by 0.25" in capsys.readouterr().err
-
-
 LOOKS_DOWN = rigid(UPRIGHT @ Rotation.from_euler("x", np.radians(-80.0)).as_matrix(), np.zeros(3)).tolist()
 
 
@@ -331,19 +285,12 @@ def every(change: dict[str, Any]):
 FAULTS = {
     "a list": (lambda v: [1], "has no frames"),
     "no frames": (lambda v: v.update(frames=[]), "has no frames"),
-    "a frame that is a text": (lambda v: v["frames"].append("x"), "has no frames"),
     "no time": (lambda v: v["frames"][3].pop("time"), "frames[0] has no timestamp and not all frames have a time"),
-    "a time that is a text": (lambda v: v["frames"][3].update(time="now"), "frames[3]: its time is 'now'"),
     "a time before 0": (lambda v: v["frames"][3].update(time=-1.0), "frames[3]: its time is -1.0"),
-    "NaN": (lambda v: v["frames"][3].update(time=float("nan")), "frames[3]: its time is nan"),
     "no focal length": (lambda v: v.pop("fl_y"), "frames[0] has no fl_y, and neither has the top"),
-    "a focal length that is a text": (lambda v: v.update(fl_x="70"), "its fl_x is '70'"),
     "a focal length of another image": (lambda v: v.update(fl_x=1e-3), "its focal length is 0.001 pixels"),
     "another size": (lambda v: v.update(w=160), "is 80x60, its w and h say 160x60"),
-    "no size": (lambda v: v.update(w=None), "its image size is None"),
     "no image": (lambda v: v["frames"][1].update(file_path="images/none.png"), "none.png is missing"),
-    "no file": (lambda v: v["frames"][1].pop("file_path"), "frames[1]: its file_path is None"),
-    "a long file": (lambda v: v["frames"][1].update(file_path="a" * 5000), "no file can have it"),
     "an image that is a folder": (lambda v: v["frames"][1].update(file_path="images"), "cannot be read"),
     "no pose": (lambda v: v["frames"][2].pop("transform_matrix"), "frames[2]: its transform is None"),
     "a pose that mirrors": (
@@ -365,7 +312,6 @@ FAULTS = {
         "frames[1]: its intrinsics are not those of frames[0], of the same camera x",
     ),
     "equal times": (every({"camera": "x"}), "it has the time of frames[0], of the same camera x"),
-    "a camera that is a list": (every({"camera": []}), "its camera is []"),
 }  # fmt: skip
 
 
@@ -390,8 +336,7 @@ def test_what_is_no_json_is_a_sentence(text, tmp_path, capsys):
     assert "none.json is missing" in capsys.readouterr().err
 
 
-@settings(max_examples=200)
-@given(random=CHANCE)
+@damages(50, 200)
 def test_damaged_files_are_refused_in_one_line_or_sound(folder, values, capsys, random):
     """Damage to a value, a word or a byte of a file with a lens and an applied transform, with times or without."""
     content = copy.deepcopy(values) | {"k1": 0.01, "applied_transform": np.eye(4)[:3].tolist()}

@@ -139,16 +139,6 @@ def test_every_image_and_sweep_uses_its_own_ego_pose_and_calibration(root):
         np.testing.assert_allclose(sweep.sensor_to_world, shift @ global_pose, atol=1e-9)
 
 
-def test_sweeps_adds_the_images_between_key_frames_with_their_own_poses(tiny_root):
-    scene = extract_scene(source(sweeps=True), tiny_root)
-    assert [frame.is_key_frame for frame in scene.frames] == [True, False] * 9 + [True]
-    for i, frame in enumerate(scene.frames):
-        assert frame.timestamp == START_US + i * KEY_FRAME_US // 2 - 35_000
-        expected = World().ego_at(seconds_of(frame.timestamp)) + CAMERA_AT
-        np.testing.assert_allclose(frame.camera_to_world[:3, 3], expected, atol=1e-6)
-        assert ("sweeps" in frame.image_path) == (not frame.is_key_frame)
-
-
 def test_an_image_between_key_frames_is_assigned_to_the_nearest_key_frame(tmp_path):
     scene = extract_scene(source(sweeps=True), write_world(tmp_path, World(key_frames=3, sweeps_between=5)))
     for frame in scene.frames:
@@ -188,11 +178,6 @@ def test_an_unknown_camera_is_refused_with_the_available_sensors(tiny_root):
         extract_scene(source(cameras=("CAM_FRONT", "CAM_BACK")), tiny_root)
 
 
-def test_box_sizes_are_converted_from_width_length_height_to_length_width_height(scene):
-    sizes = {track.category: track.size.tolist() for track in scene.tracks}
-    assert sizes == {thing.category: list(thing.size) for thing in World().things}
-
-
 def test_tracks_match_the_objects_of_the_tiny_drive(scene):
     things = {thing.category: thing for thing in World().things}
     assert len(scene.tracks) == len(things)
@@ -200,6 +185,7 @@ def test_tracks_match_the_objects_of_the_tiny_drive(scene):
         np.testing.assert_array_equal(track.timestamps, scene.key_frame_timestamps)
         np.testing.assert_array_equal(track.sample_indices, np.arange(10))
         np.testing.assert_array_equal(track.visibility, np.full(10, 4))
+        assert track.size.tolist() == list(things[track.category].size), "length, width, height"
         expected = [things[track.category].at(seconds_of(time)) for time in track.timestamps]
         np.testing.assert_allclose(track.object_to_world[:, :3, 3], expected, atol=1e-9)
 
@@ -231,15 +217,10 @@ def test_a_track_with_one_box_is_kept(root):
     np.testing.assert_allclose(track.object_to_world[0, :3, 3], car.at(2 * KEY_FRAME_US * 1e-6), atol=1e-9)
 
 
-@pytest.mark.parametrize("token", ["1", "2", "3", "4"])
-def test_visibility_is_the_level_in_the_tables(root, token):
+@pytest.mark.parametrize("token", ["1", "4", ""])
+def test_visibility_is_the_level_in_the_tables_or_0(root, token):
     edit(root, "sample_annotation", lambda boxes: [{**box, "visibility_token": token} for box in boxes])
-    assert {int(v) for track in extract_scene(source(), root).tracks for v in track.visibility} == {int(token)}
-
-
-def test_a_missing_visibility_is_0(root):
-    edit(root, "sample_annotation", lambda boxes: [{**box, "visibility_token": ""} for box in boxes])
-    assert {int(v) for track in extract_scene(source(), root).tracks for v in track.visibility} == {0}
+    assert {int(v) for track in extract_scene(source(), root).tracks for v in track.visibility} == {int(token or 0)}
 
 
 def test_the_dataroot_may_be_the_root_its_table_folder_or_its_parent(root):
@@ -256,36 +237,21 @@ def test_the_dataroot_may_start_with_a_tilde(root, monkeypatch):
     assert find_root("~/nuscenes", "v1.0-mini") == root
 
 
-def refused(dataroot: Path, version: str = "v1.0-mini") -> str:
-    with pytest.raises(DatasetError) as failure:
-        find_root(str(dataroot), version)
-    message = str(failure.value)
-    assert "\n" not in message
-    assert version in message and str(dataroot) in message
-    return message
+def test_a_dataroot_without_the_version_is_refused_with_its_path_and_what_to_do(root, tmp_path):
+    """Also a typo that names a folder beside the dataset."""
+    for folder in (tmp_path / "empty", root / "maps-of-mine"):
+        folder.mkdir()
+    for dataroot, version, said in (
+        (tmp_path / "absent", "v1.0-mini", "nuscenes.org"), (tmp_path / "empty", "v1.0-mini", "nuscenes.org"),
+        (root, "v1.0-trainval", "v1.0-mini"), (root / "maps-of-mine", "v1.0-mini", "v1.0-mini"),
+    ):  # fmt: skip
+        with pytest.raises(DatasetError) as failure:
+            find_root(str(dataroot), version)
+        message = str(failure.value)
+        assert "\n" not in message and version in message and str(dataroot) in message and said in message
 
 
-def test_a_missing_dataroot_is_refused_with_its_path_and_how_to_get_it(tmp_path):
-    assert "nuscenes.org" in refused(tmp_path / "absent")
-
-
-def test_an_empty_dataroot_is_refused_with_its_path_and_how_to_get_it(tmp_path):
-    assert "nuscenes.org" in refused(tmp_path)
-
-
-def test_a_missing_version_is_refused_with_the_available_one(tiny_root):
-    message = refused(tiny_root, "v1.0-trainval")
-    assert "v1.0-mini" in message and "version" in message
-
-
-def test_the_parent_of_a_folder_of_another_name_is_not_used(root):
-    """`dataroot` with a typo must not silently find the dataset beside it."""
-    (root / "maps-of-mine").mkdir()
-    refused(root / "maps-of-mine")
-
-
-@pytest.mark.parametrize("table", ["ego_pose", "sample_annotation"])
-def test_an_incomplete_dataset_is_refused_with_the_missing_tables(root, table):
+def test_an_incomplete_dataset_is_refused_with_the_missing_tables(root, table="ego_pose"):
     (root / "v1.0-mini" / f"{table}.json").unlink()
     with pytest.raises(DatasetError, match=rf"{table}\.json.*nuscenes\.org"):
         table_files(root, "v1.0-mini", "0001")
@@ -346,7 +312,7 @@ def test_a_bad_image_stops_the_extraction_naming_key_frame_token_and_path(root, 
         assert part in str(failure.value)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", [remove, deepen])
 def test_a_bad_image_is_skipped_and_counted_with_on_missing_warn(root, fault, caplog):
     fault(image_of(root, 0))
     fault(image_of(root, 1))
@@ -401,7 +367,7 @@ def test_a_bad_lidar_file_stops_the_seeding_naming_key_frame_token_and_path(root
         assert part in str(failure.value)
 
 
-@pytest.mark.parametrize("fault", [remove, empty, cut_off, random_bytes, far, no_number])
+@pytest.mark.parametrize("fault", [remove, far])
 def test_a_bad_lidar_file_is_counted_with_on_missing_warn(root, fault, caplog):
     for index in (0, 1):
         fault(sweep_of(root, index))
@@ -426,6 +392,7 @@ def real_scene(real_scene_root) -> Scene:
     return extract_scene(source(dataset="nuscenes", scene="0061"), real_scene_root)
 
 
+@pytest.mark.slow
 def test_the_real_scene_has_its_frames_tracks_and_sweeps(real_scene):
     assert len(real_scene.frames) == len(real_scene.sweeps) == len(real_scene.key_frame_timestamps) == 39
     assert len(real_scene.tracks) == 239
@@ -434,6 +401,7 @@ def test_the_real_scene_has_its_frames_tracks_and_sweeps(real_scene):
     assert sum(Path(sweep.path).is_file() for sweep in real_scene.sweeps) == 1
 
 
+@pytest.mark.slow
 def test_the_real_scenes_images_have_their_own_poses(real_scene, real_scene_root):
     """Compared with the tables: camera pose = ego pose of the image's own record x calibration."""
     read = {

@@ -166,10 +166,6 @@ def test_a_mistake_is_a_warning_that_says_what_to_check(change, words, content, 
             "ego_poses: timestamps are seconds, those of frames and sweeps microseconds; multiply them by 1e+06",
         ),
         (
-            lambda d: [pose.update(timestamp=pose["timestamp"] // 10**3) for pose in d["ego_poses"]],
-            "ego_poses: timestamps are milliseconds, those of frames and sweeps microseconds; multiply them by 1000",
-        ),
-        (
             lambda d: [pose.update(timestamp=pose["timestamp"] * 1000) for pose in d["ego_poses"]],
             "ego_poses: timestamps are nanoseconds, those of frames and sweeps microseconds",
         ),
@@ -178,18 +174,12 @@ def test_a_mistake_is_a_warning_that_says_what_to_check(change, words, content, 
             "timestamps are whole microseconds; from seconds: round(t * 1e6)",
         ),
         (
-            lambda d: [pose.update(timestamp=pose["timestamp"] + 0.5) for pose in d["ego_poses"]],
-            ".5: timestamps are whole microseconds; write it without the point",
-        ),
-        (
             lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(translation=[1700.0, 0.0, 1500.0]),
             "cameras.CAM_FRONT: its translation is",
         ),
     ],
     ids=[
-        "poses in seconds", "poses in milliseconds", "poses in nanoseconds", "seconds as decimals",
-        "microseconds as decimals",
-        "a mount in millimetres",
+        "poses in seconds", "poses in nanoseconds", "seconds as decimals", "a mount in millimetres",
     ],
 )  # fmt: skip
 def test_a_wrong_unit_is_a_fault_that_names_the_cause_in_few_lines(change, words, content, folder, capsys):

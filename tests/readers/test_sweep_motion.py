@@ -93,13 +93,6 @@ def test_without_the_key_points_stay_as_they_are(tmp_path):
         np.testing.assert_array_equal(read_returns(sweep).points, seen(sweep.timestamp)[1])
 
 
-def test_the_motion_survives_scene_json(tmp_path):
-    scene = scene_of(write(tmp_path))
-    write_scene(tmp_path / "scene.json", scene)
-    for one, other in zip(scene.sweeps, read_scene(tmp_path / "scene.json").sweeps, strict=True):
-        np.testing.assert_array_equal(read_returns(one).points, read_returns(other).points)
-
-
 def test_a_sweep_with_a_pose_of_its_own_is_moved_by_the_ego_path(tmp_path):
     """Only the vehicle's motion during the sweep comes from ego poses."""
     elsewhere = rigid(np.eye(3), np.array([5.0, 6.0, 7.0]))
@@ -109,12 +102,6 @@ def test_a_sweep_with_a_pose_of_its_own_is_moved_by_the_ego_path(tmp_path):
     (sweep,) = scene_of(write(tmp_path, sweeps=sweeps, origin=[0.0, 0.0, 0.0])).sweeps
     np.testing.assert_array_equal(sweep.sensor_to_world, elsewhere)
     assert np.abs(read_returns(sweep).points - seen(SWEEPS[0])[0]).max() < 1e-4
-
-
-def test_the_motion_of_dense_ego_poses_is_thinned(tmp_path):
-    (sweep, _) = scene_of(write(tmp_path, 500)).sweeps
-    assert len(sweep.motion.offsets_s) <= 43 and np.diff(sweep.motion.offsets_s).max() < 0.0101
-    assert (sweep.motion.offsets_s[0], sweep.motion.offsets_s[-1]) == pytest.approx((-0.1, 0.1))
 
 
 @pytest.mark.parametrize(
@@ -131,12 +118,6 @@ def test_times_beyond_the_known_motion_are_a_fault(times, words, tmp_path):
     sweep, _ = scene_of(write(tmp_path, times=times)).sweeps
     fault = sweep_fault(sweep)
     assert fault and words in fault and str(SWEEPS[0]) in fault and "\n" not in fault
-
-
-def test_a_sweep_without_times_is_a_fault(tmp_path):
-    sweep, _ = scene_of(write(tmp_path)).sweeps
-    np.savez(sweep.path, x=[1.0], y=[2.0], z=[3.0])
-    assert "has no column time, which motion_compensated: false needs" in (sweep_fault(sweep) or "")
 
 
 def poses_at(*times: int) -> list[dict[str, Any]]:

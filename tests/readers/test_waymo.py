@@ -19,10 +19,8 @@ from drivesplat.readers.waymo.calibration import readout_middle
 from drivesplat.readers.waymo.range_image import LaserRays
 from drivesplat.readers.waymo.segment import ImageRecord
 from drivesplat.readers.waymo.sweep_file import rays_of
-from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import apply
 from drivesplat.scene.scene import Scene, read_scene, write_scene
-from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.masks import MaskJob
 
@@ -63,16 +61,6 @@ def moved(pose: np.ndarray, scene: Scene) -> np.ndarray:
     there = GLOBAL @ pose
     there[..., :3, 3] -= scene.origin
     return there
-
-
-NOT_HELD = {
-    "category": "Waymo has four classes; cones become signs, which are as static",
-    "visibility": "unknown",
-    "description": "not read",
-    "sweeps": "another sensor: range images with poses of pixels",
-    "readout": "stated by Waymo alone",
-}
-"""Fields of nuScenes' scene that Waymo's formats cannot hold, or hold in another way."""
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -123,14 +111,6 @@ def test_without_cameras_a_segment_has_its_sweeps_and_boxes_alone(version, roots
         assert len(getattr(alone, name)) == len(getattr(scenes[version], name)) > 0
 
 
-def test_classes_are_those_that_waymo_has(scenes):
-    kinds = {track.category: track.object_class for track in scenes["v2"].tracks}
-    assert kinds == {
-        "vehicle": ObjectClass.VEHICLE, "pedestrian": ObjectClass.PEDESTRIAN, "sign": ObjectClass.OTHER_MOVABLE,
-    }  # fmt: skip
-    assert not kinds["sign"].is_dynamic and ObjectClass.CAR not in kinds.values()
-
-
 def test_cameras_keep_size_mount_and_readout(scenes, recorded):
     front, left = scenes["v1"].cameras
     assert (front.name, front.width, front.height) == ("FRONT", 96, 54)
@@ -147,14 +127,6 @@ def test_cameras_keep_size_mount_and_readout(scenes, recorded):
     np.testing.assert_allclose(frame.camera_to_world[:3, 2], to_left, atol=1e-9)
     np.testing.assert_allclose(frame.camera_to_world[:3, 0], ahead, atol=1e-9)
     np.testing.assert_allclose(frame.camera_to_world[:3, 1], [0, 0, -1], atol=1e-9)
-
-
-def test_boxes_are_interpolated_to_the_times_of_images(scenes, recorded):
-    scene, (_, other) = scenes["v2"], recorded
-    mine, theirs = scene.frames[4], other.frames[4]
-    assert mine.timestamp not in scene.key_frame_timestamps
-    for one, two in zip(boxes_at(scene, mine.timestamp), boxes_at(other, theirs.timestamp), strict=True):
-        np.testing.assert_allclose(one.object_to_world, moved(two.object_to_world, scene), atol=1e-5)
 
 
 @pytest.mark.parametrize("version", VERSIONS)

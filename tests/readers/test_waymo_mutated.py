@@ -14,11 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers import drives
-from helpers.mutations import CHANCE, flip_bytes, fresh, likely, mutate_bytes
+from helpers.mutations import damages, flip_bytes, fresh, likely, mutate_bytes
 from helpers.table_files import time_limit
 from helpers.waymo_drive import NAME, Drive, tiny_drive
 from helpers.waymo_files import components, frame_message, tfrecord, write_v1, write_v2
-from hypothesis import assume, given, settings
+from hypothesis import assume
 
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
@@ -86,8 +86,7 @@ def require_sound(scene: Scene, folder: Path) -> None:
     assert len(read_scene(folder / "scene.json").tracks) == len(scene.tracks)
 
 
-@settings(max_examples=50)
-@given(random=CHANCE)
+@damages(15, 50)
 def test_damaged_bytes_of_v2(roots, tmp_path, random):
     with fresh(tmp_path) as folder:
         root = Path(shutil.copytree(roots["v2"], folder / "data"))
@@ -126,8 +125,7 @@ def mutate_rows(random: Random, rows: list[dict[str, Any]]) -> str:
     return f"{kind} {name}"
 
 
-@settings(max_examples=60)
-@given(random=CHANCE)
+@damages(15, 60)
 def test_damaged_values_of_v2(drive, roots, tmp_path, random):
     component = random.choice(COMPONENTS)
     rows = components(drive)[component]
@@ -138,8 +136,7 @@ def test_damaged_values_of_v2(drive, roots, tmp_path, random):
         require_sound_or_one_line(root, folder / "out", random, done)
 
 
-@settings(max_examples=30)
-@given(random=CHANCE)
+@damages(8, 30)
 def test_damaged_bytes_of_v1(roots, tmp_path, random):
     with fresh(tmp_path) as folder:
         root = Path(shutil.copytree(roots["v1"], folder / "data"))
@@ -166,8 +163,7 @@ def mutate_message(random: Random, message: bytes, path: Path) -> bytes:
     return message[:place] if kind == "cut" else message[:place] + message[place // 2 :]
 
 
-@settings(max_examples=60)
-@given(random=CHANCE)
+@damages(15, 60)
 def test_damaged_messages_of_v1_with_sound_checksums(drive, tmp_path, random):
     messages = [frame_message(drive, time) for time in drive.frames]
     number = random.randrange(len(messages))

@@ -25,7 +25,10 @@ NAME = "1024360143612057520_3580_000_3600_000"
 FILE = Path(
     os.environ.get("WAYMO_ONE_FRAME", REPOSITORY.parent / "shared/data/waymo-one-frame/pvps_data_one_frame.tfrecord")
 )
-pytestmark = pytest.mark.skipif(not FILE.is_file(), reason="the real frame is not there: set WAYMO_ONE_FRAME to it")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not FILE.is_file(), reason="the real frame is not there: set WAYMO_ONE_FRAME to it"),
+]
 SOURCE = drives.source(dataset="real", reader="waymo", version="v1", scene=NAME[:19], cameras=tuple(CAMERAS.values()))
 
 

@@ -1,6 +1,5 @@
 """The film of a model's parts: all, static and dynamic ones."""
 
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import pytest
 from helpers.hand_made_street import Reels, a_format, checkpoint_of, street_actors, street_model, street_scene, views_of
 
 from drivesplat.io.prefetch import THREADS
-from drivesplat.io.video import read_footage
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import BACKDROP, render_film, render_parts
@@ -56,17 +54,6 @@ def test_scene_static_and_dynamic_parts_are_side_by_side(scene, tmp_path, reels)
     assert 0.3 < before_grey.mean() < 0.9
 
 
-def test_the_first_image_equals_the_ordinary_film(scene, tmp_path, reels):
-    checkpoint, size = checkpoint_of(street_model()), {"width": 64, "height": 36}
-    record = parts_film(scene, tmp_path, checkpoint)
-    job = FilmJob(**a_format(**size).model_dump(), trajectory=TrajectorySettings())
-    ordinary = render_film(scene, checkpoint, job, CPU, tmp_path / "original.mp4")
-    np.testing.assert_array_equal(np.split(reels["parts"], 3, axis=2)[0], reels["original"])
-    assert record.keys() - {"shows", "film"} == ordinary.keys() - {"offset", "parts"}
-    cameras = ("K", "width", "height", "timestamps", "camera_to_world")
-    assert [record[key] for key in cameras] == [ordinary[key] for key in cameras]
-
-
 @pytest.mark.parametrize(("parts", "panel"), [("all", 0), ("static", 1), ("moving", 2)])
 def test_a_film_of_some_parts_is_the_panel_of_the_film_of_parts(scene, tmp_path, reels, parts, panel):
     checkpoint = checkpoint_of(street_model())
@@ -75,25 +62,6 @@ def test_a_film_of_some_parts_is_the_panel_of_the_film_of_parts(scene, tmp_path,
     record = render_film(scene, checkpoint, job, CPU, tmp_path / "some.mp4")
     np.testing.assert_array_equal(reels["some"], np.split(reels["parts"], 3, axis=2)[panel])
     assert record["parts"] == parts and "parts" not in record["offset"]
-
-
-def test_a_film_of_parts_has_a_frame_for_each_camera(scene, tmp_path):
-    record = parts_film(scene, tmp_path, checkpoint_of(street_model()), width=70, height=38)
-    footage = read_footage(tmp_path / "parts.mp4")
-    assert (footage.frames, footage.fps) == (record["frames"], 4.0) == (19, 4.0)
-    assert (footage.width, footage.height) == (210, 38) == (3 * record["width"], record["height"])
-    assert (footage.width, footage.height) == (record["film"]["width"], record["film"]["height"])
-    assert record["bytes"] == (tmp_path / "parts.mp4").stat().st_size
-    assert json.loads(json.dumps(record)) == record
-
-
-def test_the_third_image_is_plain_grey_without_dynamic_parts(scene, tmp_path, reels):
-    still = street_model(street_model().parts[0])
-    record = parts_film(scene, tmp_path, checkpoint_of(still))
-    for frame in reels["parts"]:
-        everything, standing, moving = np.split(frame, 3, axis=1)
-        assert (everything == standing).all() and (moving == round(255 * BACKDROP)).all()
-    assert record["frames"] == len(reels["parts"])
 
 
 def test_rendering_does_not_run_far_ahead_of_the_encoder(scene, tmp_path, monkeypatch):

@@ -9,10 +9,8 @@ import pytest
 from helpers.reports import NO_LOGS, expecting, group, method, metrics, region, stages
 
 from drivesplat.io.storage import write_json
-from drivesplat.report.files import console_table
 from drivesplat.report.gaps import COLUMNS, gap_report
 from drivesplat.report.html import report_page
-from drivesplat.report.published import beside_published, measured_figures
 from drivesplat.report.tables import write_figures
 from drivesplat.settings.published import PublishedFigures
 
@@ -65,26 +63,6 @@ def test_measured_figures_follow_the_published_ones_of_their_scene(tmp_path):
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
-def test_a_mean_is_compared_with_one_over_as_many_scenes_only(tmp_path):
-    report = report_of(tmp_path)
-    two = selected(report, scene="mean", measured=True, scenes=2)
-    assert [(row["method"], row["psnr"]) for row in two] == [
-        ("vanilla", 27.0), ("street", 29.0), ("vanilla", None), ("street", None),
-    ], "the second two beside the mean of six"  # fmt: skip
-    any_number = report_of(tmp_path, [{**PAPER, "scene": "mean", "method": "SG", "psnr": 22.9}])
-    assert [row["psnr"] for row in any_number["published"]] == [22.9, 27.0, 29.0]
-
-
-def test_a_figure_that_a_scene_lacks_has_no_mean(tmp_path):
-    entry = PublishedFigures(**PAPER, scene="mean", method="SG", psnr=22.9)
-    scenes = {}
-    for scene, lpips in (("0061", 0.3), ("0103", None)):
-        between = {**group(24.0), "all": region(20.0, lpips)}
-        scenes[scene] = measured_figures(metrics(scene, {"street": method(between, group(22.0))}), [entry])
-    _, street = beside_published([entry], scenes)
-    assert (street["psnr"], street["lpips"], street["scenes"]) == (20.0, None, 2)
-
-
 def test_regions_groups_and_publications_are_compared_apart(tmp_path):
     report = report_of(tmp_path)
     assert [row["psnr"] for row in selected(report, region="moving_vehicle")] == [23.2, 17.0, 17.0]
@@ -92,15 +70,6 @@ def test_regions_groups_and_publications_are_compared_apart(tmp_path):
     assert [(row["psnr"], row["ssim"]) for row in beyond] == [(None, 0.5), (21.0, 0.8), (21.0, 0.8)]
     assert [row["psnr"] for row in selected(report, source="A blog", scene="0061")] == [32.0, 26.0, 28.0]
     assert [row["source"] for row in report["published"]] == sorted(row["source"] for row in report["published"])
-
-
-def test_a_scene_that_was_not_measured_has_published_figures_alone(tmp_path):
-    assert [row["method"] for row in selected(report_of(tmp_path), scene="0553")] == ["SG"]
-
-
-def test_a_region_that_is_null_has_no_figures(tmp_path):
-    report = report_of(tmp_path, [{**PAPER, "scene": "0103", "region": "car", "method": "SG", "psnr": 20.0}])
-    assert [row["psnr"] for row in report["published"]] == [20.0, None, None]
 
 
 def test_a_scene_whose_compared_figures_are_no_numbers_is_left_out_and_named(tmp_path):
@@ -137,15 +106,6 @@ def test_the_csv_has_published_figures_in_the_same_columns(tmp_path):
     assert not any(row["interpolation_psnr_frame_mean"] == "23.2" for row in tables["with"]), "not of whole images"
 
 
-def test_the_console_has_published_figures(tmp_path):
-    text = console_table(report_of(tmp_path))
-    first, second = text.index("Beside the figures of A & B 2026"), text.index("Beside the figures of A blog")
-    assert first < text.index("<PVG>") < second
-    assert re.search(r"0061 +whole images +SG +22\.87 +0\.650", text)
-    assert re.search(r"mean of 2 +whole images +street \(here\) +29\.00", text)
-    assert "Beside the figures" not in console_table(report_of(tmp_path, []))
-
-
 def test_the_page_has_a_table_per_publication_with_its_link(tmp_path):
     page = report_page(report_of(tmp_path), {})
     assert page.count('<table class="published">') == 2
@@ -161,17 +121,6 @@ def test_the_page_has_a_table_per_publication_with_its_link(tmp_path):
     assert ["mean of 2", "whole images", "street", "measured here", "–", "–", "–", "–", "cpu"] in rows
     assert [row[1] for row in rows if row[2] == "SG"][-2:] == ["moving vehicle", "whole images, extrapolation"]
     assert "mean over held-out images of the PSNR of each image" in page
-
-
-def test_without_published_figures_the_page_has_no_such_tables(tmp_path):
-    page = report_page(report_of(tmp_path, []), {})
-    assert "Beside published figures" not in page and 'class="published"' not in page
-
-
-def test_published_figures_are_shown_before_anything_is_measured(tmp_path):
-    entry = PublishedFigures.model_validate(FIGURES[0])
-    report = gap_report([], expecting("0061").model_copy(update={"published": (entry,)}), NO_LOGS)
-    assert "22.87" in report_page(report, {}) and "22.87" in console_table(report)
 
 
 @pytest.mark.parametrize("change", [{"method": "</script>"}, {"source": "<img src=x>"}, {"gpu": "<u>"}])

@@ -1,6 +1,5 @@
 """Views from beside the recorded path in the report: rows, means, and tables of the page, the CSV and the console."""
 
-import csv
 import json
 import re
 from typing import Any
@@ -10,7 +9,6 @@ from helpers.reports import group, method, metrics, report_of
 
 from drivesplat.report.files import console_table
 from drivesplat.report.html import report_page
-from drivesplat.report.tables import write_figures
 
 METHODS = ("vanilla", "street")
 
@@ -72,23 +70,6 @@ def test_one_scene_has_no_means_and_a_drive_without_such_views_no_table(tmp_path
     none = report_of(tmp_path / "none", bare, methods=METHODS)
     assert none["aside"] == {"rows": [], "means": []}
     assert 'id="aside"' not in report_page(none, {}) and "beside the recorded path" not in console_table(none)
-
-
-def test_the_csv_has_a_column_for_each_figure_of_a_view(report, tmp_path):
-    write_figures(tmp_path / "report.csv", report)
-    with (tmp_path / "report.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 4
-    street = next(row for row in rows if (row["scene"], row["method"]) == ("0103", "street"))
-    assert float(street["lateral_2.0_static"]) == 25.0 and float(street["lateral_4.0_depth_error"]) == 0.4
-    assert float(street["side_camera_CAM_BACK_static"]) == 21.0 and street["side_camera_CAM_BACK_depth_error"] == ""
-
-
-def test_the_console_lists_views(report):
-    text = console_table(report)
-    block = text[text.index("Views from beside the recorded path") :].splitlines()
-    assert block[2].split() == ["0061", "2", "m", "to", "the", "left", "vanilla", "22.0", "-", "20.0%"]
-    assert sum(line.split()[:1] == ["mean"] for line in block[:21]) == 6
 
 
 def test_a_figure_that_is_no_number_leaves_the_scene_out(tmp_path):

@@ -1,7 +1,6 @@
 """LiDAR in the report: rows, means, and the tables of the page, the CSV and the console."""
 
 import copy
-import csv
 import json
 import math
 import re
@@ -92,45 +91,6 @@ def test_the_page_has_a_row_for_each_scene_region_and_method(report):
     assert "4.0 to 8.0" in page and page.count('<h2 id="lidar">LiDAR</h2>') == 1
     assert f"A dash: 0103, moving vehicles, between training frames: {FEW}." in page
     assert page.count(FEW) - page.count(f'"{FEW}"') == 1, "a reason of the recording is stated once"
-
-
-def test_a_reason_of_one_method_names_it(tmp_path):
-    broken = copy.deepcopy(RECORDS[0])
-    figures = broken["methods"]["street_lidar"]["extrapolation"]["lidar"]["all"]
-    figures |= {**dict.fromkeys(FIGURES), "drop_accuracy": 0.2, "unavailable": "no ray returns in both scans"}
-    page = report_page(report_of(tmp_path, broken, methods=METHODS), {})
-    said = "0061, all rays, beyond the last training frame (street_lidar): no ray returns in both scans."
-    assert f"A dash: {said}" in page
-    assert page_rows(page)[0][8:] == ["–", "–", "20.0", "–", "34,720"]
-    assert len(page_rows(page)) == 9, "no means of one scene"
-
-
-def test_the_csv_has_the_figures_of_scans_and_rows_of_baselines(tmp_path, report):
-    write_figures(tmp_path / "gap_report.csv", report)
-    with open(tmp_path / "gap_report.csv", newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["scene"], row["method"]) for row in rows] == [
-        *((scene, name) for scene in ("0061", "0103") for name in METHODS),
-        *((scene, name) for scene in ("0061", "0103") for name in ("nearest_scan", "neighbouring_scans")),
-    ]
-    column = "interpolation_lidar_all_range_error_median_m"
-    assert [row[column] for row in rows] == ["", "0.04", "", "0.08", "0.06", "0.05", "0.07", "0.09"]
-    assert rows[1]["interpolation_static"] == "24.0" and rows[4]["interpolation_static"] == ""
-    assert rows[3]["interpolation_lidar_moving_vehicle_rays"] == "3"
-    assert rows[3]["interpolation_lidar_moving_vehicle_chamfer_m"] == ""
-
-
-def test_the_console_has_a_table_of_all_rays(report):
-    lines = console_table(report).splitlines()
-    at = next(i for i, line in enumerate(lines) if line.startswith("LiDAR"))
-    assert max(map(len, lines[at : at + 11])) <= 120 and len({len(line) for line in lines[at + 1 : at + 11]}) == 1
-    assert lines[at + 1].split() == [
-        "scene", "method", *["interp.", "range", "intensity", "drops", "Chamfer"],
-        *["extrap.", "range", "intensity", "drops", "Chamfer"],
-    ]  # fmt: skip
-    same = ["0.080", "95.0", "0.18"]
-    assert lines[at + 2].split() == ["0061", "street_lidar", "4.0", *same, "8.0", *same]
-    assert lines[at + 8].split()[:3] == ["mean", "street_lidar", "6.0"]
 
 
 def test_without_a_method_that_renders_lidar_nothing_is_said_of_it(tmp_path):

@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.chromium import chromium, in_a_browser
-from helpers.reports import NO_LOGS, expecting, group, method, metrics, stages
+from helpers.reports import expecting, group, method, metrics, stages
 from PIL import Image
 
-from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_json
 from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import gap_plot, report_page
-from drivesplat.report.media import MAX_WIDTH, collect_media, data_url, difference_position, read_image
-from drivesplat.scene.images import write_png
+from drivesplat.report.media import MAX_WIDTH, collect_media, data_url, read_image
 from drivesplat.settings.report import PICTURES
 
 METHODS = ("vanilla", "street")
@@ -115,22 +113,8 @@ def test_a_page_has_the_metrics_of_whole_images_and_a_glossary(results):
     assert "Higher is better" in dict(explained)["PSNR"] and "Lower is better" in dict(explained)["LPIPS"]
 
 
-def test_a_page_says_which_key_frames_were_used_and_how_near_training_images_are(results):
-    found = made(results)
-    assert "of the recording" not in page_of(results) and "from training images" not in page_of(results)
-    found["protocols"]["0061"] |= {"key_frame_range": [100, 190], "nearest_training_s": 0.1}
-    page = re.sub(r"\s+", " ", report_page(found, {}))
-    assert page.count("key frames 100 to 189 of the recording, counted from 0,") == 1
-    assert page.count("held-out images at least 0.10 s from training images,") == 1
-
-
 def test_a_page_is_deterministic(results):
     assert page_of(results) == page_of(results)
-
-
-def test_a_report_without_results_has_a_page(tmp_path):
-    page = report_page(gap_report([], expecting("0061"), NO_LOGS), {})
-    assert "Nothing has been measured yet" in page and "<b>0061</b>: not measured" in page and "<svg" not in page
 
 
 def test_large_images_are_reduced(tmp_path):
@@ -143,23 +127,6 @@ def test_large_images_are_reduced(tmp_path):
         sizes.append(picture.size)
         np.testing.assert_allclose(np.asarray(picture)[5, 5], [100, 200, 155], atol=4)
     assert sizes == [(MAX_WIDTH, MAX_WIDTH // 4), (160, 90)]
-
-
-@pytest.mark.parametrize("content", [b"", b"no picture"])
-def test_a_broken_image_is_named(tmp_path, content):
-    (tmp_path / "broken.png").write_bytes(content)
-    with pytest.raises(ResultError, match=r"broken\.png is not a readable image"):
-        read_image(tmp_path / "broken.png")
-
-
-def test_a_slider_starts_where_its_images_differ(tmp_path):
-    with_car, without = np.full((60, 200, 3), 90, dtype=np.uint8), np.full((60, 200, 3), 90, dtype=np.uint8)
-    with_car[20:40, 30:50] = 200
-    for name, pixels in (("with", with_car), ("without", without)):
-        write_png(tmp_path / f"{name}.png", pixels)
-    shown, gone = (read_image(tmp_path / f"{name}.png") for name in ("with", "without"))
-    assert difference_position(shown, gone) == pytest.approx(0.2, abs=0.01)
-    assert difference_position(shown, shown) == 0.5
 
 
 def test_media_are_collected_by_scene_and_method(tmp_path):

@@ -8,7 +8,7 @@ from helpers.reference_rays import pixel_rays
 from PIL import Image
 
 from drivesplat.errors import DatasetError
-from drivesplat.scene.images import continuous_intrinsics, project, read_image, read_mask, target_size, upward_rays
+from drivesplat.scene.images import continuous_intrinsics, project, read_image, read_mask, target_size
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.images import ImageSettings
@@ -55,33 +55,11 @@ def test_another_aspect_ratio_scales_each_axis_separately():
     np.testing.assert_allclose(k[1], [0.0, 1100.0 * 56 / 900, 450.0 * 56 / 900])
 
 
-def test_the_recorded_intrinsics_are_not_modified():
-    source = frame()
-    before = source.intrinsics.copy()
-    continuous_intrinsics(source, (800, 450))
-    np.testing.assert_array_equal(source.intrinsics, before)
-
-
 def test_resizing_to_a_half_averages_blocks_of_four(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (12, 20, 3)).astype(np.uint8)
     Image.fromarray(pixels).save(tmp_path / "image.png")
     blocks = pixels.reshape(6, 2, 10, 2, 3).astype(float).mean(axis=(1, 3))
     np.testing.assert_allclose(read_image(tmp_path / "image.png", (10, 6)), blocks, atol=0.51)
-
-
-def test_an_image_at_its_own_size_is_returned_unchanged(tmp_path):
-    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "image.png")
-    np.testing.assert_array_equal(read_image(tmp_path / "image.png"), pixels)
-    np.testing.assert_array_equal(read_image(tmp_path / "image.png", (7, 5)), pixels)
-
-
-@pytest.mark.parametrize("mode", ["L", "RGBA", "P"])
-def test_images_of_other_modes_become_rgb(tmp_path, mode):
-    Image.new("RGB", (6, 4), (255, 255, 255)).convert(mode).save(tmp_path / "image.png")
-    pixels = read_image(tmp_path / "image.png")
-    assert pixels.shape == (4, 6, 3) and pixels.dtype == np.uint8
-    np.testing.assert_array_equal(pixels, 255)
 
 
 def encoded(format: str) -> bytes:
@@ -122,14 +100,6 @@ def test_a_damaged_png_is_read_or_refused_naming_it(tmp_path, position):
         assert "damaged.png" in str(error)
 
 
-@pytest.mark.parametrize("name", ["absent.jpg", "folder"])
-def test_a_missing_image_is_refused_naming_it(tmp_path, name):
-    (tmp_path / "folder").mkdir()
-    for read in (read_image, lambda path: read_mask(path, (4, 4))):
-        with pytest.raises(DatasetError, match=name):
-            read(tmp_path / name)
-
-
 def test_labels_keep_their_values_when_a_mask_is_resized(tmp_path):
     labels = np.random.default_rng(0).choice(np.array([0, 3, 9], dtype=np.uint8), (6, 8))
     Image.fromarray(np.kron(labels, np.ones((3, 3), dtype=np.uint8))).save(tmp_path / "labels.png")
@@ -155,13 +125,6 @@ def test_projection_of_known_points():
     np.testing.assert_allclose(pixels[:3], [[50.0, 40.0], [70.0, 40.0], [50.0, 28.0]])
 
 
-def test_projection_of_no_points_and_of_the_camera_centre_does_not_fail():
-    k = np.eye(3)
-    pixels, depth = project(np.empty((0, 3)), np.eye(4), k)
-    assert pixels.shape == (0, 2) and depth.shape == (0,)
-    assert project(np.zeros((1, 3)), np.eye(4), k)[1][0] == 0.0
-
-
 @pytest.mark.parametrize("skew", [0.0, 3.0])
 def test_a_point_along_a_pixels_ray_projects_to_that_pixels_centre(skew):
     k = np.array([[100.0, skew, 20.0], [0.0, 120.0, 11.0], [0.0, 0.0, 1.0]])
@@ -171,11 +134,3 @@ def test_a_point_along_a_pixels_ray_projects_to_that_pixels_centre(skew):
     x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(24) + 0.5)
     np.testing.assert_allclose(pixels, np.stack([x.ravel(), y.ravel()], axis=1), atol=1e-9)
     assert (depth > 0).all()
-
-
-@pytest.mark.parametrize("skew", [0.0, 3.0])
-def test_upward_rays_are_the_z_components_of_the_pixels_rays(skew):
-    k = np.array([[100.0, skew, 20.0], [0.0, 120.0, 11.0], [0.0, 0.0, 1.0]])
-    up = upward_rays((40, 24), k, camera())
-    np.testing.assert_allclose(up, pixel_rays((40, 24), k, camera())[..., 2], atol=1e-14)
-    assert up.min() < 0.0 < up.max()

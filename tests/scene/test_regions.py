@@ -40,20 +40,6 @@ def test_fill_selects_the_pixels_with_centres_in_the_polygon(seed, place):
         np.testing.assert_array_equal(fill(outline, (48, 32)), inside_by_crossing_number(polygon, (48, 32)))
 
 
-def test_fill_of_a_rectangle_counts_pixel_centres():
-    mask = fill(np.array([[2.5, 1.0], [5.4, 1.0], [5.4, 3.0], [2.5, 3.0]]), (10, 6))
-    assert np.argwhere(mask).tolist() == [[y, x] for y in (1, 2) for x in (2, 3, 4)]
-
-
-@pytest.mark.parametrize("shift", [(-100, 0), (100, 0), (0, -100), (0, 100)])
-def test_a_polygon_outside_the_image_fills_nothing(shift):
-    assert not fill(np.array([[2.0, 1.0], [8.0, 1.0], [5.0, 5.0]]) + shift, (20, 10)).any()
-
-
-def test_a_polygon_around_the_image_fills_it():
-    assert fill(np.array([[-1e6, -1e6], [1e6, -1e6], [1e6, 1e6], [-1e6, 1e6]]), (20, 10)).all()
-
-
 def box(position, size=(4.0, 2.0, 1.5), angle=0.0, category="vehicle.car") -> Box:
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     return Box("it", *classed(category), np.array(size), rigid(turn, np.array(position, dtype=float)), 0.0, 4)
@@ -91,13 +77,6 @@ def test_the_hull_of_a_box_in_front_equals_that_of_its_corners(position, angle):
     )
 
 
-def test_the_hull_of_an_axis_aligned_box_matches_its_closed_form():
-    """A box of 2 x 2 x 2 m, its near face 4 m away: the near face hides the far one."""
-    hull = hull_of(box((0, 0, 5), (2.0, 2.0, 2.0)), np.eye(4), K)
-    corners = {(160.0 + x, 90.0 + y) for x in (-50.0, 50.0) for y in (-52.5, 52.5)}
-    assert {tuple(np.round(p, 3)) for p in hull.astype(float)} == corners
-
-
 @pytest.mark.parametrize("position", [(0.0, 0.3, 1.0), (1.2, 0.0, 0.5), (0.0, 1.0, 0.0), (-1.0, 0.8, -0.4)])
 @pytest.mark.parametrize("angle", [0.0, 0.5])
 def test_a_box_that_straddles_the_camera_plane_is_clipped_at_the_near_plane(position, angle):
@@ -121,13 +100,6 @@ def fill_of_hull_of(pixels: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("z", [-3.0, -0.7])
 def test_a_box_behind_the_near_plane_has_no_hull(z):
     assert hull_of(box((0.0, 0.0, z), (1.0, 1.0, 1.5)), np.eye(4), K) is None
-
-
-def test_the_hull_moves_with_the_camera():
-    it = box((3.0, 1.0, 12.0), angle=0.3)
-    world_to_camera = rigid(np.eye(3), np.array([-1.0, 0.5, -2.0]))
-    moved = box((2.0, 1.5, 10.0), angle=0.3)
-    np.testing.assert_allclose(hull_of(it, world_to_camera, K), hull_of(moved, np.eye(4), K), atol=1e-2)
 
 
 def rays_of(frame: Frame, world: World) -> tuple[np.ndarray, np.ndarray]:
@@ -206,10 +178,6 @@ def test_boxes_under_40_percent_visibility_are_left_out(tmp_path, visibility, ex
     assert names(labels_at_start(things, tmp_path)) == {"static", expected}
 
 
-def test_boxes_of_unknown_visibility_are_kept(tmp_path):
-    assert names(labels_at_start([dataclasses.replace(CAR_AHEAD, visibility="")], tmp_path)) == {"static", "parked_car"}
-
-
 WALL = (1000, 400)
 """The size of an image whose camera has a focal length of 1000 pixels."""
 
@@ -245,21 +213,6 @@ def test_a_box_of_unknown_visibility_is_left_out_where_nearer_boxes_hide_more_th
         assert labels[200, 450] == LABELS["parked_car"], "an annotated visibility is not estimated"
 
 
-@pytest.mark.parametrize(("hidden", "expected"), [(0.59, "parked_car"), (0.61, "left_out")])
-def test_the_hidden_share_is_that_of_the_hull_within_the_image(hidden, expected):
-    """Half of the box is left of the image, where the nearer box would hide all of it."""
-    edge = 100.0 * hidden
-    labels = labels_of_walls(wall("far", (-100.0, 100.0), 20.0, 0), wall("near", (-400.0, edge), 10.0, 4))
-    assert labels[200, 80] == LABELS[expected]
-
-
-def test_a_hidden_box_of_unknown_visibility_still_hides_others():
-    front, middle = wall("front", (280.0, 430.0), 10.0, 4), wall("middle", (300.0, 500.0), 20.0, 0)
-    labels = labels_of_walls(front, middle, wall("last", (300.0, 520.0), 30.0, 0))
-    assert names(labels) == {"static", "parked_car", "left_out"}
-    assert labels[200, 450] == labels[200, 510] == LABELS["left_out"]
-
-
 @pytest.mark.parametrize(
     ("tracks", "expected"),
     [
@@ -290,14 +243,6 @@ def test_boxes_under_100_pixels_are_left_out(tmp_path):
         seen_as[int((labels > 0).sum())] = (names(labels) - {"static"}).pop()
     assert min(seen_as) < 100 <= max(seen_as)
     assert seen_as == {pixels: "left_out" if pixels < 100 else "parked_car" for pixels in seen_as}
-
-
-def test_a_box_of_exactly_100_pixels_is_kept(tmp_path):
-    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=[CAR_AHEAD], sweeps_between=0)))
-    sizes = ((width, height) for width in range(40, 80) for height in range(24, 48))
-    labelled = (label_image(scene, scene.frames[0], size) for size in sizes)
-    exactly = next(labels for labels in labelled if (labels > 0).sum() == 100)
-    assert names(exactly) == {"static", "parked_car"}
 
 
 def test_the_nearer_box_wins_whatever_the_order_of_tracks(tmp_path):
@@ -344,16 +289,6 @@ def test_a_box_is_labelled_by_class_and_speed(tmp_path, category, velocity, expe
     assert classed(category)[0].is_dynamic == (expected != "static")
 
 
-def test_an_image_without_boxes_is_static(tmp_path):
-    behind = Thing("vehicle.car", (4.0, 2.0, 1.6), (-12.0, 0.0, 0.8))
-    assert names(labels_at_start([behind], tmp_path)) == {"static"}
-
-
-def test_a_box_around_the_camera_fills_the_image(tmp_path):
-    around = Thing("vehicle.car", (2.0, 2.0, 3.0), (1.7, 0.0, 1.5))
-    assert names(labels_at_start([around], tmp_path)) == {"parked_car"}
-
-
 def masks_of(labels: np.ndarray) -> dict[str, np.ndarray]:
     return {region: region_mask(labels, region) for region in REGIONS}
 
@@ -376,11 +311,3 @@ def test_regions_partition_the_image_as_in_the_protocol():
     assert not any(mask[left_out].any() for region, mask in masks.items() if region != "all")
     assert not any(mask[labels == LABELS["own_car"]].any() for mask in masks.values())
     assert masks["all"][labels != LABELS["own_car"]].all()
-
-
-def test_regions_of_the_tiny_drive_cover_the_image_except_left_out_and_static_people(tiny_scene):
-    labels = label_image(tiny_scene, tiny_scene.frames[0], SIZE)
-    masks = masks_of(labels)
-    parts = masks["static"].astype(int) + masks["vehicle"] + masks["moving_human"] + (labels == LABELS["left_out"])
-    assert (parts == 1).all()
-    assert masks["all"].all()

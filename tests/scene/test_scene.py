@@ -114,18 +114,3 @@ def test_json_of_another_schema_is_refused_naming_file_and_rule(tmp_path, edit):
     (tmp_path / "scene.json").write_text(json.dumps(content))
     with pytest.raises(ResultError, match=r"scene\.json.*'extract'"):
         read_scene(tmp_path / "scene.json")
-
-
-@pytest.mark.parametrize(
-    ("time", "nearest"), [(-5, 0), (0, 0), (49, 0), (51, 1), (100, 1), (179, 1), (181, 2), (9999, 2)]
-)
-def test_the_nearest_key_frame_is_nearest_in_time(time, nearest):
-    assert some_scene((0, 100, 260)).nearest_key_frame(time) == nearest
-
-
-@pytest.mark.parametrize(
-    ("times", "interval"),
-    [((0, 500_000, 1_000_000, 1_700_000), 500_000.0), ((7, 100), 93.0), ((7,), 500_000.0)],
-)
-def test_the_interval_is_the_median_time_between_key_frames(times, interval):
-    assert some_scene(times).key_frame_interval == interval

@@ -98,14 +98,6 @@ def test_without_boxes_street_is_said_to_have_the_parts_of_vanilla(tiny_scene):
     assert "; street has the parts of vanilla and differs in its losses alone (methods: {street: null} leaves" in found
 
 
-@pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (200, 100, 50)])
-def test_luminance_is_the_mean_luma_of_the_images(tiny_scene, tmp_path, color):
-    Image.new("RGB", (96, 54), color).save(tmp_path / "a.png")
-    frames = tuple(dataclasses.replace(frame, image_path=str(tmp_path / "a.png")) for frame in tiny_scene.frames)
-    expected = (0.2126 * color[0] + 0.7152 * color[1] + 0.0722 * color[2]) / 255
-    assert luminance(dataclasses.replace(tiny_scene, frames=frames)) == pytest.approx(expected, abs=1e-6)
-
-
 def test_luminance_is_averaged_over_the_whole_drive(tiny_scene, tmp_path):
     """Its second half is dark and has as many sampled images as the first."""
     Image.new("RGB", (96, 54), (0, 0, 0)).save(tmp_path / "dark.png")

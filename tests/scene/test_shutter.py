@@ -1,10 +1,7 @@
 """Rolling shutters: the motion of the camera during the readout, and where points are seen meanwhile."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from drivesplat.scene.rigid import inverse, rigid
@@ -114,22 +111,6 @@ def test_points_are_seen_where_they_are_at_the_time_of_their_line(readout, veloc
     np.testing.assert_allclose(found[:, 2], expected_depth, atol=0.02)
 
 
-def test_torch_tensors_are_displaced_as_numpy_arrays():
-    points = np.random.default_rng(1).uniform([-5, -3, -2], [5, 3, 40], (500, 3))
-    shutter = Shutter(np.array([0.0, 0.04, 0.001]), np.array([1.0, 0.2, 12.0, 0.1, 0.2, 0.0]))
-    arrays = [points, shutter.readout_s, shutter.motion, K]
-    found = displaced(*(torch.from_numpy(values) for values in arrays), SIZE)
-    np.testing.assert_allclose(found.numpy(), displaced(*arrays, SIZE), atol=1e-12)
-
-
-def test_points_behind_the_camera_stay_and_none_becomes_infinite():
-    shutter = Shutter(np.array([0.0, 0.1, 0.0]), np.array([0.0, 0.0, 40.0, 1.0, 1.0, 1.0]))
-    points = np.array([[1.0, 1.0, -3.0], [0.0, 0.0, 0.0], [2.0, -1.0, 0.1], [9.0, 50.0, 0.11], [0.0, 900.0, 1.0]])
-    found = displaced(points, shutter.readout_s, shutter.motion, K, SIZE)
-    np.testing.assert_array_equal(found[:3], points[:3])
-    assert np.isfinite(found).all() and np.abs(found - points).max() < 100.0
-
-
 def test_world_points_are_moved_as_the_camera_sees_them():
     scene = scene_of(camera())
     frame, shutter = scene.frames[1], shutter_of(scene, scene.frames[1])
@@ -141,13 +122,3 @@ def test_world_points_are_moved_as_the_camera_sees_them():
     to_camera = inverse(pose)
     np.testing.assert_allclose(moved @ to_camera[:3, :3].T + to_camera[:3, 3], expected, atol=1e-9)
     assert where_seen(world, None, pose, K, SIZE) is world
-
-
-def test_refined_poses_give_the_velocity(tmp_path):
-    scene = scene_of(camera())
-    faster = [
-        dataclasses.replace(f, ego_to_world=ego_at(0.2 * i), camera_to_world=ego_at(0.2 * i) @ MOUNT)
-        for i, f in enumerate(scene.frames)
-    ]
-    found = shutters(dataclasses.replace(scene, frames=tuple(faster)))[1].velocity[5 - 1]
-    assert found == pytest.approx(2.0 * shutters(scene)[1].velocity[4], rel=1e-6)

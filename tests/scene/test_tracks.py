@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.classed import classed
 
-from drivesplat.scene.rigid import apply, interpolate, inverse, rigid
+from drivesplat.scene.rigid import interpolate, rigid
 from drivesplat.scene.scene import Track
 from drivesplat.scene.tracks import Box, box_at, boxes_at, ever_moves
 
@@ -62,20 +62,6 @@ def test_interpolation_about_a_tilted_axis_is_rodrigues_rotation():
     np.testing.assert_allclose(interpolate(start, end, 0.25)[:3, :3], base @ rodrigues(angle / 4), atol=1e-9)
 
 
-def test_the_inverse_cancels_a_rigid_transform():
-    transforms = np.stack([rigid(turned(0.4), np.array([1.0, 2.0, 3.0])), rigid(turned(-2.0), np.array([9.0, 0, -1]))])
-    np.testing.assert_allclose(inverse(transforms) @ transforms, np.broadcast_to(np.eye(4), (2, 4, 4)), atol=1e-12)
-    points = np.array([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(apply(inverse(transforms[0]), apply(transforms[0], points)), points, atol=1e-12)
-
-
-@pytest.mark.parametrize("seconds", [0.0, 0.1, 0.25, 0.4, 0.5])
-def test_between_key_frames_the_position_is_linear_and_the_rotation_slerps(seconds):
-    box = box_at(track([0, 1], [(0, 0, 0), (2.0, 1.0, 0.5)], [0.2, 0.8]), at(seconds), INTERVAL)
-    share = seconds / 0.5
-    assert_pose(box.object_to_world, 0.2 + 0.6 * share, [2.0 * share, 1.0 * share, 0.5 * share])
-
-
 def test_each_segment_interpolates_its_own_ends():
     it = track([0, 1, 2], [(0, 0, 0), (1.0, 0, 0), (1.0, 4.0, 0)])
     np.testing.assert_allclose(box_at(it, at(0.25), INTERVAL).object_to_world[:3, 3], [0.5, 0.0, 0.0])
@@ -128,25 +114,10 @@ def test_the_object_is_absent_within_a_gap(seconds):
     assert box_at(track(*GAP), at(seconds), INTERVAL) is None
 
 
-def test_a_single_box_beside_a_gap_is_static():
-    it = track([0, 1, 3], [(0, 0, 0), (1.0, 0, 0), (30.0, 0, 0)])
-    box = box_at(it, at(1.6), INTERVAL)
-    np.testing.assert_array_equal(box.object_to_world[:3, 3], [30.0, 0, 0])
-    assert box.speed == 0.0
-
-
 def test_speed_is_the_horizontal_speed_of_the_segment():
     it = track([0, 1], [(0, 0, 0), (1.5, 2.0, 7.0)])
     for seconds in (-0.25, 0.0, 0.3, 0.5, 0.75):
         assert box_at(it, at(seconds), INTERVAL).speed == pytest.approx(5.0)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "visibility"), [(-0.2, 1), (0.0, 1), (0.24, 1), (0.26, 3), (0.6, 3), (0.9, 4), (1.2, 4)]
-)
-def test_visibility_is_that_of_the_nearest_annotation(seconds, visibility):
-    it = track([0, 1, 2], [(0, 0, 0)] * 3, visibility=[1, 3, 4])
-    assert box_at(it, at(seconds), INTERVAL).visibility == visibility
 
 
 @pytest.mark.parametrize(
@@ -180,13 +151,6 @@ def test_a_box_moves_by_its_current_speed_and_a_track_by_any_of_its_boxes():
 
 def test_a_jump_across_a_gap_is_not_motion():
     assert not ever_moves(track([0, 1, 3, 4], [(0, 0, 0), (0, 0, 0), (30.0, 0, 0), (30.0, 0, 0)]))
-
-
-def test_corners_are_half_the_size_from_the_centre_along_the_objects_axes():
-    pose = rigid(turned(np.pi / 2), np.array([10.0, 0, 0]))
-    box = Box("it", *classed("vehicle.car"), np.array([4.0, 2.0, 1.0]), pose, 0.0, 4)
-    expected = {(10 + y, x, z) for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (-0.5, 0.5)}
-    assert {tuple(np.round(corner, 9)) for corner in box.corners} == expected
 
 
 def test_the_boxes_of_the_tiny_drive_match_its_objects(tiny_scene):

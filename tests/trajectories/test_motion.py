@@ -85,23 +85,6 @@ def test_constant_velocity_and_turn_rate_are_reproduced_within_and_beyond(time):
     )
 
 
-def test_poses_are_rigid_everywhere():
-    poses = winding().poses(np.linspace(0.0, 4.0, 81))
-    np.testing.assert_allclose(
-        poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (81, 1, 1)), atol=1e-12
-    )
-    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
-    np.testing.assert_array_equal(poses[:, 3], np.tile([0.0, 0.0, 0.0, 1.0], (81, 1)))
-
-
-def test_positions_are_weighted_means_of_the_annotated_ones():
-    motion = winding()
-    at = np.linspace(TIMES[0] - REACH, TIMES[-1] + REACH, 50)
-    weights = motion.weights(at)
-    np.testing.assert_allclose(weights @ motion.object_to_world[:, :3, 3], motion.poses(at)[:, :3, 3], atol=1e-12)
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-12)
-
-
 def with_a_gap() -> Motion:
     """Annotated at 0, 0.5, 1.0 and again at 2.5, 3.0 seconds, at another position."""
     places = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [20.0, 5.0, 0.0], [20.0, 6.0, 0.0]]
@@ -115,15 +98,6 @@ def with_a_gap() -> Motion:
 )  # fmt: skip
 def test_it_is_absent_in_a_gap_and_beyond_its_reach(time, present):
     assert with_a_gap().present(np.array([time])).tolist() == [present]
-
-
-def test_each_run_depends_on_its_own_annotations_only():
-    motion, at = with_a_gap(), np.array([1.2, 2.3])
-    np.testing.assert_allclose(motion.poses(at)[0], rigid(np.eye(3), np.array([2.4, 0.0, 0.0])), atol=1e-9)
-    np.testing.assert_allclose(motion.poses(at)[1], rigid(about_z(1.5), np.array([20.0, 4.6, 0.0])), atol=1e-9)
-    weights = motion.weights(at)
-    assert not weights[0, 3:].any() and not weights[1, :3].any()
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
 
 
 def test_it_spans_all_its_runs():

@@ -158,18 +158,3 @@ def test_names_that_are_taken_and_unknown_tracks_are_refused(steps, said):
     with pytest.raises(ConfigError) as refused:
         edited(*steps, others=("walker",))
     assert str(refused.value) == said
-
-
-@pytest.mark.parametrize(
-    "path", [[[1.0, 0.0, 0.0], [1.0, 5.0, 0.0]], [[0.0, 0.0, 0.0], [2.0, 5.0, 0.0], [1.0, 9.0, 0.0]]]
-)
-def test_seconds_of_a_path_increase(path):
-    with pytest.raises(ValueError, match="the seconds of 'path' must increase from point to point"):
-        place(path)
-
-
-@pytest.mark.parametrize(("second", "x"), [(-1.0, -10.0), (0.25, 2.5), (2.5, 25.0)])
-def test_a_track_of_two_annotations_continues_straight(second, x):
-    edit = Edit.model_validate({"steps": [{"shift": {"track": "6e", "lateral": 1.0}}]})
-    (actor,) = edited_actors([recorded("6e5c", annotations=2)], edit, "here")
-    np.testing.assert_allclose(actor.poses(np.array([second]))[0, :2, 3], [x, 1.0], atol=1e-6)

@@ -13,7 +13,6 @@ from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.splits import SIDE_CAMERA, Group
 from drivesplat.settings.render import LidarFilmJob
 from drivesplat.visuals import lidar_film
-from drivesplat.visuals.beside_truth import film_rate
 from drivesplat.visuals.lidar_film import NOTES, render_lidar_film
 from drivesplat.visuals.lidar_frame import (
     HEIGHT_COLORS,
@@ -104,14 +103,6 @@ def test_errors_misses_and_false_returns_have_their_colours():
         np.testing.assert_allclose(shown(view[rows, columns], color), [6.0, 6.0], atol=1.5)
 
 
-def test_rays_that_say_nothing_are_not_seen_from_above():
-    frames = LidarFrames([recorded(room())], 0.0, "")
-    scan, nothing = recorded(room(), measured=np.zeros(room().shape, dtype=bool)), recorded(alone())
-    seen, empty = (frames.frame(one, rendered(alone())) for one in (scan, nothing))
-    for view in VIEWS:
-        np.testing.assert_array_equal(view.inside(seen), view.inside(empty))
-
-
 def test_all_frames_have_the_scales_of_the_drive():
     scans = [recorded(room(radius)) for radius in (12.0, 55.0)]
     frames = LidarFrames(scans, None, "")
@@ -152,8 +143,3 @@ def test_captions_say_which_scans_are_held_out(lidar_of, tmp_path, monkeypatch):
     assert {*NOTES, SIDE_CAMERA} == set(get_args(Group))
     assert captions[0].labels[0].startswith("range off by 10.0 cm (median)") and captions[3].clock == "1.5 s"
     assert captions[1].labels == ["0.0 % of returns and drops right"], "nothing was recorded there"
-
-
-def test_films_run_at_the_rate_of_the_scans():
-    assert film_rate([0, 50_000, 100_000, 600_000]) == 20
-    assert film_rate([0, 5_000_000]) == film_rate([0]) == 1

@@ -100,19 +100,6 @@ def test_a_discovered_object_is_removed_as_a_whole_if_most_of_it_lies_in_the_box
     assert removal.by == by and removal.removed.tolist() == [by == "box", *own, False]
 
 
-def test_an_actor_without_gaussians_is_not_removed_by_its_box():
-    """All of its Gaussians died in training: what lies in its box is not its own."""
-    box = turned_box()
-    model = model_of(round_gaussians([box.object_to_world[:3, 3]]), Own(round_gaussians([]), "it"))
-    removal = removal_of(model, model.at(0.0), box, 0.1)
-    assert removal.by == "actor" and removal.removed.tolist() == [False]
-
-
-def test_nothing_is_removed_of_an_empty_model():
-    model = model_of(round_gaussians([]))
-    assert removal_of(model, model.at(0.0), turned_box(), 0.1).removed.shape == (0,)
-
-
 def one_car(tiny_scene: Scene, speed: float = 4.0) -> Scene:
     """A car ahead, its centre at (8.5, 0, 0.8) at the first key frame."""
     times = tiny_scene.key_frame_timestamps
@@ -191,15 +178,6 @@ def test_the_footprint_covers_the_removed_gaussian(tiny_scene):
     assert not pair.footprint[distance > 4.0 * deviation].any()
 
 
-def test_an_actors_gaussians_are_removed_at_any_place(tiny_scene):
-    """A method that takes the car apart: its Gaussian beside the box goes, the background's in the box stays."""
-    parts = round_gaussians([CAR_AT], 0.2), Own(round_gaussians([[9.0, 2.5, 1.0]], 0.2), "it")
-    pair, record = remove_actor(drive_of(one_car(tiny_scene), *parts), job_of())
-    assert record["removed_by"] == "actor" and record["gaussians_removed"] == 1
-    kept, _ = remove_actor(drive_of(one_car(tiny_scene), round_gaussians([CAR_AT], 0.2)), job_of())
-    np.testing.assert_allclose(pair.without_car, kept.with_car, atol=1e-6)
-
-
 BEFORE_THE_BOX = [5.5, 0.85, 0.4]
 """On the car's way, nearer than its box and beside it in the image."""
 EGO_FROM_ROW = 36
@@ -231,14 +209,6 @@ def test_pixels_of_the_ego_mask_are_neither_inside_nor_outside(tiny_scene, tmp_p
     assert not record["ghosts"]["reach_outside_box"] and record["ghosts"]["covered_share_outside"] == 0.0
 
 
-def test_a_model_without_gaussians_in_the_box_changes_nothing(tiny_scene):
-    pair, record = remove_actor(drive_of(one_car(tiny_scene), round_gaussians([[12.0, 3.0, 1.0]], 0.2)), job_of())
-    np.testing.assert_array_equal(pair.with_car, pair.without_car)
-    assert record["gaussians_removed"] == 0 and not pair.footprint.any()
-    assert record["box"]["changed_share"] == 0.0 and record["outside"]["identical"]
-    json.dumps(record, allow_nan=False)
-
-
 def ghosts_record(tiny_scene: Scene, place, opacity: float = 0.95) -> dict:
     places = [CAR_AT] if place is None else [CAR_AT, place]
     part = round_gaussians(places, 0.15, [0.95, opacity][: len(places)], [0.9, 0.2, 0.1])
@@ -266,26 +236,6 @@ def test_remaining_ghosts_are_counted_and_their_visibility_outside_the_box_is_re
 def test_ghosts_are_visible_from_an_opacity_of_a_twentieth(tiny_scene, opacity, seen):
     record = ghosts_record(tiny_scene, BEFORE_THE_BOX, opacity)
     assert record["gaussians"] == 1 and record["reach_outside_box"] is seen
-
-
-def test_without_a_moving_vehicle_both_images_are_the_middle_key_frame(tiny_scene):
-    scene = one_car(tiny_scene, speed=0.0)
-    pair, record = remove_actor(drive_of(scene, round_gaussians(PLACES, 0.2)), job_of(key_frame=None))
-    np.testing.assert_array_equal(pair.with_car, pair.without_car)
-    assert pair.with_car.shape == (54, 96, 3) and not pair.footprint.any() and len(pair.outline) == 0
-    record = json.loads(json.dumps(record, allow_nan=False))
-    assert record["key_frame"] == 5 and record["gaussians_removed"] == 0
-    assert "no moving vehicle is visible from CAM_FRONT" in record["why_null"]
-    for name in ("subject", "removed_by", "box", "holes", "edge", "outside", "outside_footprint", "ghosts"):
-        assert record[name] is None, name
-
-
-def test_the_record_always_has_the_same_fields(tiny_scene):
-    records = [
-        remove_actor(drive_of(one_car(tiny_scene, speed), round_gaussians(PLACES, 0.2)), job_of(key_frame=None))[1]
-        for speed in (4.0, 0.0)
-    ]
-    assert records[0].keys() == records[1].keys()
 
 
 HEIGHT, WIDTH = 30, 40
@@ -323,23 +273,6 @@ def test_changed_shares_and_reach_of_a_synthetic_pair():
     }  # fmt: skip
 
 
-def test_a_change_counts_from_eight_levels_of_one_channel():
-    before = np.full((HEIGHT, WIDTH, 3), 0.5)
-    after = before.copy()
-    after[10, 12, 2] += 8.5 / 255
-    after[10, 14] += 7.5 / 255
-    assert figures(pair_of(with_car=before, without_car=after))["box"]["changed_share"] == pytest.approx(1 / 168)
-
-
-def test_the_reach_is_the_distance_to_the_nearest_pixel_of_the_box():
-    before = np.full((HEIGHT, WIDTH, 3), 0.5)
-    after = before.copy()
-    after[24, 27] = 0.9
-    found = figures(pair_of(with_car=before, without_car=after))
-    assert found["outside"]["reach_px"] == pytest.approx(np.hypot(24 - 19, 27 - 23))
-    assert found["box"]["changed_share"] == 0.0
-
-
 def test_holes_are_pixels_whose_opacity_falls():
     alpha, after = np.full((HEIGHT, WIDTH), 0.9), np.full((HEIGHT, WIDTH), 0.9)
     alpha[:, :12] = 0.2
@@ -349,13 +282,6 @@ def test_holes_are_pixels_whose_opacity_falls():
     found = figures(pair_of(alpha_with=alpha, alpha_without=after))["holes"]
     assert found["pixels"] == 9
     assert found["share_of_box"] == pytest.approx(8 / 168)
-
-
-def test_the_sky_share_of_the_box_is_one_minus_the_opacity():
-    """Opacity 0.9 everywhere; nine pixels of the hull fall to 0.3."""
-    found = figures(pair_of())["box"]
-    assert found["sky_share_with"] == pytest.approx(0.1)
-    assert found["sky_share_without"] == pytest.approx((9 * 0.7 + (168 - 9) * 0.1) / 168)
 
 
 def gradient(image: np.ndarray) -> np.ndarray:
@@ -373,18 +299,6 @@ def along_the_hull(inside: np.ndarray) -> np.ndarray:
     return (np.where(other, away, np.inf).min(axis=1) <= 2.0).reshape(inside.shape)
 
 
-@pytest.mark.parametrize("outside", [True, False])
-def test_changes_in_the_ego_mask_are_not_counted(outside):
-    """The hull's upper half, and the rows from 14 on, which hold most of the change."""
-    seen = np.arange(HEIGHT)[:, None] < 14
-    inside = pair_of().inside
-    found = figures(pair_of(inside=inside & seen, outside=~inside & seen))
-    region = found["outside" if outside else "box"]
-    among, columns = (14 * WIDTH - 14 * 6, 5) if outside else (14 * 6, 4)
-    assert region["pixels"] == among and region["changed_share"] == pytest.approx(2 * columns / among)
-    assert found["outside"]["reach_px"] == pytest.approx(5.0), "from column 23 to column 28"
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_the_edge_is_the_mean_gradient_along_the_hull_with_and_without(seed):
     pair = pair_of(seed)
@@ -395,44 +309,10 @@ def test_the_edge_is_the_mean_gradient_along_the_hull_with_and_without(seed):
     assert found["ratio"] == pytest.approx(after / before)
 
 
-def test_an_added_outline_makes_the_edge_ratio_large():
-    smooth = np.full((HEIGHT, WIDTH, 3), 0.5) + np.linspace(0, 0.1, WIDTH)[None, :, None]
-    outlined = np.where(pair_of().inside[..., None], 0.2, smooth)
-    assert figures(pair_of(with_car=smooth, without_car=outlined))["edge"]["ratio"] > 10
-    assert figures(pair_of(with_car=outlined, without_car=smooth))["edge"]["ratio"] < 0.1
-
-
-def test_without_an_edge_there_is_no_ratio():
-    flat = np.full((HEIGHT, WIDTH, 3), 0.5)
-    found = figures(pair_of(with_car=flat))
-    assert found["edge"]["with_car"] == pytest.approx(0.0, abs=1e-12) and found["edge"]["ratio"] is None
-    json.dumps(found, allow_nan=False)
-
-
-@pytest.mark.parametrize("share", ["all", "left half", "one pixel"])
-def test_figures_of_boxes_of_any_size_are_finite(share):
-    inside = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    inside[{"all": np.s_[:], "left half": np.s_[:, : WIDTH // 2], "one pixel": np.s_[3, 4]}[share]] = True
-    found = figures(pair_of(inside=inside, outside=~inside))
-    json.dumps(found, allow_nan=False)
-    assert found["box"]["pixels"] == inside.sum()
-
-
 def test_a_box_that_fills_the_image_has_no_edge():
     everywhere = np.ones((HEIGHT, WIDTH), dtype=bool)
     found = figures(pair_of(inside=everywhere, outside=~everywhere))
     assert found["edge"]["ratio"] is None
-
-
-def test_the_boundary_of_the_ego_mask_is_no_edge():
-    """Nothing changes but on the ego vehicle, in the rows below 14, which cross the hull's rows 8 to 19."""
-    seen = np.repeat(np.arange(HEIGHT)[:, None] < 14, WIDTH, axis=1)
-    inside = pair_of().inside
-    flat = np.full((HEIGHT, WIDTH, 3), 0.5) + np.linspace(0, 0.1, WIDTH)[None, :, None]
-    on_ego_vehicle = flat.copy()
-    on_ego_vehicle[14:] = 0.9
-    pair = pair_of(with_car=flat, without_car=on_ego_vehicle, inside=inside & seen, outside=~inside & seen)
-    assert figures(pair)["edge"]["ratio"] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("footprint", [True, False])

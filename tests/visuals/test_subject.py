@@ -9,7 +9,7 @@ import pytest
 from helpers.classed import classed
 from helpers.hand_made import recording_of, write_labels
 
-from drivesplat.errors import ConfigError, DatasetError
+from drivesplat.errors import ConfigError
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.rigid import rigid
@@ -126,22 +126,6 @@ def test_the_moving_vehicle_with_the_most_pixels_is_chosen(tiny_scene, actors):
     assert subject.pixels == pytest.approx(counts[found(subject)], abs=2)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_in_random_traffic_the_largest_moving_vehicle_is_chosen(tiny_scene, seed):
-    random = np.random.default_rng(seed)
-    actors = []
-    for i in range(6):
-        place = (*random.uniform([8, -4], [18, 4]), 0.8)
-        velocity = (random.uniform(3.5, 6.0), 0.0) if i % 2 else (0.0, 0.0)
-        actors.append(Actor(f"{i}", place, velocity, size=tuple(random.uniform([3, 1.6, 1.4], [8, 2.5, 3.0]))))
-    scene = with_actors(tiny_scene, *actors)
-    counts = pixels_of(scene, *actors)
-    subject = chosen(scene)
-    assert subject.pixels == pytest.approx(counts[largest(counts, "1", "3", "5")], abs=2)
-    assert subject.pixels == pytest.approx(counts[found(subject)], abs=2)
-    assert subject.box.track_id in ("1", "3", "5")
-
-
 @pytest.mark.parametrize(
     "still",
     [
@@ -163,20 +147,6 @@ def test_a_drive_without_tracks_has_no_subject(tiny_scene):
     assert chosen(with_actors(tiny_scene)) is None
 
 
-def test_nearer_boxes_hide_farther_ones(tiny_scene):
-    van = Actor("van", (6.5, 1.2, 1.1), size=(3.0, 1.0, 2.2), seen=range(1))
-    scene = with_actors(tiny_scene, LEADING, van)
-    alone, counts = pixels_of(scene, LEADING), pixels_of(scene, LEADING, van)
-    assert largest(alone, "leading") == ("leading", 0) and largest(counts, "leading") == ("leading", 1)
-    assert found(chosen(scene)) == ("leading", 1)
-    hidden = chosen(scene, SubjectSettings(key_frame=0))
-    assert 0 < hidden.pixels < 0.8 * alone["leading", 0]
-    frame = scene.frames[0]
-    seconds = (frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6
-    expected = seen_alone(frame, LEADING, seconds) & ~seen_alone(frame, van, seconds)
-    assert (hidden.visible ^ expected).sum() <= 2
-
-
 def ego_vehicle_below(scene: Scene, row: int, folder: Path) -> Path:
     """Masks (108, 192) of which the ego vehicle's body fills the rows from `row` on."""
     labels = np.full((108, WIDTH), LABELS["static"], dtype=np.uint8)
@@ -194,16 +164,6 @@ def test_pixels_of_the_ego_mask_do_not_count(tiny_scene, tmp_path):
     assert not subject.visible[70:].any() and subject.pixels == free.visible[:70].sum()
 
 
-def test_pixels_behind_the_ego_mask_do_not_count_in_the_choice(tiny_scene, tmp_path):
-    """Its hull without hidden pixels is largest elsewhen: it is nearest, but mostly hidden, in the first key frame."""
-    low = dataclasses.replace(LEADING, size=(4.0, 2.0, 1.0), position=(9.0, 0.3, 0.5), velocity=(7.0, 0.0))
-    scene = with_actors(tiny_scene, low)
-    row = int(np.flatnonzero(chosen(scene).visible.any(axis=1)).min()) + 2
-    subject = choose_subject(recorded(scene, masks=ego_vehicle_below(scene, row, tmp_path)), "CAM_FRONT", ANY)
-    assert found(chosen(scene)) == ("leading", 0)
-    assert subject.frame.sample_index > 0 and subject.visible[row:].sum() == 0
-
-
 def test_a_vehicle_completely_behind_the_ego_mask_is_not_chosen(tiny_scene, tmp_path):
     scene = with_actors(tiny_scene, LEADING)
     assert choose_subject(recorded(scene, masks=ego_vehicle_below(scene, 0, tmp_path)), "CAM_FRONT", ANY) is None
@@ -214,51 +174,11 @@ def test_a_completely_hidden_vehicle_is_not_chosen(tiny_scene):
     assert chosen(with_actors(tiny_scene, LEADING, wall)) is None
 
 
-def test_images_between_key_frames_are_ignored(tiny_scene):
-    """Were the best key frame an image between two, the second best would be chosen."""
-    scene = with_actors(tiny_scene, dataclasses.replace(LEADING, velocity=(3.6, 0.0)))
-    best = chosen(scene)
-    frames = [
-        dataclasses.replace(frame, is_key_frame=frame.is_key_frame and frame is not best.frame)
-        for frame in scene.frames
-    ]
-    second = chosen(dataclasses.replace(scene, frames=tuple(frames)))
-    assert second.frame.is_key_frame
-    assert abs(second.frame.sample_index - best.frame.sample_index) == 1
-    assert all(frame.is_key_frame for frame in (best.frame, second.frame))
-
-
-def test_the_index_is_that_of_all_images_of_all_cameras(tiny_scene):
-    scene = with_actors(tiny_scene, LEADING)
-    back = [dataclasses.replace(frame, camera="CAM_BACK") for frame in scene.frames[:3]]
-    both = dataclasses.replace(scene, frames=(*back, *scene.frames[3:]))
-    subject = chosen(both)
-    assert (subject.frame.camera, subject.index) == ("CAM_FRONT", 4)
-    assert both.frames[subject.index] is subject.frame
-    assert chosen(both, camera="CAM_BACK").frame.camera == "CAM_BACK"
-    assert chosen(both, camera="CAM_LEFT") is None
-
-
-def test_pixels_are_those_of_the_training_resolution(tiny_scene):
-    scene = with_actors(tiny_scene, LEADING)
-    small, large = chosen(scene, width=96), chosen(scene, width=192)
-    assert small.visible.shape == (54, 96) and large.visible.shape == (108, 192)
-    assert large.pixels / small.pixels == pytest.approx(4.0, rel=0.1)
-
-
 def test_a_requested_track_is_chosen_at_its_largest_even_if_parked(tiny_scene):
     scene = with_actors(tiny_scene, LEADING, PARKED)
     subject = chosen(scene, SubjectSettings(track="parked"))
     assert found(subject) == largest(pixels_of(scene, LEADING, PARKED), "parked")
     assert subject.label == "parked_other_vehicle"
-
-
-def test_in_a_requested_key_frame_the_largest_vehicle_is_chosen(tiny_scene):
-    scene = with_actors(tiny_scene, LEADING, ONCOMING)
-    counts = pixels_of(scene, LEADING, ONCOMING)
-    for key_frame in (0, 5, 9):
-        then = {key: count for key, count in counts.items() if key[1] == key_frame}
-        assert found(chosen(scene, SubjectSettings(key_frame=key_frame))) == largest(then, "leading", "oncoming")
 
 
 def test_track_and_key_frame_can_be_requested_together(tiny_scene):
@@ -321,21 +241,3 @@ def test_the_record_of_a_subject(tiny_scene, key_frame, split):
         "pixels": subject.pixels,
         "origin": scene.origin.tolist(),
     }
-
-
-def test_the_middle_key_frame_is_that_in_the_middle_of_the_drive(tiny_scene):
-    """Of ten key frames, 0 to 9, the sixth; images between them do not count."""
-    index = tiny_scene.middle_key_frame("CAM_FRONT")
-    assert tiny_scene.frames[index].is_key_frame and tiny_scene.frames[index].sample_index == 5
-    others = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames[:7]]
-    both = dataclasses.replace(tiny_scene, frames=(*others, *tiny_scene.frames[7:]))
-    assert both.frames[both.middle_key_frame("CAM_FRONT")].sample_index == 7
-    assert both.frames[both.middle_key_frame("CAM_BACK")].sample_index == 2
-
-
-@pytest.mark.parametrize("camera", ["CAM_BACK", "CAM_LEFT"])
-def test_a_camera_without_key_frames_is_refused_with_those_that_have_some(tiny_scene, camera):
-    between = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames if not frame.is_key_frame]
-    scene = dataclasses.replace(tiny_scene, frames=(*tiny_scene.frames, *between))
-    with pytest.raises(DatasetError, match=f"{scene.name}.*eval_camera {camera} has no key frame; .* CAM_FRONT$"):
-        scene.middle_key_frame(camera)

@@ -2,15 +2,12 @@
 
 import csv
 import dataclasses
-import itertools
 from collections.abc import Collection
 
 import numpy as np
 import pytest
 from helpers.hand_made import actor_record, recording_of
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
@@ -78,20 +75,6 @@ def test_times_are_those_of_annotations_and_images(recording, tiny_scene):
     assert car.pixels == max(pixels.values()) == pixels[car.key_frame]
 
 
-def test_an_object_that_is_never_visible_has_no_key_frame(tiny_scene):
-    behind = [
-        dataclasses.replace(track, object_to_world=_moved(track, [-500.0, 0.0, 0.0])) for track in tiny_scene.tracks
-    ]
-    rows = rows_of(recording_of(dataclasses.replace(tiny_scene, tracks=tuple(behind))))
-    assert rows and all((row.key_frame, row.pixels, row.seconds_visible) == (None, 0, 0.0) for row in rows)
-
-
-def _moved(track, by) -> np.ndarray:
-    poses = track.object_to_world.copy()
-    poses[:, :3, 3] += by
-    return poses
-
-
 def test_the_table_reads_back(recording, tmp_path):
     rows = rows_of(recording)
     write_tracks(tmp_path / "tracks.csv", rows)
@@ -102,14 +85,6 @@ def test_the_table_reads_back(recording, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ResultError, match=r"file/tracks\.csv"):
         write_tracks(tmp_path / "file" / "tracks.csv", rows)
-
-
-def test_only_moving_objects_are_labelled(recording):
-    rows = rows_of(recording)
-    found = set(texts(drawn(recording)))
-    dynamic_tracks = [row.id for row in rows if row.moves and row.pixels >= 100]
-    assert len(dynamic_tracks) == len(found) == 2
-    assert all(any(name.startswith(label) for name in dynamic_tracks) for label in found)
 
 
 def test_editable_tracks_are_those_of_actors_with_points(recording, tmp_path):
@@ -146,36 +121,6 @@ def test_a_track_that_cannot_be_edited_says_why(actors, walker, car, recording):
     }  # fmt: skip
     ids = [row.id for row in rows.values()]
     assert {row.not_editable for row in track_rows(recording, subjects, ids, actors)} == {""}
-
-
-def test_labels_of_objects_behind_each_other_do_not_cover_each_other(tiny_scene, monkeypatch):
-    """Cars that stand half behind each other, each label drawn at its true size."""
-    car = next(track for track in tiny_scene.tracks if track.category == "vehicle.car")
-    places = [[0.3 * i - 3.0, 0.25 * i, 0.0] for i in range(3)]
-    monkeypatch.setattr("drivesplat.visuals.track_table.MIN_PIXELS", 5)
-    row = [
-        dataclasses.replace(car, id=f"{i}" * 12, object_to_world=_moved(car, place)) for i, place in enumerate(places)
-    ]
-    figure = drawn(recording_of(dataclasses.replace(tiny_scene, tracks=tuple(row))))
-    FigureCanvasAgg(figure).draw()
-    found = 0
-    for axis in figure.axes:
-        boxes = [Text.get_window_extent(text) for text in axis.texts]  # without the lines to the outlines
-        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
-        found = max(found, len(boxes))
-    assert found == 3
-
-
-def test_what_cannot_be_edited_is_outlined_otherwise(recording):
-    car, walker = (row.id for row in sorted(rows_of(recording)[:2], key=lambda row: row.category, reverse=True))
-    figure = drawn(recording, {car})
-    outlines = {patch.get_linestyle() for axis in figure.axes for patch in axis.patches}
-    assert outlines == {"solid", "dashed"} and "dashed: cannot be edited" in figure.get_suptitle()
-    boxes = {text.get_text(): text.get_bbox_patch().get_facecolor() for axis in figure.axes for text in axis.texts}
-    assert boxes[short_ids([car, walker])[car]] != boxes[short_ids([car, walker])[walker]]
-    whole = drawn(recording, {car, walker})
-    assert {patch.get_linestyle() for axis in whole.axes for patch in axis.patches} == {"solid"}
-    assert "dashed" not in whole.get_suptitle()
 
 
 @pytest.mark.parametrize(

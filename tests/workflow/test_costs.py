@@ -13,7 +13,7 @@ from helpers.reports import NO_LOGS, expecting
 from drivesplat.io.storage import write_json
 from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import report_page
-from drivesplat.workflow.costs.measured import JobId, read_costs
+from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.run_costs import COSTS, RunCosts
 from drivesplat.workflow.costs.table import LIMIT_SECONDS, costs_in_words, costs_record, scene_totals, write_costs
 from drivesplat.workflow.plan import Plan
@@ -37,34 +37,6 @@ def trained(results: Path, scene: str, method: str, seconds: float, **more: Any)
     path = results / scene / method / "train.json"
     write_json(path, content | more)
     return path
-
-
-@pytest.mark.parametrize(
-    ("path", "job"),
-    [
-        ("lpips_backbone.tsv", JobId("lpips_backbone")),
-        ("demo_world/demo.tsv", JobId("demo_world", film="demo")),
-        ("0103/extract.tsv", JobId("extract", "0103")),
-        ("0103/metrics.tsv", JobId("scene_metrics", "0103")),
-        ("0103/discovered/actors.tsv", JobId("actors", "0103", film="discovered")),
-        ("0103/street/train.tsv", JobId("train", "0103", "street")),
-        ("0103/street/film_lateral_2m.tsv", JobId("film", "0103", "street", "lateral_2m")),
-        ("0103/street/film_parts.tsv", JobId("film_parts", "0103", "street")),
-        ("0103/street/quad_lane_change.tsv", JobId("quad", "0103", "street", "lane_change")),
-        (
-            "0103/street/drive_folder_edits_stop.tsv",
-            JobId("drive_folder", "0103", "street", "edits_stop"),
-        ),
-        (
-            "0103/street/scan_folder_trajectories_lateral_2m.tsv",
-            JobId("scan_folder", "0103", "street", "trajectories_lateral_2m"),
-        ),
-        ("0103/compare.tsv", JobId("compare", "0103")),
-        ("0103/street/edit_v1.2_stop.tsv", JobId("edit", "0103", "street", "v1.2_stop")),
-    ],
-)
-def test_a_benchmark_file_names_its_job(path, job):
-    assert JobId.of(Path(path)) == job
 
 
 def test_there_is_a_row_for_every_job_that_ran(tmp_path):
@@ -112,14 +84,6 @@ def test_a_scene_is_found_under_90_minutes_or_not(tmp_path, minutes, under):
     assert "<td>yes, so far</td>" in page and "Costs" not in report_page(report, {})
     printed = costs_in_words(costs_record(tmp_path, ["vanilla", "street"]))
     assert f"0103: {minutes}.0 min, {'under' if under else 'not under'} 90" in printed and "so far, under 90" in printed
-
-
-def test_a_resumed_training_counts_whole(tmp_path):
-    """Its benchmark has the last process alone."""
-    benchmark(tmp_path, "0103/street/train", 40.0)
-    trained(tmp_path, "0103", "street", 300.0, resumed_at=[10000])
-    ((cost,), complaints) = read_costs(tmp_path)
-    assert (cost.seconds, cost.seconds_from, cost.max_rss_mb) == (300.0, "train.json", 500.0) and complaints == []
 
 
 def test_what_is_missing_or_garbled_is_named_and_left_out(tmp_path):

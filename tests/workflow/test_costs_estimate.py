@@ -1,7 +1,5 @@
 """An estimate before a run says what has been measured in its results folder, and what has not; time, and disk."""
 
-from types import SimpleNamespace
-
 import pytest
 import yaml
 from helpers import REPOSITORY
@@ -16,11 +14,9 @@ from drivesplat.workflow.costs.estimate import (
     estimate,
     in_full,
     in_one_line,
-    spelled,
     wall_seconds,
 )
 from drivesplat.workflow.costs.measured import Cost, JobId
-from drivesplat.workflow.costs.run_costs import planned_job
 
 DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
 
@@ -43,21 +39,6 @@ def test_the_nearest_that_was_measured_counts():
     found = expectations(*peers, demo).of(JobId("masks", "0061"))
     assert found == (4.0, {JobId("masks", "0103"), JobId("masks", "0553")})
     assert expectations(demo).of(JobId("masks", "0061")) == (None, set()), "another dataset tells nothing"
-
-
-def test_a_training_goes_with_its_iterations():
-    measured = [training("0061", "vanilla", 100.0, 10000), training("0061", "street", 300.0, 15000)]
-    known = expectations(*measured, train={"iterations": 30000})
-    assert known.of(JobId("train", "0103", "vanilla"))[0] == 300.0
-    assert known.of(JobId("train", "0103", "street"))[0] == 600.0
-    more = expectations(measured[0], train={"iterations": 30000}).of(JobId("train", "0103", "street"))
-    assert more == (None, set()), "a method without parts that move tells nothing of one with them"
-
-
-def test_a_synthetic_world_gives_no_estimate_for_others():
-    measured = expectations(Cost(JobId("demo_world", film="demo"), 50.0, ""))
-    assert measured.of(JobId("demo_world", film="demo")) == (50.0, {JobId("demo_world", film="demo")})
-    assert measured.of(JobId("demo_world", film="large")) == (None, set())
 
 
 def test_scenes_and_methods_share_cores_and_gpus():
@@ -90,14 +71,6 @@ def test_an_estimate_says_how_it_knows_and_what_is_not_measured_yet(tmp_path):
     assert in_one_line(estimate([], expectations(), Machine(1, 1), tmp_path)) == "nothing is to be run"
 
 
-def test_the_mean_of_a_stage_is_of_its_measured_jobs(tmp_path):
-    """A film of one method has been measured, of the other neither film nor anything like it."""
-    jobs = [JobId("film", "0103", "street", "original"), JobId("film", "demo", "street", "original")]
-    known = expectations(Cost(JobId("film", "0103", "street", "aside"), 20.0, ""))
-    found = estimate([PlannedJob(job, 1, True) for job in jobs], known, Machine(1, 1), tmp_path)
-    assert found.by_stage == {"film": (2, 20.0)} and (found.jobs, found.known) == (2, 1)
-
-
 def test_disk_is_what_the_same_jobs_left_for_other_scenes(tmp_path):
     for scene, size in (("0103", 1000), ("0553", 3000)):
         folder = tmp_path / scene / "street"
@@ -115,18 +88,6 @@ def test_disk_is_what_the_same_jobs_left_for_other_scenes(tmp_path):
     found = estimate(planned, known, Machine(1, 1), tmp_path)
     assert (found.disk, found.unknown_disk) == (2050.0, 1) and found.free_disk > 0
     assert estimate([], known, Machine(1, 1), tmp_path / "not/there/yet").free_disk > 0
-
-
-@pytest.mark.parametrize(("gpu", "on_gpu"), [(1, True), (0, False), (None, False)])
-def test_on_processors_no_job_waits_for_a_gpu(gpu, on_gpu):
-    resources = {} if gpu is None else {"gpu": gpu}
-    job = SimpleNamespace(threads=2, resources=resources, output=["a.mp4"])
-    assert planned_job(JobId("film", "demo"), job) == PlannedJob(JobId("film", "demo"), 2, on_gpu, ("a.mp4",))
-
-
-@pytest.mark.parametrize(("seconds", "text"), [(45.2, "45 s"), (700.0, "12 min"), (11100.0, "3 h 5 min")])
-def test_time_is_spelled_for_people(seconds, text):
-    assert spelled(seconds) == text
 
 
 @pytest.mark.slow

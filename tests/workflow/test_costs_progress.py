@@ -1,7 +1,6 @@
 """Progress of a run: finished jobs, trainings that log their share, and the expected rest."""
 
 import logging
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,7 +24,6 @@ MASKS, TRAIN, FILM = (
 )
 COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=CONFIG.train.iterations), Cost(FILM, 100.0, "")]
 BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
-ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.workflow.job: street/train 0103 ends\n"
 AT_HALF = "(iteration 3500 of 7000, loss 0.04, 7 min left)"
 LOGGED = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
 
@@ -57,25 +55,6 @@ def test_a_running_training_reports_its_progress(tmp_path):
     assert line == f"50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train {AT_HALF}"
 
 
-def test_a_training_slower_than_expected_takes_as_long_as_it_says(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + at(3500, "1 it/s, 4000 s left"))
-    assert progress(tmp_path, {MASKS}).line(0.0).startswith("50 % of the work, 1 of 3 jobs, about 68 min left")
-
-
-def test_a_training_faster_than_expected_is_no_further_than_it_says(tmp_path):
-    """4 % of 200 s, and the masks' 100, of 400."""
-    (tmp_path / "train.log").write_text(BEGINS + at(280, "99 it/s, 192 s left"))
-    assert progress(tmp_path, {MASKS}).line(0.0).startswith("27 % of the work, 1 of 3 jobs, about 5 min left")
-
-
-def test_a_job_that_says_nothing_is_taken_to_be_as_far_as_expected(tmp_path):
-    (tmp_path / "film.log").write_text(BEGINS)
-    looked = progress(tmp_path, {MASKS, TRAIN})
-    assert looked.line(1000.0).startswith("90 % of the work")
-    assert looked.line(1060.0) == "96 % of the work, 2 of 3 jobs, about 40 s left; at work: 0103 street film original"
-    assert "about 0 s left" in looked.line(2000.0)
-
-
 def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
     """A running training says how long it still takes."""
     alone = progress(tmp_path, {MASKS}, costs=COSTS[:1])
@@ -83,22 +62,6 @@ def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
     (tmp_path / "train.log").write_text(BEGINS + at(3500, "18.8 it/s, 400 s left"))
     line = alone.line(0.0)
     assert line == f"1 of 3 jobs, about 7 min and 1 job not measured yet left; at work: 0103 street train {AT_HALF}"
-
-
-def test_a_job_that_has_ended_is_done_before_it_is_counted(tmp_path):
-    """Snakemake looks for outputs, and at other jobs, before it counts one."""
-    (tmp_path / "train.log").write_text(BEGINS + at(6930, "18.8 it/s, 8 s left") + ENDS)
-    assert progress(tmp_path, {MASKS}).line(0.0) == "90 % of the work, 1 of 3 jobs, about 2 min left"
-
-
-def test_a_log_without_a_beginning_gives_no_times(tmp_path):
-    (tmp_path / "train.log").write_text("")
-    assert progress(tmp_path, {MASKS}).line(0.0).startswith("10 % of the work, 1 of 3 jobs, about 15 min left")
-
-
-def test_logs_of_earlier_runs_are_not_running_jobs(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + at(3500, "18.8 it/s, 400 s left"))
-    assert "at work" not in progress(tmp_path, {MASKS}, began=time.time() + 60).line(0.0)
 
 
 def test_a_training_that_began_shows_its_iteration_and_loss(tmp_path):

@@ -8,7 +8,7 @@ from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.settings.config import merged
 
-pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("demo_workflow")]
+pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("demo_workflow")]
 
 TARGET = "results/demo/metrics.json"
 AFTER_THE_WORLD = {
@@ -107,7 +107,6 @@ def test_without_a_target_the_demo_stays_out(finished):
     assert "results/0001/metrics.json" in done.stdout and "results/demo" not in done.stdout
 
 
-@pytest.mark.slow
 def test_a_recorded_drive_is_still_refused_without_a_gpu(finished):
     done = finished.run("results/0001/vanilla/checkpoint.npz")
     assert done.returncode != 0

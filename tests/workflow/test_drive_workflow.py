@@ -65,7 +65,9 @@ def test_a_changed_drive_json_reruns_its_scene_and_a_fault_stops_it_in_a_line(co
     assert "drive.json: version is 2" in line, line
 
 
-@pytest.mark.parametrize("flags", [("-n",), ("-n", "--quiet", "all"), ()], ids=" ".join)
+@pytest.mark.parametrize(
+    "flags", [("-n",), pytest.param(("-n", "--quiet", "all"), marks=pytest.mark.slow), ()], ids=" ".join
+)
 def test_a_drive_that_is_unfit_for_the_settings_is_refused_before_any_job(copy, flags, tmp_path):
     config = copy.config
     copy.config = {**config, "holdout": {"last_block": 10}, "results_dir": "other"}

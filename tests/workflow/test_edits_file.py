@@ -1,7 +1,5 @@
 """Edits files: what is read, what travels as a rule's parameter, and what each mistake is answered with."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -83,12 +81,6 @@ def test_an_edit_survives_its_travel_as_a_rules_parameter(tmp_path):
     assert canonical_json(edit.steps[0].model_dump(mode="json")) == '{"remove":{"track":"6e5c"}}'
 
 
-def test_reading_edits_imports_nothing_heavy():
-    code = "import sys, drivesplat.workflow.edits_file as _; print(' '.join(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
-    assert not {"torch", "scipy", "matplotlib", "nuscenes"} & set(done.stdout.split())
-
-
 def test_a_missing_file_is_reported_as_missing(tmp_path):
     with pytest.raises(
         ConfigError, match=r"nowhere\.yaml: the edits file cannot be read \(No such file or directory\)"
@@ -150,54 +142,28 @@ def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, expected):
     [
         ("remove", "", "'track' is missing; there are: track"),
         ("remove", "track: 75", "'track' is 75: an id is text: put it in quotes as it stands in tracks.csv"),
-        ("remove", "track: ''", "'track' is '': string should have at least 1 character"),
         ("remove", "track: x, trak: x", "unknown key 'trak'; there are: track"),
         ("speed", "track: x", "give either 'factor' or 'to' (m/s)"),
-        ("speed", "track: x, factor: 2, to: 3", "give either 'factor' or 'to' (m/s)"),
-        ("speed", "track: x, factor: 0", "'factor' is 0: input should be greater than 0"),
-        ("speed", "track: x, to: -3", "'to' is -3: input should be greater than 0"),
         ("speed", "track: x, to: 1e1",
          "'to' is '1e1': input should be a number (YAML reads 1e-3 as text: write 1.0e-3)"),
         ("speed", "track: x, to: 3, duration: 2", "'duration' without 'start': say at which second the change begins"),
-        ("speed", "track: x, to: 3, start: 1, duration: -2",
-         "'duration' is -2: input should be greater than or equal to 0"),
-        ("speed", "track: x, to: 3, start: -1", "'start' is -1: input should be greater than or equal to 0"),
         ("stop", "track: x", "'at' is missing; there are: track, at, duration"),
-        ("stop", "track: x, at: 1, duration: -1", "'duration' is -1: input should be greater than or equal to 0"),
         ("stop", "track: x, at: .nan", "'at' is nan: input should be a finite number"),
         ("reverse", "track: x, turn: 1", "'turn' is 1: input should be true or false"),
         ("shift", "track: x", "give at least one of 'lateral', 'longitudinal' and 'yaw'"),
         ("shift", "track: x, lateral: 51", "'lateral' is 51: input should be less than or equal to 50"),
-        ("swap", "track: x", "'with' is missing; there are: track, with"),
-        ("duplicate", "track: x", "'as' is missing; there are: track, as, longitudinal, lateral, delay, phase"),
         ("duplicate", "track: x, as: a/b", f"'as' 'a/b' {NAME}"),
         ("duplicate", "track: x, as: ego", "'as' 'ego' is a name kept for the camera's car; choose another"),
-        ("place", "track: x, as: y", "'path' is missing; there are: track, as, path, yaw, phase"),
         ("place", "track: x, as: y, path: [[0, 1]]", "'path.0.2' is missing; there are: track, as, path, yaw, phase"),
         ("place", "track: x, as: y, path: []", "give at least one point in 'path'"),
         ("place", "track: x, as: y, path: [[1, 0, 0], [1, 5, 0]]",
          "the seconds of 'path' must increase from point to point"),
-        ("place", "track: x, as: y, path: [[0, 0, 0], [2, 5, 0], [1, 9, 0]]",
-         "the seconds of 'path' must increase from point to point"),
-        ("place", "track: x, as: y, path: [[0, 501, 0]]",
-         "'path.0.1' is 501: input should be less than or equal to 500"),
-        ("place", "track: x, as: ego, path: [[0, 5, 0]]",
-         "'as' 'ego' is a name kept for the camera's car; choose another"),
-        ("place", "track: x, as: a/b, path: [[0, 5, 0]]", f"'as' 'a/b' {NAME}"),
-        ("rescale", "track: x, factor: 0.01", "'factor' is 0.01: input should be greater than or equal to 0.1"),
         ("recolour", "track: x", f"give {COLOURS}, other than 0, 1 and 1"),
-        ("recolour", "track: x, hue: 360", f"give {COLOURS}, other than 0, 1 and 1"),
-        ("recolour", "track: x, hue: 400", "'hue' is 400: input should be less than or equal to 360"),
-        ("recolour", "track: x, saturation: -1", "'saturation' is -1: input should be greater than or equal to 0"),
         ("recolour", "track: x, colour: red, hue: 10",
          "'colour' replaces hue and saturation: give it alone, or with 'value'"),
         ("recolour", "track: x, colour: rouge", "'colour' is 'rouge': no colour has this name; give a CSS name, "
          "'#rrggbb' in quotes, or [red, green, blue] from 0 to 1"),
-        ("recolour", "track: x, colour: [255, 0, 0]", "'colour.0' is 255: input should be less than or equal to 1"),
-        ("recolour", "track: x, color: red",
-         "unknown key 'color'; there are: track, hue, saturation, value, colour"),
         ("ego", "", "give 'lateral', or a 'speed' other than 1"),
-        ("ego", "speed: -1", "'speed' is -1: input should be greater than or equal to 0"),
     ],
 )  # fmt: skip
 def test_a_step_with_other_fields_is_refused_by_its_number_and_kind(tmp_path, kind, fields, expected):
@@ -217,11 +183,6 @@ def test_a_colour_is_a_name_a_number_or_three_shares(tmp_path, colour):
     assert step.change.colour == (178 / 255, 34 / 255, 34 / 255)
 
 
-def test_yaml_merges_stay_possible(tmp_path):
-    text = "edits:\n  a:\n  - stop: &s {track: x, at: 1}\n  - stop: {<<: *s, at: 2}\n"
-    assert [step.change.at for step in read(text, tmp_path)["a"].steps] == [1.0, 2.0]
-
-
 @pytest.fixture(scope="module")
 def demo_actors() -> list[EditedActor]:
     """The dynamic objects of the demo's drive, at all its key frames."""
@@ -236,6 +197,7 @@ def demo_actors() -> list[EditedActor]:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_demos_edits_name_what_is_there_and_use_every_step(demo_actors):
     edits = read_edits(DEMO)
     assert {step.kind for edit in edits.values() for step in edit.steps} == set(Step.model_fields)

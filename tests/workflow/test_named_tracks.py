@@ -49,16 +49,6 @@ def test_a_run_uses_the_tracks_of_its_targets(config, targets, edits, subject):
     assert track_references(config, "0002", targets).edits == ()
 
 
-def test_copies_of_an_edit_are_no_tracks(config):
-    references = track_references(config, "0001")
-    named = [(one.edit, one.step, one.track) for one in references.edits]
-    assert named == [
-        ("gone", "step 1 (remove)", "aa"),
-        ("more", "step 1 (duplicate)", "bb"),
-        ("more", "step 2 (swap)", "cc"),
-    ]
-
-
 def test_jobs_know_the_targets_of_the_main_process(monkeypatch):
     monkeypatch.setenv(named_tracks.TARGETS, "unset")
     monkeypatch.delenv(named_tracks.TARGETS)

@@ -34,35 +34,10 @@ def test_a_setting_that_a_method_overrides_is_reported_for_that_method():
     assert sentences([("0061", "vanilla")], train={"depth_weight": 0.5}) == []
 
 
-@pytest.mark.parametrize("dataset", [{"iterations": 3000}, {"iterations": 3000, "cap_max": 500_000}])
-def test_a_setting_given_where_it_applies_is_not_reported(dataset):
-    overrides = {"datasets": {"demo": {"overrides": {"train": dataset}}}}
-    assert sentences(DEMO, train={"iterations": 3000}, **overrides) == []
-
-
-def test_a_setting_overridden_by_dataset_and_method_is_reported_for_both():
-    overrides = {"methods": {"vanilla": {"overrides": {"train": {"iterations": 500}}}}}
-    found = sentences(DEMO, train={"iterations": 3000}, **overrides)
-    assert [line.rsplit(" ", 1)[1] for line in found] == ["800", "500"], "the demo's, and that method's"
-
-
 def test_variants_of_an_ablation_differ_on_purpose():
     config = load(merged(DEFAULTS, {"sky": "none"}))
     variants = [("0061", name) for name in config.ablated]
     assert variants and without_effect(config, variants) == []
-
-
-def test_scenes_that_are_not_configured_and_jobs_of_no_scene_are_passed_over():
-    assert sentences([("", ""), ("9999", "street")], train={"iterations": 3000}) == []
-
-
-@pytest.mark.workflow
-def test_a_run_reports_it_before_its_estimate(tmp_path):
-    copy = WorkflowCopy.make(tmp_path / "workflow", methods={"vanilla": {"overrides": {"train": {"iterations": 7}}}})
-    asked = copy.run("estimate")
-    lines = [line for line in asked.stdout.splitlines() if line.startswith("drivesplat: ")]
-    assert lines[0].startswith("drivesplat: train.iterations: 60 does not hold for method vanilla"), asked.stdout
-    assert " jobs, time not measured yet, " in lines[1]
 
 
 @pytest.mark.slow

@@ -10,14 +10,12 @@ from typing import Any
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.readers.datasets import layout
+from drivesplat.errors import ConfigError
 from drivesplat.settings.config import load
 from drivesplat.settings.report import HELD_OUT_PAIR, LIDAR_LOOKS, PICTURES
 from drivesplat.workflow import inputs
-from drivesplat.workflow.named_tracks import track_references
 from drivesplat.workflow.plan import Plan
-from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, TRAINING_INPUTS, refines_poses, stage_settings
+from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, refines_poses, stage_settings
 
 ACTORS = ["background", "actors"]
 DRIFTING = ["background", "drifting"]
@@ -55,12 +53,6 @@ def test_actors_are_an_input_of_methods_with_that_part_alone():
     made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
     assert taken(made, "a1", "mine") == ["elsewhere/a1/actors.npz"]
     assert taken(made, "b1", "mine") == ["elsewhere/b1/actors.npz"]
-    assert taken(made, "a1", "vanilla") == []
-
-
-def test_depth_is_an_input_of_trainings_supervised_with_it():
-    made = plan(methods={"vanilla": {}, "held": {"overrides": HELD}})
-    assert taken(made, "a1", "held") == ["elsewhere/a1/lidar_depth.npz"]
     assert taken(made, "a1", "vanilla") == []
 
 
@@ -137,15 +129,6 @@ def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_th
     assert plan(**settings).triangulated(SimpleNamespace(scene="a1")) == taken
 
 
-def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
-    made = plan(methods={"vanilla": {}}, b=REFINED)
-    expected = json.loads(made.report([]).settings())["expected"]
-    assert {name for name in expected["a1"] if "/" not in name} == set(SCENE_STAGES)
-    assert {name for name in expected["b1"] if "/" not in name} == set(ALL_SCENE_STAGES)
-    assert expected["b1"]["refine_poses"]["code"] == made.code("refine_poses")
-    assert expected["b1"]["refine_poses"]["settings"]["refine_poses"]["enabled"] is True
-
-
 def test_the_refinement_gets_only_the_settings_that_determine_it():
     job = stage_record("refine_poses", random_seed=3, refine_poses={"rounds": 5})
     assert job.keys() == {"refine_poses", "random_seed", "lidar"} and job["lidar"] is None
@@ -188,23 +171,11 @@ def test_each_stage_gets_the_settings_that_determine_it():
     assert depth["ray_spacing"] == [0.2, 0.4] and stage_record("evaluate", **values)["lidar"] == depth
 
 
-def test_a_dataset_may_set_its_actors_for_itself():
-    overrides = {"datasets": {"nuscenes": {"overrides": {"actors": {"min_points": 9}}}}}
-    assert stage_record("actors", **overrides)["actors"]["min_points"] == 9
-
-
 def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
     made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
     of_scene = {*SCENE_STAGES} - {"scene_metrics"}
     assert made.evaluation_stages("a1", ["vanilla"]).keys() == {*of_scene, "vanilla/train", "vanilla/evaluate"}
     assert made.evaluation_stages("a1", ["mine"]).keys() == {*of_scene, "actors", "mine/train", "mine/evaluate"}
-
-
-def test_baselines_of_scans_are_measured_where_a_method_renders_lidar():
-    made = plan(b=LIDAR)
-    found = {scene: made.scan_baselines(SimpleNamespace(scene=scene)) for scene in ("a1", "b1")}
-    assert found == {"a1": [], "b1": ["elsewhere/b1/scan_baselines.json"]}
-    assert "scan_baselines" not in made.evaluation_stages("b1", ["vanilla"]), "no eval.json depends on them"
 
 
 def test_pictures_of_scans_are_those_of_methods_that_render_lidar():
@@ -235,16 +206,6 @@ def test_films_of_scans_are_those_of_methods_that_render_lidar_and_can_be_left_o
         none.refuse_unknown(["elsewhere/a1/vanilla/lidar.mp4"])
 
 
-def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
-    made = plan(render={"trajectories": {"original": {}, "objects": {"parts": "moving"}}})
-    films = {path.split("/", 2)[2] for path in made.films()}
-    assert {"vanilla/original.mp4", "street/objects.mp4", "street/parts.mp4"} < films
-    assert not {"vanilla/objects.mp4", "vanilla/parts.mp4"} & films
-    made.refuse_unknown(["elsewhere/a1/street/objects.mp4", "elsewhere/a1/street/objects.cameras.json"])
-    with pytest.raises(ConfigError, match=r"method 'vanilla' has no moving parts .* those do: street"):
-        made.refuse_unknown(["elsewhere/a1/vanilla/objects.mp4"])
-
-
 def test_a_method_that_moves_without_objects_has_films_of_its_parts_but_no_actors_and_no_edits(tmp_path):
     edits = tmp_path / "edits.yaml"
     edits.write_text("edits: {gone: [remove: {track: a}]}")
@@ -262,23 +223,6 @@ def test_a_method_that_moves_without_objects_has_films_of_its_parts_but_no_actor
         made.refuse_unknown(["elsewhere/a1/drifting/edits/gone.mp4"])
     pages = {name: json.loads(made.stage_settings("export_viewer", "a1", name)) for name in ("drifting", "mine")}
     assert not pages["drifting"]["edits"] and list(pages["mine"]["edits"]) == ["gone"]
-
-
-def test_a_method_that_moves_without_objects_is_not_the_static_reference_of_the_report():
-    made = plan(methods={"drifting": {"parts": DRIFTING}, "vanilla": {}})
-    assert json.loads(made.report([]).settings())["reference"] == "vanilla"
-
-
-def test_tracks_that_edits_name_do_not_matter_to_methods_that_cannot_be_edited(tmp_path):
-    edits = tmp_path / "edits.yaml"
-    edits.write_text("edits: {gone: [remove: {track: a}]}")
-    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
-
-    def edited(parts: list[str]) -> int:
-        made = plan(methods={"it": {"parts": parts}}, datasets={"a": dataset})
-        return len(track_references(made.config, "a1").edits)
-
-    assert (edited(DRIFTING), edited(ACTORS)) == (0, 1)
 
 
 def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(tmp_path):
@@ -324,21 +268,6 @@ def test_scans_are_of_edits_and_trajectories_of_methods_that_render_lidar(tmp_pa
         with pytest.raises(ConfigError, match=message) as refused:
             made.refuse_unknown([f"elsewhere/a1/{target}"])
         assert "\n" not in str(refused.value)
-
-
-def test_settings_of_scans_name_the_edit_or_the_trajectory_and_the_formats():
-    made = plan(export={"scan_formats": ["pcd.bin", "npz", "npz"]})
-    settings = json.loads(made.stage_settings("scan_folder", "a1", "vanilla", "trajectories/lateral_2m"))
-    assert settings["formats"] == ["pcd.bin", "npz"] and settings["edit"] is None
-    assert settings["trajectory"]["lateral"] == 2.0
-    with pytest.raises(ConfigError, match="scan_formats"):
-        plan(export={"scan_formats": []})
-
-
-def test_the_film_of_all_methods_is_left_out_where_the_settings_say_so_and_can_be_asked_for():
-    made = plan(b={"render": {"compare": False}})
-    assert [path for path in made.films() if "compare" in path] == [f"elsewhere/{s}/compare.mp4" for s in ("a1", "a2")]
-    made.refuse_unknown(["elsewhere/b1/compare.mp4"])
 
 
 # ---- the report across scenes
@@ -427,16 +356,6 @@ def test_a_dataset_that_moves_keeps_its_root_in_results(tiny_root, tmp_path, mon
     assert root("moved") == "moved", "on a disk without links"
 
 
-def test_a_world_has_one_spelling_of_its_root(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for dataroot in ("resources/w", "./resources/w/", str(tmp_path / "resources/w")):
-        world = {"w": {"dataroot": dataroot, "scenes": ["w"], "world": {}}}
-        made = Plan({"datasets": world}, str(REPOSITORY))
-        assert made.root(SimpleNamespace(scene="w")) == "resources/w" and made.truth_file("w").startswith(
-            "resources/w/"
-        )
-
-
 # ---- cameras
 
 
@@ -471,13 +390,6 @@ def test_a_points_file_that_is_a_pipe_or_a_folder_is_refused(tiny_root, tmp_path
         made.refuse_absent_data([f"{tmp_path}/out/0001/metrics.json"])
 
 
-def test_a_damaged_table_of_sensors_is_named(tmp_path):
-    (tmp_path / "v1.0-mini").mkdir()
-    (tmp_path / "v1.0-mini/sensor.json").write_text("[{]")
-    with pytest.raises(DatasetError, match=r"sensor\.json cannot be read"):
-        layout("nuscenes").camera_names(tmp_path, "v1.0-mini")
-
-
 # ---- targets
 
 
@@ -499,16 +411,6 @@ EVERY_METHOD = ("", "street", "vanilla")
 def test_targets_concern_these_scenes_and_methods(targets, scenes, methods):
     expected = {(scene, method) for scene in scenes for method in methods}
     assert plan().scenes_and_methods(targets) == expected
-
-
-def test_scans_get_the_holdout_and_what_holds_for_all_lidar():
-    record = stage_record(
-        "scans", scans={"azimuth_steps": 90}, lidar_seed={"own_car_radius": 3.0, "on_missing": "warn"}
-    )
-    assert (record["scans"]["azimuth_steps"], record["own_car_radius"], record["on_missing"]) == (90, 3.0, "warn")
-    assert record["holdout"]["every_nth"] == 8 and record["scans"]["spin"] == "dataset"
-    spin = {"revolution_s": 0.1, "start_azimuth_deg": 180.0}
-    assert stage_record("scans", scans={"spin": spin})["scans"]["spin"] == {**spin, "clockwise": True, "timestamp": 1.0}
 
 
 def test_a_film_beside_the_truth_is_refused_for_a_recorded_drive():

@@ -10,7 +10,7 @@ from helpers import REPOSITORY
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import load
-from drivesplat.workflow.named_tracks import edits_left_out, refuse_wrong_tracks, track_references
+from drivesplat.workflow.named_tracks import edits_left_out, refuse_wrong_tracks
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import stage_settings
 
@@ -69,12 +69,6 @@ def test_stages_of_a_scene_read_the_record_of_the_folder_that_they_write_to():
         assert made.discovered(job) == (["r/a1/discovered.json"] if folder == "discovered/" else [])
 
 
-def test_refined_poses_are_those_of_all_tracks():
-    made = plan(refine_poses={"enabled": True})
-    assert made.annotated_scene(at()) == made.scene(at("street")) == "r/a1/scene_refined.json"
-    assert made.scene(at("found")) == "r/a1/discovered/scene.json"
-
-
 def test_all_methods_are_measured_with_annotated_tracks():
     made = plan()
     for method in METHODS:
@@ -98,11 +92,6 @@ def test_pictures_show_the_tracks_of_the_method_and_annotated_ones_without_any()
     assert plan(methods={"found": METHODS["found"]}).looks()[0] == "r/a1/discovered/tracks.png"
 
 
-def test_the_film_of_all_methods_reads_the_record_of_the_first():
-    assert plan().first_parser(at()) == "r/a1/parser.npz"
-    assert plan(methods={"found": METHODS["found"]}).first_parser(at()) == "r/a1/discovered/parser.npz"
-
-
 OF_TRACKS = {"found": {"scans", "discover", "relabel", "regions"}, "blind": {"relabel", "regions"}}
 
 
@@ -114,11 +103,6 @@ def test_a_report_expects_the_stages_that_give_a_method_its_tracks(method):
     assert {name for name in stages if name in ours} == OF_TRACKS.get(method, set())
 
 
-def test_a_scene_without_cameras_has_no_regions():
-    stages = plan(methods={"found": METHODS["found"]}).metrics_stages("b1")
-    assert {"scans", "discover", "relabel", "scan_baselines"} < stages.keys() and "regions" not in stages
-
-
 def test_targets_in_the_folders_of_tracks_are_known():
     made = plan()
     made.refuse_unknown(["r/a1/discovered/tracks.csv", "r/a1/unlabelled/seed.ply", "r/b1/discovered/actors.npz"])
@@ -126,11 +110,6 @@ def test_targets_in_the_folders_of_tracks_are_known():
         made.refuse_unknown(["r/b1/discovered/seed.ply"])
     with pytest.raises(ConfigError, match="method 'discover' is not in the config"):
         made.refuse_unknown(["r/a1/discover/seed.ply"])
-
-
-def test_variants_of_an_ablation_have_the_tracks_of_the_method():
-    made = plan(ablation={"of": "found", "seeds": [0]})
-    assert {method.tracks for method in made.config.ablated.values()} == {"discovered"}
 
 
 def test_actors_without_tracks_are_refused():
@@ -175,15 +154,6 @@ def test_an_edit_of_other_tracks_is_refused_with_the_methods_that_have_them(edit
         with pytest.raises(ConfigError) as refused:
             made.refuse_unknown([f"r/a1/{target}"])
         assert all(word in str(refused.value) for word in words) and "\n" not in str(refused.value), refused.value
-
-
-def test_named_tracks_are_compared_with_the_record_that_has_them(edited):
-    config = plan(**edited, subjects={"a1": {"track": "found_0003"}}).config
-    names = {}
-    for tracks in ("annotated", "discovered"):
-        found = track_references(config, "a1", tracks=tracks)
-        names[tracks] = ([reference.track for reference in found.edits], found.subject)
-    assert names == {"annotated": (["aa"], None), "discovered": (["found_0001"], "found_0003")}
 
 
 def job_of(rule: str, output: str = "", **wildcards: str) -> SimpleNamespace:

@@ -9,11 +9,9 @@ from helpers import REPOSITORY
 
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.settings.config import load
-from drivesplat.settings.world import WorldJob
 from drivesplat.workflow.plan import Plan
-from drivesplat.workflow.stages import TRAINING_INPUTS, refines_poses, stage_settings
+from drivesplat.workflow.stages import TRAINING_INPUTS, stage_settings
 from drivesplat.workflow.without_cameras import CAMERA_STAGES, methods_left_out, require_methods
-from drivesplat.world.optics.rig import recording_sensors
 
 ALONE = {"cameras": [], "eval_camera": None}
 METHODS = {
@@ -75,31 +73,17 @@ def test_the_report_expects_its_own_stages():
     assert "with_lidar/evaluate_scans" not in expected["a1"] and "street/evaluate" in expected["a1"]
 
 
-def test_its_poses_are_not_refined_from_images_that_it_lacks():
-    config = load(settings(refine_poses={"enabled": True}))
-    assert refines_poses(config, "a1") and not refines_poses(config, "a2")
-
-
 @pytest.mark.parametrize(
     ("target", "words"),
     [
         ("vanilla/eval.json", "and method 'vanilla' renders images alone; those that render LiDAR: with_lidar"),
-        ("street/checkpoint.npz", "and method 'street' renders images alone"),
         ("with_lidar/original.mp4", ": with_lidar/original.mp4 needs images; docs/lidar.md"),
-        ("with_lidar/parts.mp4", ": with_lidar/parts.mp4 needs images"),
-        ("with_lidar/original.cameras.json", ": with_lidar/original.cameras.json needs images"),
         ("with_lidar/ghost_panel.png", ": with_lidar/ghost_panel.png needs images"),
-        ("with_lidar/removal.png", ": with_lidar/removal.png needs images"),
-        ("with_lidar/held_out_rendered.png", ": with_lidar/held_out_rendered.png needs images"),
-        ("with_lidar/edits/away.mp4", ": with_lidar/edits/away.mp4 needs images"),
-        ("with_lidar/quad/away.mp4", ": with_lidar/quad/away.mp4 needs images"),
         ("with_lidar/edits/away/scans/scans.json", ": with_lidar/edits/away/scans/scans.json needs images"),
         ("with_lidar/trajectories/original/drive/drive.json", "drive.json needs images"),
         ("with_lidar/splat.ply", ": with_lidar/splat.ply needs images"),
-        ("with_lidar/colmap/images.txt", "images.txt needs images"),
         ("masks/masks.json", ": masks/masks.json needs images"),
         ("seed.ply", ": seed.ply needs images"),
-        ("compare.mp4", ": compare.mp4 needs images"),
         ("ablation.csv", ": ablation.csv needs images"),
     ],
 )
@@ -161,16 +145,3 @@ def test_a_camera_of_a_dataset_without_any_is_refused_with_the_remedy(tmp_path):
     gone = {**mine, "dataroot": str(tmp_path / "gone"), "overrides": ALONE}
     with pytest.raises(DatasetError, match="drive folder not found"):
         Plan({"datasets": {"m": gone}, **values}, str(REPOSITORY)).refuse_absent_data([])
-
-
-def test_a_synthetic_world_without_cameras_records_lidar_alone():
-    world = {"dataroot": "resources/w", "scenes": ["w"], "world": {}, "overrides": ALONE}
-    made = Plan({"datasets": {"w": world}, "methods": METHODS, "results_dir": "there"}, str(REPOSITORY))
-    settings = WorldJob.model_validate_json(made.world_settings("w"))
-    assert [sensor.channel for sensor in recording_sensors(settings.world)] == ["LIDAR_TOP"]
-
-
-def test_an_evaluated_camera_without_cameras_is_refused_and_the_default_is_none():
-    assert load({"cameras": []}).cameras == ()
-    with pytest.raises(ConfigError, match=r"eval_camera CAM_BACK is set, but cameras is empty.*eval_camera: null"):
-        load({"cameras": [], "eval_camera": "CAM_BACK"})

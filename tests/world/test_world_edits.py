@@ -179,6 +179,7 @@ def test_a_vehicle_placed_inside_a_parked_one_is_refused():
     assert said == "scene demo, edit 'odd', step 1 (place): 'new' is inside parked 0 at 0.0 s; choose another path"
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_drives_into_a_wall_is_refused_with_the_second():
     steps = {"shift": {"track": AHEAD, "lateral": 0.2}}, placed([[0.0, 20.0, 3.5], [4.0, 40.0, 16.0]])
     said = refusal({"parked": 0, "pedestrians": 0}, odd=edit_of(*steps))
@@ -189,6 +190,7 @@ def test_a_vehicle_that_drives_into_a_wall_is_refused_with_the_second():
     assert 1.0 < float(said.split(" at ")[1].split(" s;")[0]) < 4.0
 
 
+@pytest.mark.slow
 def test_a_vehicle_on_the_free_road_is_accepted_and_one_that_is_removed_again_too():
     clear = edit_of(placed([[0.0, 60.0, 3.5]]), {"remove": {"track": ONCOMING}})
     gone = edit_of(placed([[0.0, 30.0, 14.0]]), {"remove": {"track": "new"}})

@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-import trimesh
 from helpers.demo_worlds import FRONT, LIDAR, meshes_at, named, names_of, pose_at, recorder_of
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from drivesplat.settings.world import WorldLidarSettings
 from drivesplat.world.optics.lidar import MAX_RANGE, ScanPattern, StreetScan, scan, scan_pattern
@@ -47,16 +45,6 @@ def rays_of(recorder: Recorder, step: int, left: float = 0.0) -> tuple[float, np
     return seconds, origin, local @ pose[:3, :3].T
 
 
-def first_hits(triangles: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Distances (n,) to the first of `triangles` (f, 3, 3), by Embree through trimesh; infinite without one."""
-    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
-    origins = np.tile(origin, (len(directions), 1))
-    points, rays, _ = RayMeshIntersector(mesh).intersects_location(origins, directions, multiple_hits=False)
-    distance = np.full(len(directions), np.inf)
-    distance[rays] = np.linalg.norm(points - origin, axis=1)
-    return distance
-
-
 def by_hand(triangles: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
     """The distance to the first of `triangles` (f, 3, 3): Moeller and Trumbore (1997), in float64."""
     a, b, c = np.moveaxis(triangles, 1, 0)
@@ -68,40 +56,6 @@ def by_hand(triangles: np.ndarray, origin: np.ndarray, direction: np.ndarray) ->
         v, distance = (q @ direction) / determinant, ((c - a) * q).sum(axis=1) / determinant
     hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0)
     return float(distance[hit].min(initial=np.inf))
-
-
-def steps_of(recorder: Recorder, found: StreetScan) -> np.ndarray:
-    """Steps all round, and some of those that hit each moving object."""
-    steps = set(range(0, found.range.shape[1], 150))
-    for number, item in enumerate(recorder.objects):
-        if item.moves:
-            steps |= set(np.unique(np.nonzero(found.object == number)[1])[1::40].tolist())
-    return np.array(sorted(steps))
-
-
-@pytest.mark.slow
-def test_ranges_are_those_of_meshes_posed_at_each_rays_own_time(recorder, found):
-    static = np.concatenate([meshes_at(item, 0.0) for item in recorder.objects if not item.moves])
-    standing = RayMeshIntersector(
-        trimesh.Trimesh(static.reshape(-1, 3), np.arange(3 * len(static)).reshape(-1, 3), process=False)
-    )
-    moving = [item for item in recorder.objects if item.moves]
-    errors, missed, hit = [], 0, set()
-    for step in steps_of(recorder, found):
-        seconds, origin, directions = rays_of(recorder, int(step))
-        expected = first_hits(np.concatenate([meshes_at(item, seconds) for item in moving]), origin, directions)
-        points, rays, _ = standing.intersects_location(np.tile(origin, (len(directions), 1)), directions, False)
-        expected[rays] = np.minimum(expected[rays], np.linalg.norm(points - origin, axis=1))
-        both = np.isfinite(expected) & np.isfinite(found.range[:, step])
-        missed += int((np.isfinite(expected) != np.isfinite(found.range[:, step])).sum())
-        errors.append(np.abs(expected[both] - found.range[both, step]))
-        hit |= set(found.object[:, step].tolist())
-    error = np.concatenate(errors)
-    far = error > 1e-3  # a ray that grazes an edge may fall on either side of it
-    print(f"{len(error)} rays, greatest error of the others {error[~far].max():.6f} m, {far.sum()} at edges, {missed}")
-    assert len(error) > 500 and far.sum() + missed <= 3e-3 * len(error)
-    seen = {recorder.objects[number].name.split()[0] for number in hit if number >= 0}
-    assert {"scenery", "vehicle", "pedestrian"} <= seen
 
 
 def not_ego(item: StreetObject, left: float) -> bool:
@@ -200,28 +154,6 @@ def test_grazing_rays_return_less_than_steep_ones():
     steep, flat = cosine > 0.2, (cosine < 0.15) & (cosine > 0.05)
     assert reflectivity[flat].mean() == pytest.approx(reflectivity[steep].mean(), rel=0.1), "Lambert's cosine law"
     assert found.returned[hit][steep].all() and not found.returned[hit & (found.range > 60.0)].any()
-
-
-def test_glass_returns_at_normal_incidence_alone():
-    glass, plain = (scanned(wall(material)) for material in (Material.GLASS, Material.PLAIN))
-    hit = np.isfinite(plain.range)
-    with np.errstate(invalid="ignore"):
-        cosine = np.where(hit, 10.0 / plain.range, 0.0)
-    frontal, oblique = cosine > 0.99, hit & (cosine < 0.8) & (cosine > 0.2)
-    assert glass.intensity[frontal].mean() > 0.3
-    assert glass.intensity[oblique].max() < 0.03 < 0.1 * plain.intensity[frontal].mean() + 0.02
-    assert plain.returned[oblique].all() and 0.02 < (~glass.returned[oblique]).mean() < 0.5
-
-
-def test_a_wet_road_returns_less_than_a_dry_one_and_nothing_else_changes():
-    dry, wet = (scanned(plane(Material.ROAD), wet) for wet in (0.0, 1.0))
-    hit = np.isfinite(dry.range)
-    ratio = wet.intensity[hit] / dry.intensity[hit]
-    cosine = 1.8 / dry.range[hit]
-    assert ratio.max() <= 1.0 and np.median(ratio[cosine < 0.2]) == pytest.approx(0.15, abs=0.02)
-    assert wet.returned.sum() < 0.95 * dry.returned.sum()
-    plain = [scanned(plane(Material.PLAIN), wet).intensity for wet in (0.0, 1.0)]
-    np.testing.assert_array_equal(*plain)
 
 
 def edge_scans(gap: float, grey: float) -> tuple[StreetScan, StreetScan, np.ndarray]:

@@ -103,13 +103,6 @@ def test_two_worlds_in_one_dataroot_are_refused(tmp_path):
     load({"datasets": {"demo": demo(tmp_path), "other": {**other, "dataroot": str(tmp_path / "other")}}})
 
 
-@pytest.mark.parametrize("spelling", ["{}/", "{}/."])
-def test_a_dataroot_spelt_in_two_ways_is_still_one(tmp_path, spelling):
-    other = demo(tmp_path, scenes=["other"], dataroot=spelling.format(tmp_path))
-    with pytest.raises(ConfigError, match="same dataroot"):
-        load({"datasets": {"demo": demo(tmp_path), "other": other}})
-
-
 @pytest.mark.parametrize("scenes", [[], ["a", "b"]])
 def test_a_world_has_one_scene(tmp_path, scenes):
     with pytest.raises(ConfigError, match="a dataset with a world has one scene"):

@@ -18,12 +18,11 @@ from drivesplat.readers.truth import Truth, read_truth
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.scan import wrapped
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.scans import ScanSettings, ScansJob
-from drivesplat.world.generate import make_world, world_bytes
+from drivesplat.world.generate import make_world
 from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
 
 pytestmark = pytest.mark.slow
@@ -76,26 +75,6 @@ def png(path) -> np.ndarray:
     return np.asarray(Image.open(path))
 
 
-def test_key_frames_come_at_10_hz_and_images_at_20(root, scene):
-    assert set(np.diff([row["timestamp"] for row in table(root, "sample")])) == {100_000}
-    images = [frame.timestamp for frame in scene.frames]
-    assert set(np.diff(images)) == {50_000} and len(images) == 2 * (KEY_FRAMES - 1) + 1
-    assert [frame.is_key_frame for frame in scene.frames] == [i % 2 == 0 for i in range(len(images))]
-    assert scene.key_frame_hz == 10.0 and scene.key_frame_interval == 100_000.0
-
-
-def test_at_10_hz_nothing_near_a_held_out_key_frame_is_trained_on(scene):
-    """Key frame 3 and the last are held out: images less than 0.15 s away are excluded, key frames too."""
-    holdout = HoldoutSettings(every_nth=8, offset=3, last_block=1, neighbourhood_s=0.15)
-    held = {3: "interpolation", KEY_FRAMES - 1: "extrapolation"}
-    for records, groups in ((scene.frames, frame_groups), (scene.sweeps, sweep_groups)):
-        for record, group in zip(records, groups(scene, holdout), strict=True):
-            near = min(abs(record.timestamp - scene.key_frame_timestamps[index]) for index in held)
-            own = held.get(record.sample_index) if record.is_key_frame else None
-            assert group == (own or ("excluded" if near < 150_000 else "train")), record.token
-        assert groups(scene, holdout).count("excluded") >= 3
-
-
 def test_the_tables_state_shutter_beams_and_spin(root, scene, recorder):
     (camera,), (lidar,) = scene.cameras, scene.lidars
     assert (camera.readout_s, camera.readout_direction) == (0.03, "down")
@@ -104,26 +83,6 @@ def test_the_tables_state_shutter_beams_and_spin(root, scene, recorder):
     np.testing.assert_allclose(np.degrees(lidar.beam_elevations), np.linspace(-30.67, 10.67, 32), atol=1e-9)
     sensors = {row["token"]: row for row in table(root, "sensor")}
     assert {row["channel"] for row in sensors.values()} == {"CAM_FRONT", "LIDAR_TOP"}
-
-
-def test_class_and_sky_maps_of_key_frames_are_those_of_the_truth(root, scene, truth):
-    records = truth.recorded("CAM_FRONT").by_image()
-    sky_number = next(int(n) for n, name in truth.classes.items() if name == "sky")
-    for frame in (frame for frame in scene.frames if frame.is_key_frame):
-        name = f"CAM_FRONT/{frame.image_path.rsplit('/')[-1].removesuffix('.jpg')}.png"
-        semantic, sky = png(root / "semantic" / name), png(root / "sky" / name)
-        classes, depth = (png(root / "truth" / getattr(records[frame.token], k)) for k in ("classes", "depth"))
-        np.testing.assert_array_equal(sky > 0, depth == 0)
-        np.testing.assert_array_equal(sky > 0, classes == sky_number)
-        assert set(np.unique(sky)) == {0, 255}
-        np.testing.assert_array_equal(semantic, np.where(depth == 0, 255, classes))
-
-
-def test_every_recorded_image_has_maps(root, scene):
-    images = {path.stem for folder in ("samples", "sweeps") for path in (root / folder / "CAM_FRONT").iterdir()}
-    assert len(images) == len(scene.frames)
-    for folder in ("semantic", "sky"):
-        assert {path.stem for path in (root / folder / "CAM_FRONT").iterdir()} == images
 
 
 def test_the_stage_masks_reads_class_and_sky_maps(root, scene, tmp_path):
@@ -142,15 +101,6 @@ def test_the_stage_masks_reads_class_and_sky_maps(root, scene, tmp_path):
         if (classes := png(path)) is not None
     )
     assert record.semantic_classes == highest + 1
-
-
-def test_views_of_both_cameras_and_of_the_edit_are_listed(truth, recorder):
-    kinds = [(view.camera, view.left_m, view.edit, view.without) for view in truth.views]
-    per_camera = [(0.0, None, None), (2.0, None, None), (0.0, None, AHEAD), (0.0, "gone", None)]
-    assert sorted(kinds, key=str) == sorted(
-        [(camera, *view) for camera in ("CAM_FRONT", "CAM_FRONT_LEFT") for view in per_camera], key=str
-    )
-    assert truth.leading == AHEAD == recorder.instance("vehicle 0")
 
 
 def test_a_held_out_camera_has_truth_with_images_and_records_nothing(root, truth):
@@ -267,17 +217,3 @@ def test_a_world_larger_than_the_free_space_is_refused_before_anything_is_record
     assert message.startswith(f"{tmp_path}: the world takes about 0.0 GB, 0.0 GB are free; free some space")
     assert "\n" not in message and "datasets.<name>.dataroot" in message
     assert not (tmp_path / "samples").exists() and not (tmp_path / "v1.0-mini").exists()
-
-
-def test_the_size_told_before_is_about_that_of_the_files(root, truth):
-    images, sweeps = 2 * (KEY_FRAMES - 1) + 1, KEY_FRAMES
-    told = world_bytes(JOB.world, images, sweeps, len(truth.views), len(truth.scans) // KEY_FRAMES)
-    held = sum(path.stat().st_size for path in root.rglob("*") if path.is_file() and "v1.0-mini" not in path.parts)
-    assert 0.5 * held < told < 2.5 * held
-
-
-def test_a_world_takes_more_space_with_more_of_everything():
-    small, large = world_of(), world_of(width=1600, class_maps=True, lidar={"beams": 64})
-    assert world_bytes(small, 10, 0, 0, 0) < world_bytes(small, 20, 0, 0, 0) < world_bytes(large, 20, 0, 0, 0)
-    assert world_bytes(small, 0, 10, 0, 0) < world_bytes(large, 0, 10, 0, 0)
-    assert world_bytes(small, 0, 0, 1, 0) < world_bytes(small, 0, 0, 2, 0) < world_bytes(small, 0, 0, 2, 1)

@@ -6,16 +6,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
 from helpers import REPOSITORY
 from helpers.demo_worlds import CAMERAS
 
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.machine.device import choose_device
 from drivesplat.readers.nuscenes.layout import TABLES
 from drivesplat.readers.truth import TRUTH_FILE
 from drivesplat.settings.config import load
-from drivesplat.settings.device import DeviceSettings
 from drivesplat.workflow.plan import Plan
 
 
@@ -35,11 +32,6 @@ def test_auto_makes_do_with_the_cpu_for_synthetic_worlds_alone(written, syntheti
     made = plan(device=written)
     assert json.loads(made.device(scene("demo")))["kind"] == synthetic
     assert json.loads(made.device(scene("0103")))["kind"] == recorded
-
-
-def test_without_a_word_about_the_device_the_demo_makes_do_with_the_cpu():
-    assert json.loads(plan().device(scene("demo")))["kind"] == "any"
-    assert json.loads(plan().device(scene("0103")))["kind"] == "auto"
 
 
 def test_the_demo_asks_for_little_gpu_memory_and_keeps_the_rest_of_the_device():
@@ -74,21 +66,11 @@ def test_trainings_take_a_card_where_they_run_on_one_and_half_the_processors_els
     assert plan(device="cpu").threads(on_gpu=3)(scene("demo")) == 1
 
 
-def test_any_device_without_a_gpu_is_the_cpu(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert choose_device(DeviceSettings(kind="any")) == torch.device("cpu")
-
-
 def test_the_demo_is_there_by_default_and_out_of_the_batch():
     config = load({})
     assert "demo" in config.scenes and "demo" not in config.batch_scenes
     assert config.batch_scenes == [s for s in config.scenes if s != "demo"]
     assert plan().report([]).scenes == config.batch_scenes
-
-
-def test_a_world_can_be_part_of_the_batch():
-    datasets = {"made": {"dataroot": "resources/made", "scenes": ["made"], "world": {}}}
-    assert load({"datasets": datasets}).batch_scenes == ["made"]
 
 
 def test_a_world_is_known_by_its_dataset(tmp_path):
@@ -102,13 +84,6 @@ def test_a_world_is_known_by_its_dataset(tmp_path):
     assert {str(Path(table).parent) for table in made.world_tables("b")} == {f"{tmp_path}/b/v1.0-trainval"}
     told = json.loads(made.world_settings("a"))
     assert (told["scene"], told["world"]["random_seed"]) == ("a", 5)
-
-
-def test_the_tables_a_scene_of_a_world_needs_are_those_that_the_world_makes(tmp_path):
-    datasets = {"a": {"dataroot": str(tmp_path / "a"), "scenes": ["a"], "world": {}}}
-    made = plan(datasets=datasets)
-    assert made.tables(scene("a")) == made.world_tables("a")
-    assert made.world_tables("a") == [f"{tmp_path}/a/v1.0-mini/{table}.json" for table in TABLES] and len(TABLES) == 13
 
 
 @pytest.mark.parametrize(
@@ -175,11 +150,6 @@ def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has(target, 
 )  # fmt: skip
 def test_films_that_there_are_and_what_is_no_film_are_not_refused(target):
     films().refuse_unknown([target])
-
-
-def test_an_unknown_scene_is_refused_however_its_path_is_spelled():
-    with pytest.raises(ConfigError, match="9999"):
-        plan().refuse_unknown(["./results/9999/metrics.json"])
 
 
 @pytest.mark.parametrize(("cameras", "threads"), [(0, 1), (1, 2), (3, 6), (6, 8)])

@@ -4,6 +4,7 @@ import dataclasses
 import multiprocessing
 
 import numpy as np
+import pytest
 from helpers.demo_worlds import FRONT, names_of, world_of
 from helpers.patience import PATIENCE_S
 
@@ -43,6 +44,7 @@ def test_more_than_a_thousand_moving_pieces_are_hit_at_their_own_times():
     assert hits.object.max() > 50
 
 
+@pytest.mark.slow
 def test_rays_that_pass_a_limb_are_all_cast_at_it_and_few_others():
     """Compared with rays cast at every limb of every person, whether they pass it or not."""
     recorder = Recorder(world_of(pedestrians=6, cyclists=1))

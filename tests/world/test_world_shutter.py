@@ -42,7 +42,7 @@ def test_each_row_is_that_of_a_global_shutter_at_its_own_time(channel="CAM_BACK_
     assert (found.depth[85] != middle.depth[85]).mean() > 0.9, "no other row is that of the timestamp"
 
 
-@pytest.mark.parametrize("speed", [30.0, -30.0])
+@pytest.mark.parametrize("speed", [30.0, pytest.param(-30.0, marks=pytest.mark.slow)])
 def test_a_moving_vertical_edge_is_sheared_by_its_speed_times_the_readout(speed):
     """A board 10 m ahead moves sideways past a standing camera."""
     recorder = recorder_of(width=WIDTH, readout_s=READOUT, ego="stands")

@@ -85,21 +85,6 @@ def test_every_file_of_truth_json_is_there_in_the_images_size(truth, demo_root):
             assert (image.size, image.mode) == ((WIDTH, HEIGHT), mode), name
 
 
-def test_the_recorded_view_has_no_image_of_its_own_and_all_others_have(truth):
-    for view in truth.views:
-        own = not view.left_m and view.without is None
-        assert all((frame.image is None) == own for frame in view.frames)
-
-
-def test_instances_list_the_annotated_objects(truth, recorded, demo_root, demo_tables):
-    assert {instance["token"] for instance in demo_tables.instance} <= set(truth.instances.values())
-    shown = set()
-    for frame in recorded.frames:
-        shown |= set(np.unique(png(demo_root, frame, "instances")).tolist())
-    assert 0 in shown and len(shown) >= 6
-    assert {str(n) for n in shown - {0}} <= truth.instances.keys()
-
-
 def test_instance_pixels_show_the_listed_object(truth, recorded, demo_root, demo_recorder, index):
     objects = demo_recorder.geometry(FRONT, time_of(index)).objects
     shown = png(demo_root, recorded.frames[index], "instances")
@@ -129,18 +114,6 @@ def test_classes_agree_with_objects(truth, recorded, demo_root, demo_recorder, i
     assert not scenery & {"vehicle", "person", "cyclist", "animal"}
 
 
-def test_classes_of_the_ground_are_those_of_its_strips(recorded, demo_root, demo_recorder, index):
-    """By the distance from the centre line: the road up to 6.4 m, the sidewalk up to 10 m."""
-    frame, camera = recorded.frames[index], demo_recorder.camera(FRONT, time_of(index) * 1e-6)
-    depth = png(demo_root, frame, "depth") / 256.0
-    classes, points = png(demo_root, frame, "classes"), points_of(depth, camera)
-    low = (depth > 0) & (depth < 60) & (np.abs(points[..., 2]) < 0.02) & (png(demo_root, frame, "instances") == 0)
-    aside = np.abs(points[..., 1])
-    for near, far, name in ((0.0, 6.3, SurfaceClass.ROAD), (6.7, 9.9, SurfaceClass.SIDEWALK)):
-        found = classes[low & (aside > near) & (aside < far)]
-        assert len(found) > 20 and (found == name).mean() > 0.95
-
-
 def test_the_depth_image_decodes_to_metres(recorded, demo_root, demo_recorder, index):
     found, decoded = (
         demo_recorder.geometry(FRONT, time_of(index)),
@@ -161,13 +134,6 @@ def ego_to_global(tables, sample_data: str) -> np.ndarray:
     w, x, y, z = pose["rotation"]
     matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), pose["translation"]
     return matrix
-
-
-def test_camera_poses_agree_with_the_tables(recorded, demo_tables):
-    for frame in recorded.frames:
-        in_ego = np.linalg.inv(ego_to_global(demo_tables, frame.token)) @ np.array(frame.camera_to_global)
-        np.testing.assert_allclose(in_ego[:3, 3], [1.701, 0.016, 1.511], atol=1e-6)
-        assert in_ego[0, 2] > 0.999, "the camera looks ahead"
 
 
 def test_lateral_cameras_lie_to_the_left_and_turn_nowhere(lateral, recorded, demo_tables):

@@ -27,6 +27,8 @@ from drivesplat.world.recorder import Recorder
 
 STORED = json.loads(DIGESTS.read_text())
 NAMES = {"day", "dense", "lidar", "night", "slope", "six_cameras"}
+BY_DEFAULT = {"day", "dense", "slope"}
+"""Worlds whose streets `make test` compares: free traffic and a queue on a straight road, and a bend with a slope."""
 
 
 @pytest.fixture(scope="module", params=WORLDS)
@@ -84,6 +86,9 @@ HOW_TO = (
 )
 
 
+@pytest.mark.parametrize(
+    "name", [world if world in BY_DEFAULT else pytest.param(world, marks=pytest.mark.slow) for world in WORLDS]
+)
 def test_streets_are_those_of_the_stored_digests(name):
     assert digest(recorder_of_world(name)) == STORED["streets"][name], f"the streets of {name} {HOW_TO}"
 

@@ -10,8 +10,9 @@ from drivesplat.model.states import IMAGE, SCAN
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.graphs.inputs import SharedImageInputs, SharedScanInputs, can_share
 from drivesplat.training.graphs.iteration_graphs import GaussianCount, IterationGraphs, Recording, can_capture
+from drivesplat.training.losses import Terms
 from drivesplat.training.scans import TrainingScan
-from drivesplat.training.step import UNTIMED, Terms, TrainingState, eager_step, image_step, scan_step
+from drivesplat.training.step import UNTIMED, TrainingState, eager_step, image_step, scan_step
 from drivesplat.training.views import TrainingView
 
 MEASURED_SCANS = 8

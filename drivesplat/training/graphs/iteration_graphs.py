@@ -20,7 +20,7 @@ from drivesplat.kernels import capacity, cuda_graphs
 from drivesplat.kernels.cuda_graphs import CudaGraph, MemoryPool, capture, graphs_supported, new_pool
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.step import Terms
+from drivesplat.training.losses import Terms
 
 log = logging.getLogger(__name__)
 
