@@ -63,7 +63,7 @@ def test_a_changed_setting_reruns_its_stage_and_the_trainings_that_take_it(train
     ("file", "old", "new", "expected"),
     [
         ("drivesplat/preprocess/actor_seed.py", "UNSEEN = 127", "UNSEEN = 128", {"actors": 1, "train": 1}),
-        ("drivesplat/lidar/depth.py", "< interval", "<= interval", {"lidar_depth": 1, "train": 1}),
+        ("drivesplat/lidar/depth.py", "static &= ~item", "static &= item", {"lidar_depth": 1, "train": 1}),
     ],
 )
 def test_code_that_makes_them_reruns_no_training_that_does_not_take_them(trained, file, old, new, expected):
