@@ -285,7 +285,7 @@ def assert_curve_ends_at_result(run: dict[str, Any]) -> None:
 def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkeypatch):
     """Both call the same function, and equal settings and files give the same model."""
     script = (REPOSITORY / "workflow_scripts/train.py").read_text()
-    assert re.search(r"^from drivesplat\.training\.run import .*\brun_training$", script, re.MULTILINE)
+    assert re.search(r"^from drivesplat\.training\.stage import .*\brun_training$", script, re.MULTILINE)
     assert runs.run_training is run_training and runs.read_inputs is read_inputs
     monkeypatch.chdir(measured.folder)
     file = read_speed_file("tiny.yaml", {})

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 from helpers.killed_runs import only_complaint, training_process
@@ -28,10 +29,12 @@ def copy(tmp_path_factory) -> Iterator[WorkflowCopy]:
 
 
 def started(copy: WorkflowCopy) -> subprocess.Popen:
-    """Snakemake at work on the training, in a session of its own."""
+    """Snakemake at work on the training, in a session of its own, which SIGINT ends even where these tests run in the
+    background of a shell that ignores it."""
     return subprocess.Popen(
         copy.command("--cores", "2", "--", TARGET), cwd=copy.folder, env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
 
 

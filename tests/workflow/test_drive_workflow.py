@@ -131,6 +131,6 @@ def test_this_workflow_trains_on_a_rendered_drive_and_on_its_tables(copy):
         assert measured[0]["static"]["psnr"] == pytest.approx(measured[1]["static"]["psnr"], abs=1.0)
     recorded = read_scene(folder / "results/0001/scene.json")
     gone, shifted = (read_scene(folder / f"results/{edit}/scene.json") for edit in ("gone", "shifted"))
-    (moved,) = {track.id for track in recorded.tracks} - {track.id for track in gone.tracks}
+    (moved,) = {track.id for track in shifted.tracks} - {track.id for track in gone.tracks}
     places = [scene.track(moved).object_to_world for scene in (recorded, shifted)]
     np.testing.assert_allclose(places[1][:, :3, 3] - places[0][:, :3, 3], places[0][:, :3, 1], atol=0.2)
