@@ -55,9 +55,9 @@ class Priors:
             problem.add_residual_block(cost, pyceres.TrivialLoss(), [poses[i], poses[j]])
 
 
-def priors_of(images: RigImages, settings: RefinePosesSettings) -> Priors:
-    """Priors around the poses of `images`."""
-    return Priors(images.ego_to_world, images.seconds, settings.priors, settings.feature_noise)
+def priors_of(images: RigImages, settings: RefinePosesSettings, expected: PriorSettings | None = None) -> Priors:
+    """Priors around the poses of `images`, with the `expected` errors instead of those of the settings, if given."""
+    return Priors(images.ego_to_world, images.seconds, expected or settings.priors, settings.feature_noise)
 
 
 def triangulate(

@@ -59,6 +59,16 @@ class Corrections:
         return rigid(rotations.as_matrix(), np.stack(positions, axis=-1))
 
 
+def magnitudes(corrections: np.ndarray) -> dict[str, dict[str, float]]:
+    """`shift_m` and `turn_deg` of corrections (n, 4, 4): their median and largest translation and rotation."""
+    shift = np.linalg.norm(corrections[:, :3, 3], axis=1)
+    turn = np.degrees(Rotation.from_matrix(corrections[:, :3, :3]).magnitude())
+    return {
+        name: {"median": float(np.median(values)), "largest": float(values.max())}
+        for name, values in (("shift_m", shift), ("turn_deg", turn))
+    }
+
+
 def apply_corrections(scene: Scene, corrections: Corrections, poses: str = "refined") -> Scene:
     """The scene with corrected poses of images, LiDAR sweeps and boxes; `poses` becomes `Scene.poses`.
 

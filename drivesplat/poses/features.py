@@ -13,7 +13,7 @@ from numpy.linalg import inv
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image
-from drivesplat.scene.rigid import inverse
+from drivesplat.scene.rigid import inverse, path_lengths
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.refine_poses import FeatureSettings, RefinePosesJob
@@ -61,9 +61,13 @@ def write_images(
 
 def match_features(images: RigImages, job: RefinePosesJob, database: Path, threads: int) -> None:
     """Matches features of `image_pairs`; matches that contradict the geometry of two views are dropped."""
-    pairs = database.parent / "pairs.txt"
-    listed = image_pairs(images, job.refine_poses.features)
-    pairs.write_text("".join(f"{image_name(a)} {image_name(b)}\n" for a, b in listed))
+    match_pairs(image_pairs(images, job.refine_poses.features), job, database, threads)
+
+
+def match_pairs(numbers: list[tuple[int, int]], job: RefinePosesJob, database: Path, threads: int) -> None:
+    """Matches features of pairs of image numbers (from 1), as `match_features` does."""
+    pairs = database.with_suffix(".pairs.txt")
+    pairs.write_text("".join(f"{image_name(a)} {image_name(b)}\n" for a, b in numbers))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.random_seed
     pairing = pycolmap.ImportedPairingOptions()
@@ -84,8 +88,8 @@ def image_pairs(images: RigImages, settings: FeatureSettings) -> list[tuple[int,
     pairs: set[tuple[int, int]] = set()
     for by_key_frame in numbers.values():
         ordered = [by_key_frame[key] for key in sorted(by_key_frame)]
-        for step in range(1, settings.neighbours + 1):
-            pairs.update((min(pair), max(pair)) for pair in zip(ordered, ordered[step:], strict=False))
+        for i, later in enumerate(later_images(images.ego_to_world[np.array(ordered) - 1], settings)):
+            pairs.update((min(ordered[i], ordered[j]), max(ordered[i], ordered[j])) for j in later)
     for a, b in combinations(images.cameras, 2):
         if views_overlap(images.of_camera(a)[0], images.of_camera(b)[0]):
             pairs.update(
@@ -95,6 +99,18 @@ def image_pairs(images: RigImages, settings: FeatureSettings) -> list[tuple[int,
                 if abs(key - other) <= settings.across
             )
     return sorted(pairs)
+
+
+def later_images(poses: np.ndarray, settings: FeatureSettings) -> list[list[int]]:
+    """For each of a camera's images in the order of time, with the vehicle at `poses` (n, 4, 4): the later ones that it
+    is matched with."""
+    gone, found = path_lengths(poses), []
+    for i in range(len(poses)):
+        later = [i]
+        for multiple in range(settings.neighbours):
+            later.append(max(later[-1] + 1, int(np.searchsorted(gone, gone[i] + multiple * settings.spacing))))
+        found.append([j for j in later[1:] if j < len(poses)])
+    return found
 
 
 def views_overlap(a: Frame, b: Frame) -> bool:

@@ -24,9 +24,11 @@ from drivesplat.poses.adjustment import (
     priors_of,
     with_poses,
 )
-from drivesplat.poses.corrections import Corrections, apply_corrections
+from drivesplat.poses.corrections import Corrections, apply_corrections, magnitudes
 from drivesplat.poses.features import detect_features, match_features
 from drivesplat.poses.from_images import estimate_poses
+from drivesplat.poses.from_matches import MatchJudge, match_judge
+from drivesplat.poses.from_sweeps import SweepJudge
 from drivesplat.poses.lens import lens_warnings, with_tested_images
 from drivesplat.poses.readout import RollingFeatures
 from drivesplat.poses.refinement_record import Refinement, record_header
@@ -37,6 +39,11 @@ from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import LimitSettings, RefinePosesJob
 
 log = logging.getLogger(__name__)
+
+CHORD = 2.0
+"""Metres between places whose distances make the length of a path."""
+MIN_PATH = 5.0
+"""Metres of a recorded path below which noise hides a change of its length."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +57,16 @@ class WithheldTrial:
     after: float
 
 
-def refine_poses(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_MASK, threads: int = 1) -> Refinement:
-    """Refines a scene's poses; features on the ego vehicle are ignored. Where images cannot improve the given poses,
-    logs a warning and keeps them.
+def refine_poses(
+    scene: Scene,
+    job: RefinePosesJob,
+    ego_mask: EgoMask = NO_EGO_MASK,
+    threads: int = 1,
+    judge: SweepJudge | None = None,
+) -> Refinement:
+    """Refines a scene's poses with its images; features on the ego vehicle are ignored. Where these cannot improve the
+    given poses, or `judge` objects (LiDAR; without it matches over longer baselines), logs a warning and keeps the
+    given ones.
 
     Raises DatasetError where an image cannot be read or the mount of a camera changes; with `start: images` also where
     images do not determine the poses.
@@ -69,7 +83,8 @@ def refine_poses(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_M
         log.info("scene %s: features are matched", scene.name)
         if job.refine_poses.start == "images":
             return estimate_from_matches(images, start, database, job, threads)
-        refinement = refine_from_matches(images, start, database, job, threads)
+        checked_by = judge or match_judge(images, job, database, threads)
+        refinement = refine_from_matches(images, start, database, job, threads, checked_by)
     sentences = lens_warnings(with_tested_images(scene), ego_mask, threads)
     for sentence in sentences:
         log.warning("scene %s: %s", scene.name, sentence)
@@ -77,12 +92,18 @@ def refine_poses(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_M
 
 
 def refine_from_matches(
-    images: RigImages, start: pycolmap.Reconstruction, database: Path, job: RefinePosesJob, threads: int = 1
+    images: RigImages,
+    start: pycolmap.Reconstruction,
+    database: Path,
+    job: RefinePosesJob,
+    threads: int = 1,
+    judge: SweepJudge | MatchJudge | None = None,
 ) -> Refinement:
-    """Refines recorded poses, with images and features in `start` and matches in `database`. Where refined poses are
-    not better than the recorded ones, these and points that fit them are kept; where they cannot be trusted, no
-    points."""
-    scene, priors = images.scene, priors_of(images, job.refine_poses)
+    """Refines given poses, with images and features in `start` and matches in `database`. Where refined poses are not
+    better than the given ones, these and points that fit them are kept; where they cannot be trusted, no points.
+    `judge` has the last word; where it is LiDAR, the given poses are as accurate as it."""
+    scene, settings = images.scene, job.refine_poses
+    priors = priors_of(images, settings, settings.priors_with_lidar if isinstance(judge, SweepJudge) else None)
     rolling = RollingFeatures.of(images, start)
     unadjusted, reconstruction = adjust_in_rounds(start, rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
@@ -90,13 +111,13 @@ def refine_from_matches(
     trial, at_given = _trial(unadjusted, priors, job, threads) if len(observations.positions) else (None, None)
     changes, limits = corrections.at(images.timestamps), job.refine_poses.limits
     flaw = unusable(images, observations, changes, trial, limits)
-    reason = flaw or no_gain(trial, limits)
+    refined = scene if flaw else apply_corrections(scene, corrections)
+    reason = flaw or no_gain(trial, limits) or contradiction(scene, refined, judge, limits)
     record = {**record_header(scene, job, reason), **_record(images, observations, changes, trial)}
     log.info("scene %s: %s", scene.name, _figures(record))
     if reason is None:
         log.info("scene %s: the refined poses are taken", scene.name)
-        points = triangulated_points(images.indices, observations)
-        return Refinement(apply_corrections(scene, corrections), record, points)
+        return Refinement(refined, record, triangulated_points(images.indices, observations))
     log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
     points = no_points() if flaw or at_given is None else triangulated_points(images.indices, at_given)
     return Refinement(scene, record, points)
@@ -167,8 +188,9 @@ def unusable(
             f"{int(constrained.sum())} of {len(images)} images see {limits.min_points} triangulated points or more "
             "(there are few by night, where the vehicle stands, or with wrong poses or calibration)"
         )
-    shift, turn = _magnitudes(changes)
-    for largest, limit, unit in ((shift.max(), limits.max_shift, "m"), (turn.max(), limits.max_turn, "degrees")):
+    sizes = magnitudes(changes)
+    for key, limit, unit in (("shift_m", limits.max_shift, "m"), ("turn_deg", limits.max_turn, "degrees")):
+        largest = sizes[key]["largest"]
         if not largest <= limit:
             return (
                 f"one of them would be moved by {largest:.2f} {unit}, more than {limit:g} (as with a camera matrix K "
@@ -187,17 +209,34 @@ def no_gain(trial: WithheldTrial | None, limits: LimitSettings) -> str | None:
     return None
 
 
-def _magnitudes(changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Translations (n,) in metres and rotations (n,) in degrees of transforms (n, 4, 4)."""
-    turns = Rotation.from_matrix(changes[:, :3, :3]).magnitude()
-    return np.linalg.norm(changes[:, :3, 3], axis=1), np.degrees(turns)
+def contradiction(
+    given: Scene, refined: Scene, judge: SweepJudge | MatchJudge | None, limits: LimitSettings
+) -> str | None:
+    """What speaks against refined poses that they were not fitted to; None if nothing does."""
+    if judge is not None and (objection := judge.objection(given, refined)):
+        return objection
+    before, after = path_length(given), path_length(refined)
+    if isinstance(judge, SweepJudge) or before < MIN_PATH or abs(after - before) <= limits.max_stretch * before:
+        return None
+    return f"with them the path is {after:.1f} m long, {before:.1f} m as recorded"
+
+
+def path_length(scene: Scene) -> float:
+    """The length in metres of the vehicle's path at its images, of chords of CHORD metres and more: noise of positions
+    does not count."""
+    frames = sorted(scene.frames, key=lambda frame: frame.timestamp)
+    length, start = 0.0, frames[0].ego_to_world[:3, 3]
+    for frame in frames[1:]:
+        chord = float(np.linalg.norm(frame.ego_to_world[:3, 3] - start))
+        if chord >= CHORD or frame is frames[-1]:
+            length, start = length + chord, frame.ego_to_world[:3, 3]
+    return length
 
 
 def _record(
     images: RigImages, observations: Observations, changes: np.ndarray, trial: WithheldTrial | None
 ) -> dict[str, Any]:
     """The measured part of poses.json: errors of points, corrections of poses, both also per image."""
-    shift, turn = _magnitudes(changes)
     points = np.bincount(observations.image, minlength=len(images))
     rotations = Rotation.from_matrix(changes[:, :3, :3]).as_rotvec(degrees=True)
     return {
@@ -213,8 +252,7 @@ def _record(
             "before_px": _finite(trial.before),
             "after_px": _finite(trial.after),
         },
-        "shift_m": {"median": float(np.median(shift)), "largest": float(shift.max())},
-        "turn_deg": {"median": float(np.median(turn)), "largest": float(turn.max())},
+        **magnitudes(changes),
         "corrections": [
             {
                 "camera": frame.camera,

@@ -1,8 +1,11 @@
-"""The stage `refine_poses`, with a fallback to the given poses where refinement is optional and impossible."""
+"""The stage `refine_poses`: LiDAR first, then images, with a fallback to the given poses where images are optional and
+cannot refine them."""
 
 import logging
+from dataclasses import replace
 
 from drivesplat.errors import DatasetError, DriveSplatError
+from drivesplat.poses.from_sweeps import Alignment, align_sweeps
 from drivesplat.poses.refinement_record import Refinement, record_header
 from drivesplat.poses.triangulated import no_points
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
@@ -26,11 +29,32 @@ MEASURED = (
 
 
 def refine_or_keep(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_MASK, threads: int = 1) -> Refinement:
-    """`drivesplat.poses.refine.refine_poses`. With `enabled: auto` and recorded poses, a scene that it cannot refine
-    keeps its poses with a warning, also where pycolmap cannot be imported.
+    """Registers LiDAR sweeps to each other (`drivesplat.poses.from_sweeps`), then refines the poses with the images
+    (`drivesplat.poses.refine`). With `enabled: auto` and recorded poses, a scene whose images cannot refine them keeps
+    them with a warning, also where pycolmap cannot be imported.
 
     Raises DriveSplatError otherwise: without pycolmap, and the errors of `refine_poses`.
     """
+    aligned = Alignment(scene, None, None)
+    if job.refine_poses.start == "recorded" and job.lidar is not None:
+        aligned = align_sweeps(scene, job, threads)
+    refinement = _with_images(aligned, job, ego_mask, threads)
+    record, by_lidar = refinement.record, aligned.record
+    if by_lidar is not None and aligned.judge is not None:
+        by_lidar = {**by_lidar, "with_images_m": aligned.judge.distance(refinement.scene) if scene.frames else None}
+    by_images = record["kept_because"] if scene.frames else None
+    taken = record["refined"] or (by_lidar is not None and by_lidar["taken"])
+    reason = None if taken else by_images or "registered sweeps fit each other no better"
+    decision = {"refined": taken, "kept_because": reason, "images_kept_because": by_images, "lidar": by_lidar}
+    return replace(refinement, record=record | decision)
+
+
+def _with_images(aligned: Alignment, job: RefinePosesJob, ego_mask: EgoMask, threads: int) -> Refinement:
+    """The refinement of aligned poses with the images, or without: then the aligned ones."""
+    scene = aligned.scene
+    if not scene.frames:
+        record = {**record_header(scene, job, "there are no images"), **dict.fromkeys(MEASURED), "corrections": []}
+        return Refinement(scene, record, no_points())
     required = job.refine_poses.enabled is True or job.refine_poses.start == "images"
     try:
         from drivesplat.poses.refine import refine_poses  # imports pycolmap
@@ -43,7 +67,7 @@ def refine_or_keep(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO
             ) from error
     else:
         try:
-            return refine_poses(scene, job, ego_mask, threads)
+            return refine_poses(scene, job, ego_mask, threads, aligned.judge)
         except DatasetError as error:
             if required:
                 raise

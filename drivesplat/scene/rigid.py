@@ -31,3 +31,9 @@ def interpolate(start: np.ndarray, end: np.ndarray, fraction: float) -> np.ndarr
     turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
     rotation = start[:3, :3] @ Rotation.from_rotvec(fraction * turn).as_matrix()
     return rigid(rotation, (1.0 - fraction) * start[:3, 3] + fraction * end[:3, 3])
+
+
+def path_lengths(poses: np.ndarray) -> np.ndarray:
+    """Metres (n,) from the first of successive poses (n, 4, 4) to each, along the path."""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])

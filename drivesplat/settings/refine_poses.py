@@ -16,7 +16,11 @@ class FeatureSettings(Settings):
     max_features: int = Field(4096, ge=64, le=65_536)
     """Maximum number of features per image."""
     neighbours: int = Field(6, ge=1, le=100)
-    """Number of following key frames of the same camera that an image is matched with."""
+    """Number of later key frames of the same camera that an image is matched with: the next one, and those at
+    multiples of `spacing`."""
+    spacing: float = Field(2.5, ge=0)
+    """Distance (metres along the path) between these key frames. Where key frames are farther apart, or with 0, they
+    are the following ones."""
     across: int = Field(2, ge=0, le=100)
     """Maximum distance in key frames between matched images of different cameras with overlapping views."""
     box_margin: float = Field(0.3, ge=0, le=5)
@@ -53,6 +57,8 @@ class LimitSettings(Settings):
     interpolated from their neighbours."""
     min_gain: float = Field(0.05, ge=0, lt=1)
     """Minimum relative decrease of the median reprojection error of withheld points."""
+    max_stretch: float = Field(0.01, gt=0, lt=1)
+    """Maximum relative change of the length of the path. Applies where no LiDAR judges."""
     max_scale_drift: float = Field(1.2, ge=1)
     """Maximum factor by which the scale may change along the drive, with `start: images`. Images whose scale deviates
     more from their neighbours' are interpolated."""
@@ -72,6 +78,8 @@ class RefinePosesSettings(Settings):
     for drives without poses, and fails where the drive does not allow it. docs/poses.md"""
     features: FeatureSettings = FeatureSettings()
     priors: PriorSettings = PriorSettings()
+    priors_with_lidar: PriorSettings = PriorSettings(position=0.03, height=0.03, tilt=0.003, heading=0.002)
+    """The same for images, of drives whose LiDAR sweeps are registered to each other first."""
     limits: LimitSettings = LimitSettings()
     min_angle: float = Field(1.0, gt=0, le=90)
     """Minimum angle between the rays of a triangulated point (degrees)."""
@@ -99,4 +107,4 @@ class RefinePosesJob(Settings):
     refine_poses: RefinePosesSettings
     random_seed: int
     lidar: LidarRays | None = None
-    """None with `start: recorded`, which does not use LiDAR."""
+    """None: LiDAR takes no part."""

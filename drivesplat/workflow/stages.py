@@ -181,8 +181,6 @@ def _ego_mask(at: JobScope) -> dict[str, Any]:
 
 
 def _lidar_rays(at: JobScope) -> dict[str, Any]:
-    if at.config.refine_poses.start != "images":
-        return {}
     return {"lidar": LidarRays(ray_spacing=at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius"))}
 
 
