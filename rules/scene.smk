@@ -63,13 +63,13 @@ rule own_car:
 
 rule refine_poses:
     """
-    Refines poses from images: triangulated features between key frames, bundle adjustment with the given poses as
-    priors. Keeps the given poses, with a warning, if images cannot improve them. Can also estimate poses from images and
-    LiDAR alone, and fails if these do not determine them.
+    Refines poses: LiDAR sweeps are registered to each other, then images are adjusted together with triangulated
+    features. Keeps the given poses, with a warning, where withheld measurements do not improve. Can also estimate poses
+    from images and LiDAR alone, and fails if these do not determine them.
     """
     input:
         scene="<results>/{scene}/scene.json",
-        own_car="<results>/{scene}/own_car.json",
+        own_car=plan.of_images("own_car.json"),
     output:
         scene="<results>/{scene}/scene_refined.json",
         poses="<results>/{scene}/poses.json",

@@ -61,7 +61,7 @@ def write_images(
 
 def match_features(images: RigImages, job: RefinePosesJob, database: Path, threads: int) -> None:
     """Matches features of `image_pairs`; matches that contradict the geometry of two views are dropped."""
-    match_pairs(image_pairs(images, job.refine_poses.features), job, database, threads)
+    match_pairs(image_pairs(images, job.refine_poses.paired_features), job, database, threads)
 
 
 def match_pairs(numbers: list[tuple[int, int]], job: RefinePosesJob, database: Path, threads: int) -> None:

@@ -39,13 +39,15 @@ def refine_or_keep(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO
     if job.refine_poses.start == "recorded" and job.lidar is not None:
         aligned = align_sweeps(scene, job, threads)
     refinement = _with_images(aligned, job, ego_mask, threads)
-    record, by_lidar = refinement.record, aligned.record
-    if by_lidar is not None and aligned.judge is not None:
-        by_lidar = {**by_lidar, "with_images_m": aligned.judge.distance(refinement.scene) if scene.frames else None}
-    by_images = record["kept_because"] if scene.frames else None
-    taken = record["refined"] or (by_lidar is not None and by_lidar["taken"])
-    reason = None if taken else by_images or "registered sweeps fit each other no better"
-    decision = {"refined": taken, "kept_because": reason, "images_kept_because": by_images, "lidar": by_lidar}
+    if aligned.record is None or aligned.judge is None:
+        return refinement
+    record, by_images = refinement.record, refinement.record["images_kept_because"]
+    refined = record["refined"] or aligned.record["taken"]
+    decision = {
+        "refined": refined,
+        "kept_because": None if refined else by_images or "registered sweeps fit each other no better",
+        "lidar": aligned.record | {"final_m": aligned.judge.distance(refinement.scene)},
+    }
     return replace(refinement, record=record | decision)
 
 
@@ -53,7 +55,7 @@ def _with_images(aligned: Alignment, job: RefinePosesJob, ego_mask: EgoMask, thr
     """The refinement of aligned poses with the images, or without: then the aligned ones."""
     scene = aligned.scene
     if not scene.frames:
-        record = {**record_header(scene, job, "there are no images"), **dict.fromkeys(MEASURED), "corrections": []}
+        record = {**record_header(scene, job, None), "refined": False, **dict.fromkeys(MEASURED), "corrections": []}
         return Refinement(scene, record, no_points())
     required = job.refine_poses.enabled is True or job.refine_poses.start == "images"
     try:

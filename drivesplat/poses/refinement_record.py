@@ -20,6 +20,14 @@ class Refinement:
 
 
 def record_header(scene: Scene, job: RefinePosesJob, reason: str | None) -> dict[str, Any]:
-    """The first keys of poses.json. `reason`: why the given poses are kept, None where they are not."""
-    start = job.refine_poses.start
-    return {"schema": SCHEMA, "scene": scene.name, "start": start, "refined": reason is None, "kept_because": reason}
+    """The first keys of poses.json of a refinement with images. `reason`: why the given poses are kept, None where they
+    are not."""
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "start": job.refine_poses.start,
+        "refined": reason is None,
+        "kept_because": reason,
+        "images_kept_because": reason,
+        "lidar": None,
+    }

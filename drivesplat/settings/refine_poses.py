@@ -93,6 +93,11 @@ class RefinePosesSettings(Settings):
     """Fraction of the points that are withheld from a trial adjustment and then judge it: unless their error falls by
     limits.min_gain, the given poses are kept."""
 
+    @property
+    def paired_features(self) -> FeatureSettings:
+        """`features` with neighbours of a drive whose recorded positions say nothing, if they are not used."""
+        return self.features if self.start == "recorded" else self.features.model_copy(update={"spacing": 0.0})
+
 
 class LidarRays(Settings):
     """Settings for LiDAR depth at image points."""

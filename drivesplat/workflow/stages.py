@@ -46,8 +46,6 @@ TRAIN, WORLD = "train", "demo_world"
 SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = (TRAIN, "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
-ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
-"""The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
@@ -111,16 +109,17 @@ def refines_poses(config: Config, scene: str) -> bool:
 
 def _refines(at: JobScope) -> bool:
     enabled, world = at.config.refine_poses.enabled, at.dataset.world
-    if not at.config.cameras:
+    if not at.config.cameras and at.config.refine_poses.start == "images":
         return False
     return (world is None or world.pose_noise) if enabled == "auto" else enabled
 
 
 def stages_of_metrics(config: Config, scene: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The stages of a scene, and those of each of its methods, behind its metrics.json."""
+    refinement = ("refine_poses",) if refines_poses(config, scene) else ()
     if not has_cameras(config, scene):
-        return LIDAR_SCENE_STAGES, LIDAR_METHOD_STAGES
-    return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES, METHOD_STAGES
+        return (*LIDAR_SCENE_STAGES, *refinement), LIDAR_METHOD_STAGES
+    return (*SCENE_STAGES, *refinement), METHOD_STAGES
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:

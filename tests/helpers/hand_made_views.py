@@ -141,7 +141,7 @@ def write_database(
     none = np.zeros((0, 128), dtype=np.uint8)
     reconstruction = write_images(images, ((k.astype(np.float32), none) for k in keypoints), path)
     database = pycolmap.Database.open(path)
-    for a, b in image_pairs(images, job.refine_poses.features):
+    for a, b in image_pairs(images, job.refine_poses.paired_features):
         _, first, second = np.intersect1d(seen[a - 1].points, seen[b - 1].points, return_indices=True)
         matches = np.stack([first, second], axis=1)
         mixed = rng.uniform(size=len(matches)) < wrong
