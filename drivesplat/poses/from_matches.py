@@ -6,6 +6,7 @@ Their errors depend on poses alone: a match in another image lies on a line that
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pycolmap
@@ -30,6 +31,7 @@ class MatchJudge:
     `Scene.frames`."""
 
     pairs: list[tuple[int, int, Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]]
+    name: ClassVar[str] = "matches_px"
 
     def distance(self, scene: Scene) -> float:
         """The median Sampson distance in pixels of matches to the epipolar geometry of the poses (Hartley, Zisserman:
@@ -42,9 +44,8 @@ class MatchJudge:
             errors.append(np.abs(np.einsum("ni,ni->n", second, lines)) / scale)
         return float(np.median(np.concatenate(errors)))
 
-    def objection(self, given: Scene, refined: Scene) -> str | None:
-        """What the matches say against refined poses; None where they fit as well as with the given ones."""
-        before, after = self.distance(given), self.distance(refined)
+    def objection(self, before: float, after: float) -> str | None:
+        """What speaks against refined poses, by their distance and that of the given ones; None if it is not larger."""
         if after <= before:
             return None
         return f"the error of withheld matches is {after:.2f} pixels with them and {before:.2f} with the given ones"

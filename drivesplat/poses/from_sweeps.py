@@ -7,7 +7,7 @@ distances between their surfaces, before and after. Later corrections, by images
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -36,6 +36,7 @@ class SweepJudge:
 
     surfaces: dict[int, Surfaces]
     pairs: list[Pair]
+    name: ClassVar[str] = "lidar_m"
 
     def distance(self, scene: Scene) -> float:
         """The median distance in metres between surfaces that two sweeps of a pair see: the mean of that of upright
@@ -50,9 +51,8 @@ class SweepJudge:
         medians = [np.median(np.concatenate(found)) for found in (upright, others) if any(map(len, found))]
         return float(np.mean(medians)) if medians else np.inf
 
-    def objection(self, given: Scene, refined: Scene) -> str | None:
-        """What the sweeps say against refined poses; None where their surfaces lie as close as with the given ones."""
-        before, after = self.distance(given), self.distance(refined)
+    def objection(self, before: float, after: float) -> str | None:
+        """What speaks against refined poses, by their distance and that of the given ones; None if it is not larger."""
         if after <= before:
             return None
         return (

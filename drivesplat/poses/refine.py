@@ -112,8 +112,13 @@ def refine_from_matches(
     changes, limits = corrections.at(images.timestamps), job.refine_poses.limits
     flaw = unusable(images, observations, changes, trial, limits)
     refined = scene if flaw else apply_corrections(scene, corrections)
-    reason = flaw or no_gain(trial, limits) or contradiction(scene, refined, judge, limits)
+    judged = None if judge is None or flaw else (judge.distance(scene), judge.distance(refined))
+    reason = flaw or no_gain(trial, limits) or (judge and judged and judge.objection(*judged))
+    if reason is None and not isinstance(judge, SweepJudge):
+        reason = stretched(scene, refined, limits)
     record = {**record_header(scene, job, reason), **_record(images, observations, changes, trial)}
+    if judge and judged:
+        record["judged"] = {judge.name: dict(zip(("before", "after"), judged, strict=True))}
     log.info("scene %s: %s", scene.name, _figures(record))
     if reason is None:
         log.info("scene %s: the refined poses are taken", scene.name)
@@ -209,14 +214,10 @@ def no_gain(trial: WithheldTrial | None, limits: LimitSettings) -> str | None:
     return None
 
 
-def contradiction(
-    given: Scene, refined: Scene, judge: SweepJudge | MatchJudge | None, limits: LimitSettings
-) -> str | None:
-    """What speaks against refined poses that they were not fitted to; None if nothing does."""
-    if judge is not None and (objection := judge.objection(given, refined)):
-        return objection
+def stretched(given: Scene, refined: Scene, limits: LimitSettings) -> str | None:
+    """Why the length of the path speaks against refined poses; None if it does not."""
     before, after = path_length(given), path_length(refined)
-    if isinstance(judge, SweepJudge) or before < MIN_PATH or abs(after - before) <= limits.max_stretch * before:
+    if before < MIN_PATH or abs(after - before) <= limits.max_stretch * before:
         return None
     return f"with them the path is {after:.1f} m long, {before:.1f} m as recorded"
 
@@ -252,6 +253,7 @@ def _record(
             "before_px": _finite(trial.before),
             "after_px": _finite(trial.after),
         },
+        "judged": None,
         **magnitudes(changes),
         "corrections": [
             {

@@ -21,6 +21,7 @@ MEASURED = (
     "points_per_image",
     "reprojection_px",
     "trial",
+    "judged",
     "shift_m",
     "turn_deg",
     "lens_warnings",

@@ -147,8 +147,9 @@ def test_the_judge_objects_to_worse_poses_alone(tmp_path):
         for sweep, pose in zip(scene.sweeps, wander(truth, 0.1, 0.2), strict=True)
     ]
     spoiled = dataclasses.replace(scene, sweeps=tuple(worse))
-    assert "surfaces of LiDAR sweeps lie" in judge.objection(scene, spoiled)
-    assert judge.objection(spoiled, scene) is None and judge.objection(scene, scene) is None
+    good, bad = judge.distance(scene), judge.distance(spoiled)
+    assert bad > 2 * good and "surfaces of LiDAR sweeps lie" in judge.objection(good, bad)
+    assert judge.objection(bad, good) is None and judge.objection(good, good) is None
     moved = rigid(Rotation.from_euler("z", 40, degrees=True).as_matrix(), np.array([5.0, 2.0, 1.0]))
     elsewhere = [dataclasses.replace(s, sensor_to_world=moved @ s.sensor_to_world) for s in scene.sweeps]
     whole = dataclasses.replace(scene, sweeps=tuple(elsewhere))
