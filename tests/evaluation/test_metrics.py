@@ -95,6 +95,27 @@ def test_psnr_is_pooled_over_frames_and_the_frame_mean_is_not():
     assert record["psnr_frame_mean"] == pytest.approx((20.0 + 40.0) / 2)
 
 
+def test_psnr_cc_is_that_of_the_image_after_an_affine_map_of_its_colours():
+    """Fitted over all measured pixels of each image, before regions are taken."""
+    image, truth = pair(3)
+    labels = labels_of(moving_car=1200, own_car=300)
+    tinted = 0.8 * truth @ np.array([[0.9, 0.1, 0.0], [0.0, 1.0, 0.1], [0.1, 0.0, 0.8]]) + 0.05
+    tinted[labels == LABELS["own_car"]] = 1.0
+    records = measured((tinted, truth, labels))
+    assert (
+        records["all"]["psnr"] < 30 and records["all"]["psnr_cc"] > 100 and records["moving_vehicle"]["psnr_cc"] > 100
+    )
+    every = (labels != LABELS["own_car"]).ravel()
+    known = np.column_stack([image.reshape(-1, 3), np.ones(image.size // 3)])
+    fit = np.linalg.lstsq(known[every], truth.reshape(-1, 3)[every], rcond=None)[0]
+    car = (labels == LABELS["moving_car"]).ravel()
+    expected = peak_signal_noise_ratio(truth.reshape(-1, 3)[car], (known @ fit).clip(0, 1)[car], data_range=1.0)
+    assert measured((image, truth, labels))["moving_vehicle"]["psnr_cc"] == pytest.approx(expected)
+    constant = np.full_like(truth, 0.4)
+    assert measured((constant + 0.1, constant, labels_of()))["all"]["psnr_cc"] > 100, "one colour alone is corrected"
+    assert measured((truth, truth, labels_of()))["all"]["psnr_cc"] is None
+
+
 def test_a_frame_with_fewer_than_100_pixels_of_a_region_is_left_out_of_its_frame_mean():
     truth = np.full((HEIGHT, WIDTH, 3), 0.3)
     frames = [
