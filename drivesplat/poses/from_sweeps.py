@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 MAX_SWEEPS = 250
 """Sweeps of a drive that are registered; of more, evenly spread ones."""
+MIN_SWEEPS = 3
+"""Sweeps of which a pair can be withheld."""
 MIN_POINTS = 200
 """Points on surfaces without which a sweep has no part."""
 MAX_PAIRS = 60
@@ -75,12 +77,12 @@ def align_sweeps(scene: Scene, job: RefinePosesJob, threads: int = 1) -> Alignme
     pair, returns the scene as it is, without a judge."""
     surfaces = _surfaces(scene, job, threads)
     chosen = sorted(surfaces)
+    if len(chosen) < MIN_SWEEPS:
+        return Alignment(scene, None, None)
     sweeps = [scene.sweeps[i] for i in chosen]
     times = np.array([sweep.timestamp for sweep in sweeps])
     vehicle = _vehicle_poses(scene, sweeps)
-    pairs = [(chosen[i], chosen[j]) for i, j in pairs_of(vehicle)[1]] if len(chosen) > 2 else []
-    if not pairs:
-        return Alignment(scene, None, None)
+    pairs = [(chosen[i], chosen[j]) for i, j in pairs_of(vehicle)[1]]
     kept = np.unique(np.linspace(0, len(pairs) - 1, MAX_PAIRS).astype(int))
     judge = SweepJudge(surfaces, [pairs[i] for i in kept])
     log.info("scene %s: %d sweeps are registered", scene.name, len(sweeps))

@@ -135,8 +135,9 @@ def test_sweeps_without_files_or_surfaces_have_no_part_and_two_are_too_few(tmp_p
     assert aligned.record["sweeps"] == COUNT // 2
     assert len({tuple(s.sensor_to_world[:3, 3]) for s in aligned.scene.sweeps} & {
         tuple(s.sensor_to_world[:3, 3]) for s in scene.sweeps}) == 0, "sweeps between are corrected too"  # fmt: skip
-    two = dataclasses.replace(scene, sweeps=scene.sweeps[:2])
-    assert align_sweeps(two, JOB).judge is None and align_sweeps(two, JOB).scene is two
+    for count in (0, 2):
+        few = dataclasses.replace(scene, sweeps=scene.sweeps[:count])
+        assert align_sweeps(few, JOB).judge is None and align_sweeps(few, JOB).scene is few
 
 
 def test_the_judge_objects_to_worse_poses_alone(tmp_path):
