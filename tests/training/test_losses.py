@@ -123,8 +123,8 @@ def test_colour_terms_are_weighted_l1_and_ssim(masked):
     terms = loss_terms(picture, view, model, TrainSettings(ssim_weight=0.3))
     recorded = view.pixels.numpy() / 255.0
     shown = np.where(ego_mask[..., None], recorded, picture.image.numpy())
-    assert float(terms["l1"]) == pytest.approx(0.7 * np.abs(shown - recorded).mean(), rel=1e-5)
-    assert float(terms["ssim"]) == pytest.approx(0.3 * (1.0 - zero_padded_ssim(shown, recorded)), abs=1e-4)
+    assert float(terms["l1"].detach()) == pytest.approx(0.7 * np.abs(shown - recorded).mean(), rel=1e-5)
+    assert float(terms["ssim"].detach()) == pytest.approx(0.3 * (1.0 - zero_padded_ssim(shown, recorded)), abs=1e-4)
 
 
 def test_regularizers_are_weighted_means_over_all_gaussians():
