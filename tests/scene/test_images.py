@@ -102,6 +102,14 @@ def test_labels_keep_their_values_when_a_mask_is_resized(tmp_path):
     np.testing.assert_array_equal(read_mask(tmp_path / "sky.png", (2, 1)), [[255, 0]]), "black and white"
 
 
+def test_a_mask_of_colours_or_more_than_8_bits_is_refused(tmp_path):
+    for mode in ("RGB", "RGBA", "I;16", "I", "F", "CMYK"):
+        content = np.random.default_rng(0).bytes(8 * 6 * {"RGB": 3, "I;16": 2}.get(mode, 4))
+        Image.frombytes(mode, (8, 6), content).save(tmp_path / "mask.tif")
+        with pytest.raises(DatasetError, match=r"mask\.tif has colours or more than 8 bits"):
+            read_mask(tmp_path / "mask.tif", (8, 6))
+
+
 def camera() -> np.ndarray:
     """A camera-to-world pose: at (5, -2, 1.5), looking along world y, its image's x along world x, y down."""
     return rigid(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), np.array([5.0, -2.0, 1.5]))

@@ -21,6 +21,12 @@ NUSCENES = {
     "vehicle.truck": "truck",
 }  # fmt: skip
 """All 23 classes of nuScenes."""
+OTHERS = {
+    "car": "car", "pedestrian": "pedestrian", "other_vehicle": "vehicle", "bus": "bus", "truck": "truck", "CAR": "car",
+    "motorcycle": "motorcycle", "emergency_vehicle": "vehicle", "bicycle": "bicycle", "vehicle.ego.car": "vehicle",
+    "traffic_cone": "other_movable",
+}  # fmt: skip
+"""Classes of other tables in its layout."""
 
 
 def test_every_class_of_nuscenes_has_an_object_class_with_the_properties_of_its_prefix():
@@ -29,6 +35,7 @@ def test_every_class_of_nuscenes_has_an_object_class_with_the_properties_of_its_
         assert known.value == expected
         assert (known.is_vehicle, known.is_human) == (kind == "vehicle", kind == "human"), category
         assert known.is_dynamic == (kind in ("vehicle", "human", "animal")), category
+    assert {name: object_class(name).value for name in OTHERS} == OTHERS
 
 
 def test_vehicles_move_above_1_metre_per_second_pedestrians_above_0_3_others_never():

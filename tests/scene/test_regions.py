@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.classed import classed
-from helpers.drives import CAMERA_AT, CAMERA_TO_EGO, Thing, World, cast, scene_at, seconds_of, write_world
+from helpers.drives import CAMERA_AT, Thing, World, drive, shows, true_depths
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
@@ -100,24 +100,20 @@ def test_a_box_behind_the_near_plane_has_no_hull(z):
     assert hull_of(box((0.0, 0.0, z), (1.0, 1.0, 1.5)), np.eye(4), K) is None
 
 
-def rays_of(frame: Frame, world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (3,) and rays (h * w, 3) of the frame's camera in the drive, at SIZE, one a pixel centre."""
-    focal = 0.62 * SIZE[0]
-    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5 - SIZE[0] / 2, np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2)
-    rays = np.stack([x / focal, y / focal, np.ones_like(x)], axis=-1).reshape(-1, 3) @ CAMERA_TO_EGO.T
-    return world.ego_at(seconds_of(frame.timestamp)) + CAMERA_AT, rays
+LARGER = World(width=SIZE[0], height=SIZE[1])
 
 
-def cast_mask(frame: Frame, world: World, category: str, alone: bool = False) -> np.ndarray:
-    """The pixels (h, w) in which an object of the world is visible; `alone`: ignoring occlusion."""
-    origin, rays = rays_of(frame, world)
-    mine = [thing for thing in world.things if thing.category == category]
-    others = [thing for thing in world.things if thing.category != category]
-    present = dataclasses.replace(world, things=mine if alone else world.things)
-    absent = dataclasses.replace(world, things=[] if alone else others)
-    with_it, _ = cast(present, origin, rays, seconds_of(frame.timestamp))
-    without, _ = cast(absent, origin, rays, seconds_of(frame.timestamp))
-    return (with_it < without).reshape(SIZE[1], SIZE[0])
+def visible(frame: Frame, category: str) -> np.ndarray:
+    """The pixels (h, w) of a frame of SIZE in which the thing of this class is seen."""
+    others = [thing for thing in LARGER.things if thing.category != category]
+    without = true_depths(dataclasses.replace(LARGER, things=others), frame)
+    return (true_depths(LARGER, frame) < without)[..., 0]
+
+
+def alone(frame: Frame, category: str) -> np.ndarray:
+    """The same, whatever is before it."""
+    (thing,) = (thing for thing in LARGER.things if thing.category == category)
+    return shows(LARGER, frame, thing)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -135,13 +131,12 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("index", [1, 4])
 def test_labels_of_the_tiny_drive_match_its_visible_objects(tiny_scene, category, label, index):
     frame = tiny_scene.frames[index]
-    seen_alone = cast_mask(frame, World(), category, alone=True)
+    seen_alone = alone(frame, category)
     labels = label_image(tiny_scene, frame, SIZE)
     marked = labels == LABELS[label]
-    visible = cast_mask(frame, World(), category)
     nearer_thing = (labels != LABELS["static"]) & ~marked
     assert seen_alone.sum() > 200
-    assert (marked | nearer_thing)[visible].mean() > 0.98
+    assert (marked | nearer_thing)[visible(frame, category)].mean() > 0.98
     assert iou(marked, seen_alone & ~nearer_thing) > 0.6
 
 
@@ -149,10 +144,8 @@ def test_an_object_between_key_frames_is_labelled_at_its_interpolated_position(t
     """Not at its position at the nearest key frame, 215 ms earlier."""
     frame = next(f for f in tiny_scene.frames if not f.is_key_frame)
     marked = label_image(tiny_scene, frame, SIZE) == LABELS["moving_car"]
-    now = cast_mask(frame, World(), "vehicle.car", alone=True)
-    then = cast_mask(
-        dataclasses.replace(frame, timestamp=frame.timestamp - 215_000), World(), "vehicle.car", alone=True
-    )
+    earlier = dataclasses.replace(frame, timestamp=frame.timestamp - 215_000)
+    now, then = alone(frame, "vehicle.car"), alone(earlier, "vehicle.car")
     assert iou(marked, now) > iou(marked, then)
 
 
@@ -202,7 +195,7 @@ def test_one_box_without_annotated_visibility_makes_it_estimated():
 
 def test_boxes_under_100_pixels_are_left_out(tmp_path):
     things = [Thing("vehicle.car", (4.0, 2.0, 1.6), (12.0, 0.0, 0.8))]
-    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=things, sweeps_between=0)))
+    scene = drive(tmp_path, *things, key_frames=2, sweeps_between=0)
     seen_as = {}
     for width in range(32, 97, 4):
         labels = label_image(scene, scene.frames[0], (width, width * 9 // 16))
@@ -215,14 +208,16 @@ def test_boxes_under_100_pixels_are_left_out(tmp_path):
 def test_the_nearer_box_wins_whatever_the_order_of_tracks(tmp_path):
     near = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8))
     far = Thing("vehicle.truck", (6.0, 6.0, 4.0), (25.0, 0.0, 2.0))
-    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=[near, far], sweeps_between=0)))
+    scene = drive(tmp_path, near, far, key_frames=2, sweeps_between=0)
+    car, truck = (
+        label_image(dataclasses.replace(scene, tracks=only(scene, name)), scene.frames[0], SIZE) > 0
+        for name in ("vehicle.car", "vehicle.truck")
+    )
+    assert (truck & car).any() and (truck & ~car).any(), "the boxes must overlap in the image"
     for tracks in (scene.tracks, scene.tracks[::-1]):
         labels = label_image(dataclasses.replace(scene, tracks=tracks), scene.frames[0], SIZE)
-        alone = label_image(dataclasses.replace(scene, tracks=only(scene, "vehicle.car")), scene.frames[0], SIZE)
-        both = label_image(dataclasses.replace(scene, tracks=only(scene, "vehicle.truck")), scene.frames[0], SIZE) > 0
-        assert (both & (alone > 0)).any() and (both & (alone == 0)).any(), "the boxes must overlap in the image"
-        np.testing.assert_array_equal(labels == LABELS["parked_car"], alone == LABELS["parked_car"])
-        np.testing.assert_array_equal(labels == LABELS["parked_other_vehicle"], both & (alone == 0))
+        np.testing.assert_array_equal(labels == LABELS["parked_car"], car)
+        np.testing.assert_array_equal(labels == LABELS["parked_other_vehicle"], truck & ~car)
 
 
 def only(scene: Scene, category: str) -> tuple[Track, ...]:
@@ -257,7 +252,7 @@ LARGE = Thing("vehicle.truck", (8.0, 3.0, 4.0), (0.0, 0.0, CAMERA_AT[2]))
     ],
 )
 def test_a_box_is_labelled_by_class_speed_visibility_and_distance(tmp_path, things, expected):
-    scene = scene_at(write_world(tmp_path, World(key_frames=2, things=things, sweeps_between=0)))
+    scene = drive(tmp_path, *things, key_frames=2, sweeps_between=0)
     labels = label_image(scene, scene.frames[0], SIZE)
     assert {name for name, value in LABELS.items() if (labels == value).any()} == {"static", expected}
 
