@@ -83,24 +83,18 @@ def test_a_valid_archive_becomes_the_dataset_which_is_then_left_unchanged(site, 
     assert site.asked == [] and (root / "mine.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("part_only", [False, True])
-def test_other_data_in_the_folder_are_left_unchanged(site, world, tmp_path, part_only):
-    root = tmp_path / "mini"
-    if part_only:
-        shutil.copytree(world, root)
-        (root / "v1.0-mini/sample.json").unlink()
-    else:
-        root.mkdir()
-        (root / "thesis.tex").write_text("years of work")
-    before = files(root)
-    refused(str(root), "datasets.nuscenes.dataroot", call=lambda: download(site.job(root)))
-    assert files(root) == before and site.asked == []
-
-
-def test_nothing_is_fetched_without_accepted_terms(site, tmp_path):
+def test_other_data_in_the_folder_are_left_unchanged_and_terms_must_be_accepted(site, world, tmp_path):
+    foreign, part = tmp_path / "foreign", Path(shutil.copytree(world, tmp_path / "part"))
+    foreign.mkdir()
+    (foreign / "thesis.tex").write_text("years of work")
+    (part / "v1.0-mini/sample.json").unlink()
+    for root in (foreign, part):
+        before = files(root)
+        refused(str(root), "datasets.nuscenes.dataroot", call=lambda root=root: download(site.job(root)))
+        assert files(root) == before and site.asked == []
     job = site.job(tmp_path / "mini").model_copy(update={"accept_nuscenes_terms": False})
     refused("accept_nuscenes_terms: true", "https://www.nuscenes.org/terms-of-use", call=lambda: download(job))
-    assert site.asked == [] and list(tmp_path.iterdir()) == []
+    assert site.asked == [] and set(tmp_path.iterdir()) == {foreign, part}
 
 
 def test_a_kept_archive_is_unpacked_without_network(site, world, tmp_path, caplog):

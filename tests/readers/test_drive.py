@@ -329,9 +329,9 @@ def lidar_alone(content, folder, tmp_path) -> Path:
     return rewritten(folder, tmp_path / "0001", less)
 
 
-def test_lidar_alone_is_read(lidar_alone, recorded):
+def test_lidar_alone_is_read_checked_and_drawn_from_above(lidar_alone, recorded, capsys):
     """Its key frames are the sweeps, and its world begins at the first one."""
-    scene = read(lidar_alone, source())
+    scene = extract_scene(source(cameras=()), lidar_alone)
     assert scene.frames == scene.cameras == () and [lidar.name for lidar in scene.lidars] == ["LIDAR_TOP"]
     np.testing.assert_array_equal(scene.key_frame_timestamps, [sweep.timestamp for sweep in recorded.sweeps])
     assert all(sweep.is_key_frame for sweep in scene.sweeps) and scene.seconds(scene.sweeps[2].timestamp) > 0
@@ -339,6 +339,12 @@ def test_lidar_alone_is_read(lidar_alone, recorded):
     for one, other in zip(scene.sweeps, recorded.sweeps, strict=True):
         np.testing.assert_allclose(one.sensor_to_world[:3, 3] + moved, other.sensor_to_world[:3, 3], atol=1e-9)
     assert len(scene.tracks) == len(recorded.tracks)
+    assert main(["check", str(lidar_alone)]) == 0
+    said = capsys.readouterr().out
+    assert "no images: methods that render LiDAR are trained and measured with cameras: []" in said
+    pixels = np.asarray(Image.open(lidar_alone / "check.png"))
+    assert pixels.shape == (960, 960, 3) and (pixels == (255, 90, 0)).all(axis=2).sum() > 100
+    assert (pixels[20:].max(axis=2) > 0).sum() > 1000, "returns"
 
 
 def test_sensors_that_a_drive_lacks_are_refused_in_a_line(lidar_alone, content, folder, tmp_path):
@@ -352,23 +358,11 @@ def test_sensors_that_a_drive_lacks_are_refused_in_a_line(lidar_alone, content, 
         extract_scene(source(cameras=(), scene="images_alone"), images_alone)
 
 
-def test_without_cameras_a_drive_is_extracted_from_its_sweeps(lidar_alone, folder):
-    """Of a drive with images, too, whose key frames are then those of its images."""
-    alone = extract_scene(source(cameras=()), lidar_alone)
-    assert alone.frames == () and len(alone.sweeps) == len(alone.key_frame_timestamps) > 3 and alone.dataset == "mine"
+def test_without_cameras_a_drive_with_images_has_their_key_frames(folder):
     beside_images, with_images = extract_scene(source(cameras=()), folder), extract_scene(source(), folder)
     assert beside_images.frames == beside_images.cameras == ()
     assert [sweep.token for sweep in beside_images.sweeps] == [sweep.token for sweep in with_images.sweeps]
     np.testing.assert_array_equal(beside_images.key_frame_timestamps, with_images.key_frame_timestamps)
-
-
-def test_lidar_alone_is_checked_and_drawn_from_above(lidar_alone, capsys):
-    assert main(["check", str(lidar_alone)]) == 0
-    said = capsys.readouterr().out
-    assert "no images: methods that render LiDAR are trained and measured with cameras: []" in said
-    pixels = np.asarray(Image.open(lidar_alone / "check.png"))
-    assert pixels.shape == (960, 960, 3) and (pixels == (255, 90, 0)).all(axis=2).sum() > 100
-    assert (pixels[20:].max(axis=2) > 0).sum() > 1000, "returns"
 
 
 @pytest.fixture

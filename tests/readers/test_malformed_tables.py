@@ -262,7 +262,7 @@ def test_a_damaged_row_of_a_sensor_that_is_not_read_refuses_no_drive(root):
 
 
 @pytest.mark.parametrize("speed", [110.0, 130.0])
-def test_a_track_and_an_ego_vehicle_that_jump_are_warned_of(root, caplog, speed):
+def test_tracks_that_jump_are_warned_of_with_id_and_times(root, caplog, speed):
     """A parked truck is moved once, at the second key frame."""
 
     def jump(rows: list[dict]) -> None:

@@ -252,7 +252,7 @@ def test_a_bad_image_stops_the_extraction_naming_key_frame_token_and_path(root, 
         assert part in str(failure.value)
 
 
-def test_bad_images_are_skipped_and_counted_with_on_missing_warn_unless_all_are_bad(root, caplog):
+def test_a_bad_image_is_skipped_and_counted_with_on_missing_warn(root, caplog):
     for index, fault in enumerate(("missing", "deep")):
         FAULTS[fault](image_of(root, index))
     with caplog.at_level(logging.WARNING):
@@ -302,7 +302,7 @@ def test_a_bad_lidar_file_stops_the_seeding_naming_key_frame_token_and_path(root
         path.write_bytes(whole)
 
 
-def test_bad_lidar_files_are_counted_with_on_missing_warn(root, caplog):
+def test_a_bad_lidar_file_is_counted_with_on_missing_warn(root, caplog):
     for index, fault in enumerate(("missing", "in millimetres")):
         SWEEP_FAULTS[fault](sweep_of(root, index))
     scene = extract_scene(source(), root)

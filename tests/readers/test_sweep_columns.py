@@ -33,7 +33,7 @@ def test_intensities_of_other_programs_are_between_0_and_1(name, tmp_path):
     np.testing.assert_allclose(read_file(path).intensity.max(), 1.0 / 255.0), "8 bits count to 255, however dark"
 
 
-def test_what_no_rule_covers_is_refused(tmp_path):
+def test_values_that_no_rule_covers_are_refused(tmp_path):
     for columns, words in (
         ({"scalar_intensity": 300.0 * VALUES}, "divide them"),
         ({"intensity": VALUES}, "has intensities up to 255; divide them"),

@@ -279,7 +279,7 @@ def labelled(drive: Drive, **changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("version", WRITERS)
-def test_wrong_values_are_named(version, drive, tmp_path):
+def test_wrong_values_are_named_in_both_versions(version, drive, tmp_path):
     for fault, (change, words) in wrong_values(drive).items():
         with fresh(tmp_path) as folder:
             root = WRITERS[version](folder / "data", replace(drive, **change))
