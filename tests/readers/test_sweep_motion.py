@@ -37,14 +37,14 @@ def pose_record(pose: np.ndarray) -> dict[str, Any]:
     return {"translation": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
 
 
-def offsets(count: int = 2000) -> np.ndarray:
+def offsets(count: int = 500) -> np.ndarray:
     """Times of points, half a revolution of 0.1 s before the sweep's timestamp to half a revolution after it."""
     return np.linspace(-0.05, 0.05, count)
 
 
 def seen(time: int) -> tuple[np.ndarray, np.ndarray]:
     """Static points (n, 3) in the sensor's frame at the sweep's time, and each in its frame at its own time."""
-    at_sweep = np.random.default_rng(time).uniform([-40, -40, -2], [40, 40, 5], (2000, 3))
+    at_sweep = np.random.default_rng(time).uniform([-40, -40, -2], [40, 40, 5], (500, 3))
     now = (time - BEGIN) * 1e-6
     world = apply(ego_at(now) @ MOUNT, at_sweep)
     own = [apply(inverse(ego_at(now + t) @ MOUNT), p[None])[0] for t, p in zip(offsets(), world, strict=True)]
