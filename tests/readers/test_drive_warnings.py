@@ -169,7 +169,9 @@ def test_a_sound_drive_is_not_warned_of(sound):
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_named_with_its_cause(name, sound):
+def test_a_mistake_is_named_with_its_cause(name, sound, monkeypatch):
+    if not name.startswith("camera"):  # the comparison of images takes most of the time
+        monkeypatch.setattr(f"{drive_warnings.__module__}.image_warnings", lambda scene, sweeps: [])
     change, words = MISTAKES[name]
     found = drive_warnings(change(sound))
     assert any(words in sentence for sentence in found), found
