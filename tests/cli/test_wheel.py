@@ -18,13 +18,8 @@ from drivesplat.provenance.code_digest import code_digest
 
 FOLDERS = ("envs", "presets", "profiles", "report", "rules", "workflow_scripts")
 FILES = (
-    "Snakefile",
-    "config.yaml",
-    "config.schema.json",
-    "docs/ghosts.md",
-    "docs/images/ghosts.webp",
-    "docs/settings.md",
-)
+    "Snakefile", "config.yaml", "config.schema.json", "docs/ghosts.md", "docs/images/ghosts.webp", "docs/settings.md",
+)  # fmt: skip
 PLACE = "drivesplat/_workflow"
 
 
