@@ -166,12 +166,17 @@ def test_no_script_reads_results_but_by_a_reader_that_is_tested():
     assert used <= tested
 
 
+def dotted(node: ast.expr) -> str:
+    """The name of what is called, 'torch.load', where '()' stands for any other expression."""
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else "()"
+
+
 @cache
 def calls(path: Path) -> list[tuple[str, ast.Call]]:
     """The calls in a module, by what is called: 'torch.load', 'open'."""
-    return [
-        (ast.unparse(node.func), node) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
-    ]
+    return [(dotted(node.func), node) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
 
 
 EXECUTES = {

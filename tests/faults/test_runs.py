@@ -46,8 +46,8 @@ def planning(copy: WorkflowCopy, *targets: str) -> str:
     with chdir(copy.folder), pytest.raises(DriveSplatError) as refused:
         plan = Plan(copy.config, str(REPOSITORY))
         plan.edits()
-        plan.refuse_unknown(targets)
-        plan.refuse_absent_data(targets)
+        plan.refuse_unknown([*targets])
+        plan.refuse_absent_data([*targets])
     assert "\n" not in str(refused.value)
     return str(refused.value)
 
