@@ -209,6 +209,8 @@ def trained(finished_run, tmp_path_factory) -> WorkflowCopy:
         for path in (copy.folder / "results/0001" / method / ".digests").iterdir():
             if path.stem not in ("train.json", "checkpoint.npz"):
                 path.unlink()
+    trained = [f"results/0001/{method}/train.json" for method in TWO_METHODS]
+    assert copy.planned(*trained) == {}, "and the plan has written its tables for the copied data"
     return copy
 
 
