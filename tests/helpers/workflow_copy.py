@@ -7,6 +7,8 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
@@ -95,6 +97,17 @@ class WorkflowCopy:
 
     def write_config(self, text: str | None = None) -> None:
         (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))
+
+    @contextmanager
+    def set_to(self, **config: Any) -> Iterator[None]:
+        """Other values of the config for a while."""
+        before, self.config = self.config, {**self.config, **config}
+        self.write_config()
+        try:
+            yield
+        finally:
+            self.config = before
+            self.write_config()
 
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "snakemake", *self._arguments(*arguments)]
