@@ -77,6 +77,13 @@ def assert_same_gradients(results: list[Any], inputs: list[torch.Tensor], atol: 
         torch.testing.assert_close(ours, theirs, atol=atol, rtol=rtol)
 
 
+def a_pose() -> torch.Tensor:
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=0).as_matrix())
+    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
+    return pose
+
+
 def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(seed).uniform(size=(height, width)) < share).to(DEVICE)
 
@@ -85,8 +92,7 @@ def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tens
     ("height", "width", "hidden", "moving"),
     [
         pytest.param(10, 45, True, True, id="wider than a block, and no multiple of it"),
-        pytest.param(10, 45, False, False, id="no masks"),
-        pytest.param(3, 4, False, True, id="smaller than a window"),
+        pytest.param(3, 4, False, False, id="smaller than a window, without masks"),
     ],
 )
 def test_color_differences_and_their_gradients_agree_with_torch(height, width, hidden, moving):
@@ -116,8 +122,8 @@ def test_an_empty_moving_mask_gives_no_difference_and_no_gradient():
     assert float(moving.detach()) == 0.0 and not image.grad.any()
 
 
-@pytest.mark.parametrize("count", [1, 130])
-def test_the_first_iterations_of_values_that_are_not_finite_agree_with_torch(count):
+def test_the_first_iterations_of_values_that_are_not_finite_agree_with_torch():
+    count = 130
     values = torch.linspace(-3.0, 3e38, count, device=DEVICE)
     values[::3], values[1::5], values[2::7] = torch.nan, torch.inf, -torch.inf
     found = []
@@ -135,12 +141,12 @@ def test_adam_steps_agree_with_torch():
     from drivesplat.kernels.triton.adam import adam_step as fused_step
 
     torch.manual_seed(0)
-    theirs = torch.randn(700, 3, device=DEVICE)
+    theirs = torch.randn(400, 3, device=DEVICE)
     mine, rate = theirs.clone(), torch.tensor(0.02, device=DEVICE)
     states = {"exp_avg": torch.zeros_like(mine), "exp_avg_sq": torch.zeros_like(mine), "step": rate.new_zeros(())}
     broken = rate.new_zeros(())
     adam = torch.optim.Adam([theirs], lr=0.02, eps=1e-15, fused=True)
-    for step in range(25):
+    for step in range(8):
         theirs.grad = torch.randn_like(theirs) * 10.0 ** -(step % 7)
         rate.fill_(0.02 * 0.9**step)
         adam.param_groups[0]["lr"] = 0.02 * 0.9**step
@@ -151,7 +157,7 @@ def test_adam_steps_agree_with_torch():
     assert broken == 0.0
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1e25])
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf, 1e25])
 @pytest.mark.parametrize("used", [True, False])
 def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
     """Or its square. Triton's kernel does so for good: a later gradient may be finite again."""
@@ -166,7 +172,7 @@ def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
     assert found == [True, False, not used]
 
 
-@pytest.mark.parametrize(("objects", "annotations"), [(1, 1), (3, 20), (40, 700)])
+@pytest.mark.parametrize(("objects", "annotations"), [(3, 20), (40, 300)])
 def test_corrected_poses_and_their_gradients_agree_with_torch(objects, annotations):
     torch.manual_seed(0)
     quats = F.normalize(torch.randn(objects, 4, device=DEVICE), dim=1)
@@ -178,7 +184,7 @@ def test_corrected_poses_and_their_gradients_agree_with_torch(objects, annotatio
     assert_same_gradients([expected, found], [yaw, shifts], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("coefficients", [1, 4, 9])
+@pytest.mark.parametrize("coefficients", [1, 4])
 def test_rotations_of_harmonics_by_quaternions_agree_with_torch(coefficients):
     torch.manual_seed(0)
     quats = F.normalize(torch.randn(40, 4, device=DEVICE), dim=1)
@@ -187,7 +193,7 @@ def test_rotations_of_harmonics_by_quaternions_agree_with_torch(coefficients):
     torch.testing.assert_close(found, rotation_of_harmonics(rotation_matrix(quats), coefficients), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("annotations", [0, 1, 3, 700])
+@pytest.mark.parametrize("annotations", [0, 3, 400])
 def test_penalties_of_tracks_and_their_gradients_agree_with_torch(annotations):
     """Of two tracks with a gap between them."""
     torch.manual_seed(0)
@@ -199,18 +205,14 @@ def test_penalties_of_tracks_and_their_gradients_agree_with_torch(annotations):
     assert_same_gradients(results, [yaw, shifts], atol=1e-3, rtol=1e-4)
 
 
-@pytest.mark.parametrize("degree", [0, 1])
-@pytest.mark.parametrize("coefficients", [1, 4, 9])
-@pytest.mark.parametrize("wider", [False, True])
+@pytest.mark.parametrize(
+    ("degree", "coefficients", "wider"), [(0, 1, False), (1, 4, True), (0, 9, True), (1, 9, False)]
+)
 def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients, wider):
     """Also where the colours are columns of a `wider` tensor."""
-    if degree == 1 and coefficients == 1:
-        pytest.skip("there are none of that degree")
     torch.manual_seed(0)
-    pose = torch.eye(4)
-    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=0).as_matrix())
-    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
-    sizes = ((700, 3), (700, 1, 3), (700, coefficients - 1, 3))
+    pose = a_pose()
+    sizes = ((300, 3), (300, 1, 3), (300, coefficients - 1, 3))
     inputs = [torch.randn(size, device=DEVICE).requires_grad_() for size in sizes]
     basis = sh_basis(coefficients, F.normalize(inputs[0] - pose[:3, 3].to(DEVICE), dim=1))
     used = (degree + 1) ** 2
@@ -219,7 +221,7 @@ def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients, wider)
     with triton(True):
         found = fused_view_colors(*inputs, pose.to(DEVICE), degree)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    beside = torch.ones(700, 1, device=DEVICE)
+    beside = torch.ones(300, 1, device=DEVICE)
     results = [[torch.cat([colors, beside], dim=1) if wider else colors] for colors in (expected, found)]
     assert_same_gradients(results, inputs, atol=1e-4, rtol=1e-4)
 
@@ -234,13 +236,11 @@ def test_no_fused_view_colors_without_triton_or_for_a_learned_camera_or_a_high_d
         assert fused_view_colors(*values, pose, 1) is None
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 2])
 def test_colors_of_all_gaussians_have_all_coefficients(degree):
     """Also of those behind the camera and beside its view."""
     torch.manual_seed(0)
-    pose = torch.eye(4)
-    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
-    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
+    pose = a_pose()
     means, sh = torch.randn(300, 3, device=DEVICE), torch.randn(300, (degree + 1) ** 2, 3, device=DEVICE)
     basis = sh_basis((degree + 1) ** 2, F.normalize(means - pose[:3, 3].to(DEVICE), dim=1))
     expected = ((basis[..., None] * sh).sum(dim=1) + 0.5).clamp(min=0.0)
@@ -263,7 +263,7 @@ def test_colors_of_several_sets_equal_those_of_one():
     torch.testing.assert_close(found[0], found[1])
 
 
-@pytest.mark.parametrize("counts", [(1500,), (1500, 0, 2100), (1, 1)])
+@pytest.mark.parametrize("counts", [(1, 1), (1100, 0, 300)])
 def test_regularized_means_over_sets_and_their_gradients_agree_with_torch(counts):
     torch.manual_seed(0)
     sets = []
@@ -280,8 +280,8 @@ def test_regularized_means_over_sets_and_their_gradients_agree_with_torch(counts
     assert_same_gradients([expected, found], [values for own in sets for values in own], atol=1e-9, rtol=1e-5)
 
 
-@pytest.mark.parametrize("count", [1, 1500])
-def test_the_mean_thickness_and_its_gradient_agree_with_torch(count):
+def test_the_mean_thickness_and_its_gradient_agree_with_torch():
+    count = 1100
     torch.manual_seed(count)
     scales = torch.rand(count, 3, device=DEVICE).requires_grad_()
     expected, found = both_ways(lambda: [mean_thickness(scales)])
@@ -293,8 +293,7 @@ def test_the_mean_thickness_and_its_gradient_agree_with_torch(count):
         assert mean_thickness(broken).isnan()
 
 
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("width", [1, 77])
+@pytest.mark.parametrize(("masked", "width"), [(False, 77), (True, 1), (True, 77)])
 def test_the_entropy_of_alpha_and_its_gradient_agree_with_torch(masked, width):
     torch.manual_seed(width)
     alpha = (1.2 * torch.rand(23, width, device=DEVICE) - 0.1).clamp(0.0, 1.0).requires_grad_()
@@ -312,7 +311,7 @@ def test_the_entropy_of_alpha_and_its_gradient_agree_with_torch(masked, width):
         assert mean_entropy(broken).isnan() and mean_cross_entropy(broken, empty).isnan()
 
 
-@pytest.mark.parametrize(("count", "room"), [(1, 1), (19, 19), (0, 40), (20, 40), (2500, 2500), (1700, 2100)])
+@pytest.mark.parametrize(("count", "room"), [(19, 19), (0, 40), (2500, 2500), (1700, 2100)])
 def test_errors_of_depth_and_their_gradient_agree_with_torch(count, room):
     torch.manual_seed(room)
     depth = (1.0 + 8.0 * torch.rand(60, 50, device=DEVICE)).requires_grad_()
@@ -338,7 +337,7 @@ def test_of_equal_errors_of_depth_those_that_count_share_their_weight():
     torch.testing.assert_close(gradient, torch.full_like(depth, -1.0 / 40.0))
 
 
-@pytest.mark.parametrize("count", [0, 1, 700])
+@pytest.mark.parametrize("count", [0, 300])
 def test_the_response_to_a_lidar_and_its_gradients_agree_with_torch(count):
     torch.manual_seed(count)
     means, sensor = 20.0 * torch.randn(count, 3, device=DEVICE), torch.tensor([1.0, -2.0, 1.8], device=DEVICE)
@@ -350,7 +349,7 @@ def test_the_response_to_a_lidar_and_its_gradients_agree_with_torch(count):
     assert expected[0].shape == (count, 2)
 
 
-@pytest.mark.parametrize("listed", [1, 37, 64])
+@pytest.mark.parametrize("listed", [1, 37])
 def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed, monkeypatch):
     """Triton, and without it numba on the CPU. A road of one cell, with gaps, and of all cells; Gaussians out of reach,
     outside and of opacity 0 among them; more blocks than the sum of all reads at a time."""
@@ -360,10 +359,10 @@ def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed, monk
     normals = F.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.1 * torch.randn(listed, 3), dim=1)
     cells = SparseGrid(torch.tensor([-4.0, -4.0]), 1.0, (8, 8), keys)
     road = Road(cells, normals, 0.1 * torch.randn(listed), torch.rand(listed), 0.4).to(DEVICE)
-    means = torch.rand(1500, 3, device=DEVICE) * torch.tensor([10.0, 10.0, 1.0], device=DEVICE) - 0.5
+    means = torch.rand(800, 3, device=DEVICE) * torch.tensor([10.0, 10.0, 1.0], device=DEVICE) - 0.5
     means[:, :2] -= 4.5
-    scales, quats = 0.3 * torch.rand(1500, 3, device=DEVICE), 2.0 * torch.randn(1500, 4, device=DEVICE)
-    opacities = torch.rand(1500, device=DEVICE)
+    scales, quats = 0.3 * torch.rand(800, 3, device=DEVICE), 2.0 * torch.randn(800, 4, device=DEVICE)
+    opacities = torch.rand(800, device=DEVICE)
     opacities[::3] = 0.0
     inputs = [values.requires_grad_() for values in (means, quats, scales)]
     expected = [by_torch(*inputs, opacities, road)]
@@ -373,10 +372,10 @@ def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed, monk
         assert_same_gradients([[by_torch(*inputs, opacities, road)], found], inputs, atol=1e-7, rtol=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 3])
 def test_an_image_over_a_cube_map_and_its_gradients_agree_with_torch(seed):
-    """For cameras that see edges and corners of the cube, with long focal lengths, which see few texels, and with a
-    rolling shutter."""
+    """For cameras that see edges and corners of the cube, and few texels by a long focal length with a rolling
+    shutter."""
     torch.manual_seed(seed)
     sky = CubemapSky(9, torch.tensor([0.3, 0.5, 0.7]), 1e-2).to(DEVICE)
     texels = sky.params["texels"]
@@ -455,7 +454,7 @@ def test_placed_gaussians_and_their_gradients_agree_with_torch():
     assert_same_gradients(results, [*local, objects.quats, objects.translations], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), (3, 2), (2, 1)])
+@pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), (3, 2)])
 def test_time_varying_colors_and_their_gradients_agree_with_torch(degree, terms):
     torch.manual_seed(1)
     objects, owner, owns = some_objects(requires_grad=False)

@@ -1,4 +1,4 @@
-"""LiDAR scans on the CPU against the reference, which test_scan_reference.py compares with closed forms."""
+"""LiDAR scans on the CPU against the reference, which test_scan_closed_forms.py compares with closed forms."""
 
 from dataclasses import replace
 
@@ -46,22 +46,17 @@ def disagreements(scene: ScanScene, bound: float = AGREEMENT, **options) -> dict
     return differing(found, expected, bound)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(("beams", "firings"), [(1, 1), (5, 7), (8, 32), (9, 33), (20, 130)])
-def test_every_size_of_scan_agrees(seed, beams, firings):
+def test_every_size_of_scan_agrees(beams, firings):
     """A revolution of 7 firings is a single tile that goes all the way round."""
-    scene = random_scan(seed, n=80, rays=even_rays(beams, firings))
+    scene = random_scan(0, n=80, rays=even_rays(beams, firings))
     assert beams * firings == 1 or (scene.render().alpha > 0.1).any()
     assert not disagreements(scene)
 
 
-@pytest.mark.parametrize("seed", [2, 3])
-def test_uneven_beams_in_any_order_agree(seed):
-    assert not disagreements(random_scan(seed, n=120, rays=uneven_rays(seed, 19, 150)))
-
-
 def test_firings_in_any_order_agree():
-    """Clockwise, beginning anywhere, and shuffled: tiles take their borders from their rays."""
+    """Clockwise, beginning anywhere, and shuffled: tiles take their borders from their rays. Beams, too."""
+    assert not disagreements(random_scan(2, n=120, rays=uneven_rays(2, 19, 150)))
     rays = even_rays(9, 100)
     for order in (torch.arange(99, -1, -1), torch.arange(100).roll(37), torch.randperm(100)):
         shuffled = RayGrid(*(getattr(rays, name)[:, order] for name in ("azimuths", "elevations", "offsets_s")))
@@ -74,7 +69,7 @@ def test_azimuths_beyond_one_turn_are_those_within():
     torch.testing.assert_close(turned.render().alpha, scene.render().alpha)
 
 
-@pytest.mark.parametrize("channels", [0, 1, 7])
+@pytest.mark.parametrize("channels", [0, 7])
 def test_any_number_of_channels_agrees(channels):
     scene = random_scan(7, n=50, rays=even_rays(9, 40))
     scene.values = torch.from_numpy(np.random.default_rng(channels).normal(size=(50, channels)))
@@ -109,8 +104,8 @@ def test_extreme_gaussians_agree():
 
 def test_rays_that_end_early_agree():
     """With opaque Gaussians in many layers most lists are not processed to their end."""
-    scene = random_scan(32, n=500, rays=even_rays(10, 70))
-    scene.opacities[:] = torch.linspace(0.6, 1.0, 500)
+    scene = random_scan(32, n=250, rays=even_rays(10, 70))
+    scene.opacities[:] = torch.linspace(0.6, 1.0, 250)
     assert not disagreements(scene)
 
 
@@ -196,10 +191,9 @@ def test_recorded_rays_become_tensors_like_the_gaussians():
     assert [tensor.tolist() for tensor in found] == [array.tolist() for array in (angles, -angles, offsets)]
 
 
-@pytest.mark.parametrize("seed", [35, 36])
-def test_float32_is_near_the_reference(seed):
-    scene = random_scan(seed, n=100, rays=uneven_rays(seed, 16, 100))
-    expected, found = seen_and_gradients(scene, "reference"), seen_and_gradients(scene.float())
+def test_float32_is_near_float64():
+    scene = random_scan(35, n=100, rays=uneven_rays(35, 16, 100))
+    expected, found = seen_and_gradients(scene), seen_and_gradients(scene.float())
     for name, truth in expected.items():
         error = (found[name] - truth).abs().flatten() / truth.abs().max()
         assert float(error.quantile(0.99)) < 1e-3, name
@@ -242,21 +236,18 @@ def test_gradients_of_projected_gaussians_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(seen, [value.requires_grad_() for value in inputs], eps=1e-7, atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_results_are_bitwise_equal_for_every_run_and_number_of_threads(count):
+def test_results_are_bitwise_equal_for_every_run_and_number_of_threads():
     """Of more Gaussians than torch gives to one thread."""
-    scene = random_scan(39, n=70_000, rays=uneven_rays(39, 32, 300)).float()
+    scene = random_scan(39, n=70_000, rays=uneven_rays(39, 16, 100)).float()
     scene.scales = scene.scales * 0.05
-    before = torch.get_num_threads()
+    before, results = torch.get_num_threads(), []
     try:
-        torch.set_num_threads(1)
-        expected = seen_and_gradients(scene, motion=_float(MOTION))
-        torch.set_num_threads(count)
-        for _ in range(2):
-            found = seen_and_gradients(scene, motion=_float(MOTION))
-            assert all(torch.equal(found[name], value) for name, value in expected.items())
+        for count in (1, 2, 2, 3):
+            torch.set_num_threads(count)
+            results.append(seen_and_gradients(scene, motion=_float(MOTION)))
     finally:
         torch.set_num_threads(before)
+    assert all(torch.equal(found[name], value) for found in results[1:] for name, value in results[0].items())
 
 
 class ShapesOfProducts(TorchDispatchMode):
