@@ -533,7 +533,6 @@ NUMBERS |= dict.fromkeys(("first_count", "last_count", "room", "blocks"), "i32")
 NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range", "per_metre", "per_radian"), "fp32")
 IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
-SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.COLUMNS}
 
 RAYS = {"numbers": "*i32", "values": FLOATS}
 DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "last": FLOATS}
@@ -553,6 +552,9 @@ SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
 
 def compiled(kernel, **constants):
+    # constants that are not given are those of its module
+    own = {p.name: kernel.fn.__globals__.get(p.name) for p in kernel.params if p.is_constexpr}
+    constants = own | constants
     kinds = {name: "constexpr" if name in constants else {**IN, **NUMBERS}.get(name, FLOATS)
              for name in kernel.arg_names}
     if kernel in (cube_map._blend, cube_map._gradients):
@@ -564,74 +566,50 @@ def compiled(kernel, **constants):
     source = ASTSource(fn=kernel, signature=kinds, constexprs=places)
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
 
-compiled(probe._increment)
-for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
-    compiled(view_colors._colors, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
-    compiled(view_colors._colors_backward, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
-for k, degree, depth in ((1, 0, True), (4, 1, True), (4, 0, False), (9, 1, False)):
+for module, names in (
+    (probe, "_increment"), (road_distance, "_distances_backward"), (adam, "_step"), (tiles, "_count_tiles _list"),
+    (lidar_response, "_values _values_backward"), (finite, "_record"), (placement, "_place _place_backward"),
+    (regularizers, "_sums _means _spread _thinnest _spread_to_thinnest"), (depth_error, "_errors _gradients"),
+    (scan_tiles, "_count_tiles _compact _list"), (scan_sums, "_pass"), (scan_compositing, "_arrive"),
+    (exploration, "_move"), (cube_map, "_blend _gradients"), (object_poses, "_correct _correct_backward"),
+    (track_penalties, "_sums _gradients"), (chunks, "count_chunks"),
+):
+    for name in names.split():
+        compiled(getattr(module, name))
+for k, degree in ((1, 0), (9, 1)):
+    for kernel in (view_colors._colors, view_colors._colors_backward):
+        compiled(kernel, OTHERS=k - 1, DEGREE=degree)
+for k, degree, depth in ((1, 0, True), (9, 1, False)):
     for kernel in (colored_projection._project, colored_projection._project_backward):
-        compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth, BLOCK=colored_projection.BLOCK)
-compiled(road_distance._distances, STEPS=17, BLOCK=road_distance.BLOCK)
+        compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth)
+compiled(road_distance._distances, STEPS=17)
 compiled(road_distance._mean, BLOCK=road_distance.SUMS)
-compiled(road_distance._distances_backward, BLOCK=road_distance.BLOCK)
-compiled(adam._step, BLOCK=adam.BLOCK)
-compiled(lidar_response._values, BLOCK=lidar_response.BLOCK)
-compiled(lidar_response._values_backward, BLOCK=lidar_response.BLOCK)
-compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
-compiled(regularizers._means, BLOCK=regularizers.BLOCK)
-compiled(regularizers._spread, BLOCK=regularizers.BLOCK)
-compiled(regularizers._thinnest, BLOCK=regularizers.BLOCK)
-compiled(regularizers._spread_to_thinnest, BLOCK=regularizers.BLOCK)
-for masked in (False, True):
-    compiled(alpha_entropy._sums, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
-    compiled(alpha_entropy._gradients, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
-for kernel in (depth_error._errors, depth_error._gradients):
-    compiled(kernel, BLOCK=depth_error.BLOCK)
+for kernel in (alpha_entropy._sums, alpha_entropy._gradients):
+    compiled(kernel, MASKED=True)
 for kernel in (depth_error._refine, depth_error._sum):
-    compiled(kernel, kept_percent=95, BLOCK=depth_error.BLOCK)
-compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
-compiled(tiles._list, BLOCK=tiles.BLOCK)
-compiled(chunks.count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
+    compiled(kernel, kept_percent=95)
 for kernel in (chunks._split, chunks._sum_copies):
-    compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
+    compiled(kernel, CHANNELS=3)
 for kernel in (joined_chunks._composite, joined_chunks._composite_backward):
-    compiled(kernel, CHANNELS=3, WIDTH=4, DEPTH=False, OBJECTS=False)
     compiled(kernel, CHANNELS=4, WIDTH=4, DEPTH=True, OBJECTS=True)
-for motion, moving, parts in ((True, True, 2), (True, False, 2), (True, True, 1), (False, False, 1)):
-    options = {"WITH_MOTION": motion, "MOVING": moving, "PARTS": parts, "BLOCK": scan_projection.BLOCK}
+for motion, moving, parts in ((True, True, 2), (False, False, 1)):
+    options = {"WITH_MOTION": motion, "MOVING": moving, "PARTS": parts}
     compiled(scan_projection._project, STEPS=4, **options)
     compiled(scan_projection._project_backward, **options)
-compiled(scan_tiles._count_tiles, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
-compiled(scan_tiles._compact, BLOCK=scan_tiles.BLOCK)
-compiled(scan_tiles._list, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
-compiled(scan_chunks._copy, CHANNELS=2, BLOCK=scan_chunks.BLOCK)
-compiled(scan_sums._pass, GROUP=scan_sums.GROUP)
-compiled(scan_compositing._arrive, JOINED=scan_compositing.JOINED)
-compiled(scan_sums._composite, CHANNELS=2, WIDTH=2, GROUP=scan_sums.GROUP)
+compiled(scan_chunks._copy, CHANNELS=2)
+compiled(scan_sums._composite, CHANNELS=2, WIDTH=2)
 for kernel in (scan_compositing._join, scan_gradients.remain):
     compiled(kernel, CHANNELS=2, JOINED=scan_compositing.JOINED)
 compiled(scan_gradients.add_gradients, CHANNELS=2, GROUP=scan_sums.GROUP_BACKWARD)
-compiled(exploration._move, BLOCK=exploration.BLOCK)
-compiled(cube_map._blend, BLOCK=cube_map.BLOCK)
-compiled(cube_map._gradients, BLOCK=cube_map.BLOCK)
-for kernel in (object_poses._correct, object_poses._correct_backward):
-    compiled(kernel, BLOCK=object_poses.BLOCK)
-for k in (1, 4):
-    compiled(object_poses._rotate_harmonics, K=k, OBJECTS=object_poses.OBJECTS)
-for kernel in (track_penalties._sums, track_penalties._gradients):
-    compiled(kernel, BLOCK=track_penalties.BLOCK)
-compiled(finite._record, BLOCK=finite.BLOCK)
-compiled(placement._place, BLOCK=placement.BLOCK)
-compiled(placement._place_backward, BLOCK=placement.BLOCK)
+compiled(object_poses._rotate_harmonics, K=4)
 for kernel in (time_varying_colors._colors, time_varying_colors._colors_backward):
-    for k in (1, 4, 16):
+    for k in (1, 16):
         compiled(kernel, TERMS=5, K=k, PADDED=k, BLOCK=time_varying_colors.PRODUCTS // (4 * k**2))
-compiled(color_difference._window_along_rows, TAPS=11, BLOCK=color_difference.BLOCK)
-compiled(color_difference._means_along_rows, HIDDEN=True, TAPS=11, BLOCK=color_difference.BLOCK)
-compiled(color_difference._means_along_rows, HIDDEN=False, hidden=None, TAPS=11, BLOCK=color_difference.BLOCK)
+compiled(color_difference._window_along_rows, TAPS=11)
+compiled(color_difference._means_along_rows, HIDDEN=True, TAPS=11)
 for kernel in (color_difference._similarity, color_difference._gradient):
-    compiled(kernel, HIDDEN=True, MOVING=True, **SIZES)
-    compiled(kernel, HIDDEN=False, MOVING=False, hidden=None, moving=None, **SIZES)
+    compiled(kernel, HIDDEN=True, MOVING=True, TAPS=11)
+    compiled(kernel, HIDDEN=False, MOVING=False, hidden=None, moving=None, TAPS=11)
 """
 
 

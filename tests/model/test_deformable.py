@@ -323,27 +323,3 @@ def test_tracks_with_a_value_that_is_not_finite_are_named(owner, name, row):
     with torch.no_grad():
         getattr(part, owner)[name][row] = math.nan
     assert part.broken_tracks() == ["second"]
-
-
-def test_a_swinging_leg_is_learned():
-    """From where its points are at 40 times; between them it swings on."""
-    track, settings = walker(), DeformableSettings(lattice=LATTICE, fourier=1)
-    rng = np.random.default_rng(5)
-    points = rng.uniform([-0.05, 0.05, -0.9], [0.05, 0.15, 0.0], (60, 3))
-    part = Deformable.from_points([track], [points], [np.full((60, 3), 0.5)], settings, GaussianSettings())
-
-    def truth(time: float) -> torch.Tensor:
-        angle = 0.5 * math.sin(2.0 * math.pi * SPEED * time / STRIDE)
-        return torch.from_numpy(points + np.array([1.0, 0.0, 0.0]) * -angle * points[:, 2:]).float()
-
-    optimizer = torch.optim.Adam([part.shared["lattice"]], lr=0.02)
-    times = rng.uniform(0.0, 4.0, 40)
-    for step in range(200):
-        optimizer.zero_grad()
-        time = times[step % len(times)]
-        (part.local(time_state(part, time)).means - truth(time)).square().sum().backward()
-        optimizer.step()
-    for time in (0.33, 1.71, 3.2):
-        off = (in_box(part, time) - truth(time)).norm(dim=1)
-        moved = (torch.from_numpy(points).float() - truth(time)).norm(dim=1)
-        assert off.mean() < 0.1 * moved.mean() and moved.max() > 0.1

@@ -8,12 +8,10 @@ import pytest
 import torch
 from helpers.hand_made import looking_at
 from helpers.records import training_record_of
-from helpers.samples import EVERYTHING, sampled
+from helpers.samples import sampled
 
-from drivesplat.io.storage import no_provenance
 from drivesplat.model.background import Background
 from drivesplat.model.build import ModelInit, build_model
-from drivesplat.model.checkpoint import TrainedCheckpoint, read_checkpoint, trained_model, write_checkpoint
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import DriftingSeed, drifting_seed, ego_velocities
 from drivesplat.model.splat_model import SplatModel
@@ -22,7 +20,7 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.drifting import DriftingSeedSettings, DriftingSettings
-from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainJob, TrainSettings
+from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier
 from drivesplat.training.loop import Trainer
@@ -75,18 +73,13 @@ def expected_at(part: Drifting, time: float, min_span: float) -> tuple[np.ndarra
 
 @pytest.mark.parametrize("time", [-1.0, 2.3, 8.0])
 def test_a_gaussian_moves_at_its_velocity_and_is_most_opaque_at_its_life_peak(time):
+    """Beyond the training images it goes on, but neither appears nor fades."""
     part = drifting(DriftingSettings(min_span=0.4))
     found = sampled(part, time)
     centres, opacities = expected_at(part, time, 0.4)
     np.testing.assert_allclose(found.means.detach(), centres, atol=1e-5)
     np.testing.assert_allclose(found.opacities.detach(), opacities, atol=1e-6)
-
-
-def test_beyond_the_training_images_gaussians_go_on_but_neither_appear_nor_fade():
-    part = drifting()
-    last, later = sampled(part, SECONDS[1]), sampled(part, SECONDS[1] + 2.0)
-    assert torch.equal(last.opacities, later.opacities) and (last.opacities > 0.0).any()
-    torch.testing.assert_close(later.means - last.means, 2.0 * part.params["velocities"])
+    assert opacities.any()
 
 
 def test_a_gaussian_is_absent_long_before_and_after_its_life_peak():
@@ -210,24 +203,6 @@ def test_drifting_gaussians_are_no_objects_whose_alpha_has_a_loss():
     with torch.no_grad():
         picture = model.render(view)
         assert model.objects_alpha(picture, view) is None
-
-
-@pytest.mark.parametrize("logits", [None, (0.3, 0.9)])
-def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(logits, tmp_path):
-    settings = TrainSettings(cap_max=100, drifting=DriftingSettings(min_span=0.7))
-    model = an_untrained_model(settings, lidar_logits=logits)
-    with torch.no_grad():
-        for value in (value for value in model.parameters() if value.requires_grad):
-            value += 0.2 * torch.randn_like(value)
-    job = TrainJob(parts=("background", "drifting"), sky="none", train=settings, random_seed=0)
-    write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, no_provenance()))
-    rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
-    for time in (-0.2, 0.5, 1.3, 3.5, 9.0):
-        ours, again = (it.at(time, EVERYTHING) for it in (model, rebuilt))
-        assert ours.tensors.keys() == again.tensors.keys() and ("lidar_logits" in ours.tensors) == (logits is not None)
-        assert all(torch.equal(values, again.tensors[name]) for name, values in ours.tensors.items())
-    part, again = model.parts[1], rebuilt.parts[1]
-    assert again.definition() == part.definition() and again.learning_rates() == part.learning_rates()
 
 
 def test_densification_copies_motion_and_life_with_each_gaussian(monkeypatch):

@@ -8,7 +8,7 @@ import torch
 from helpers.hand_made import actor_record, actors_of, looking_at, motion_through, round_gaussians, track_of
 from helpers.records import training_record_of
 from helpers.reference_rays import pixel_rays
-from helpers.samples import sampled
+from helpers.samples import EVERYTHING, sampled
 from scipy.spatial.transform import Rotation
 from torch import nn
 
@@ -17,7 +17,7 @@ from drivesplat.io.storage import no_provenance
 from drivesplat.model import splat_model
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
-from drivesplat.model.build import ModelInit, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
+from drivesplat.model.build import ModelInit, actor_cap, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, read_checkpoint, trained_model, write_checkpoint
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -27,12 +27,14 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.drifting import DriftingSettings
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings
 from drivesplat.trajectories.actor_record import ActorRecord
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SH_C0 = 0.5 / np.sqrt(np.pi)
+STREET = ("background", "actors", "drifting")
 SKY_COLOR = np.array([0.2, 0.4, 0.8])
 
 
@@ -173,23 +175,6 @@ def test_concatenation_keeps_the_colours_of_lower_degrees(degrees):
         torch.testing.assert_close(seen, alone)
 
 
-@pytest.mark.parametrize(
-    ("sky", "antialiased", "max_scale", "sh_degree"),
-    [("none", True, 0.0, 2), ("mask", False, 0.05, 0), ("cubemap", False, 0.0, 2)],
-)
-def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, max_scale, sh_degree):
-    gaussians = GaussianSettings(sh_degree=sh_degree, init_scale=0.5)
-    settings = TrainSettings(antialiased=antialiased, max_scale=max_scale, sky_resolution=4, gaussians=gaussians)
-    model = shaken(build_model(model_init(parser_record(40)), ("background",), sky, settings))
-    rebuilt = rebuild_model(model.state_dict(), definitions(model), sky, settings)
-    picture, again = (m.render(a_view(), sh_degree, with_depth=True) for m in (model, rebuilt))
-    assert float(picture.alpha.detach().max()) > 0.3
-    assert torch.equal(again.image, picture.image) and torch.equal(again.depth, picture.depth)
-    assert rebuilt.parts[0].learning_rates() == model.parts[0].learning_rates()
-    unlimited = SplatModel([*model.parts], model.sky, antialiased).render(a_view(), sh_degree)
-    assert torch.equal(unlimited.image, picture.image) == (not max_scale)
-
-
 def a_track(name: str = "it", start: float = 0.0) -> ActorTrack:
     """Half a second a box, from 3 m before the camera of `a_view` on."""
     times = start + 0.5 * np.arange(4)
@@ -277,26 +262,35 @@ def test_the_alpha_of_dynamic_parts_is_asked_for_beside_the_image_where_they_are
     assert asked[-1] is None
 
 
-@pytest.mark.parametrize("sky", ["none", "cubemap"])
-def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
-    """Places, colours and presence at many times; learning rates and penalties, too. Of a training, in whose course
-    Gaussians came and went."""
-    settings = TrainSettings(sky_resolution=4, actors=ActorSettings(sh_degree=2, fourier=3, cap_max=50))
-    records = [actor_record(a_track(), 10), actor_record(a_track("later", 1.0), 7)]
-    parts = ("background", "actors")
-    model = shaken(build_model(model_init(parser_record(20), *records), parts, sky, settings))
+@pytest.mark.parametrize(
+    ("sky", "logits", "changes"),
+    [("none", (0.3, 0.9), {"antialiased": True}), ("mask", None, {"max_scale": 0.05}), ("cubemap", None, {})],
+)
+def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, logits, changes, tmp_path):
+    """Places, colours and presence at many times; pictures, learning rates and penalties, too. Of a training, in whose
+    course Gaussians came and went."""
+    actors, drifting = ActorSettings(sh_degree=2, fourier=3, cap_max=50), DriftingSettings(min_span=0.7)
+    settings = TrainSettings(sky_resolution=4, actors=actors, drifting=drifting, **changes)
+    records, parts = [actor_record(a_track(), 10), actor_record(a_track("later", 1.0), 7)], STREET
+    init = ModelInit(parser_record(20), records, SKY_COLOR, lidar_logits=logits)
+    model = shaken(build_model(init, parts, sky, settings))
     for value in model.parts[1].params.values():
         value.data = value.data[3:]
     job = TrainJob(parts=parts, sky=sky, train=settings, random_seed=0)
     write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, no_provenance()))
     rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
-    assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
+    assert [part.name for part in rebuilt.parts] == list(parts)
+    assert rebuilt.moving().sum() == 14 + len(model.parts[2]) > 14
     for time in (-0.2, 0.61, 1.8, 5.0):
-        ours, again = model.at(time), rebuilt.at(time)
-        assert all(torch.equal(values, again.tensors[name]) for name, values in ours.tensors.items())
+        ours, again = (it.at(time, EVERYTHING).tensors for it in (model, rebuilt))
+        assert ours.keys() == again.keys() and ("lidar_logits" in ours) == (logits is not None)
+        assert all(torch.equal(values, again[name]) for name, values in ours.items())
+    picture, again = (it.render(a_view(), with_depth=True) for it in (model, rebuilt))
+    assert torch.equal(again.image, picture.image) and torch.equal(again.depth, picture.depth)
+    assert (rebuilt.antialiased, rebuilt.max_scale) == (settings.antialiased, settings.max_scale)
     for part, again in zip(model.parts, rebuilt.parts, strict=True):
-        assert again.learning_rates() == part.learning_rates() and again.extent == part.extent
-        assert again.penalties().keys() == part.penalties().keys()
+        assert again.definition() == part.definition() if part.name == "drifting" else again.extent == part.extent
+        assert again.learning_rates() == part.learning_rates() and again.penalties().keys() == part.penalties().keys()
         assert all(torch.equal(value, part.penalties()[name]) for name, value in again.penalties().items())
     assert [value.requires_grad for value in rebuilt.parameters()] == [v.requires_grad for v in model.parameters()]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.random_scans import REVOLUTION_S, ScanScene, even_rays, random_scan
+from helpers.random_scans import ScanScene, even_rays, random_scan
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.scan_compositing import composite_scan
@@ -221,14 +221,3 @@ def test_motion_is_that_of_rays_rendered_firing_by_firing():
     assert error.max() < 0.05, "where the revolution begins and ends, too"
     assert (exact[:, 0] - exact[:, -1])[seen[:, 0]].abs().median() > 1.0
     assert (found.alpha - alpha).abs().mean() < 0.01
-
-
-def test_a_moving_gaussian_is_where_it_is_when_the_beam_passes_it():
-    """Ahead of a sensor that drives towards it and whose revolution ends behind it, half a revolution later."""
-    scene = ahead([20.0], [0.9], sigma=0.05, rays=even_rays(1, 360))
-    scene.rays = replace(scene.rays, elevations=torch.zeros_like(scene.rays.elevations))
-    motion = ScanMotion(torch.tensor([30.0, 0.0, 0.0]).double(), torch.zeros(3).double())
-    distance = scene.render(motion=motion).range[0, 180].item()
-    assert distance == pytest.approx(20.0 + 30.0 * REVOLUTION_S / 2, abs=1e-6)
-    velocities = torch.tensor([[30.0, 0.0, 0.0]], dtype=torch.float64)
-    assert scene.render(motion=replace(motion, velocities=velocities)).range[0, 180].item() == pytest.approx(20.0)
