@@ -1,10 +1,13 @@
 """The cache of compiled functions is invalidated by every change of code that is compiled into them."""
 
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import pytest
 from helpers import REPOSITORY
 
 CALLEE = (
@@ -30,19 +33,30 @@ while len(list(pathlib.Path().glob("ready-*"))) < 3:
     time.sleep(0.01)
 scaled(eval(sys.argv[1]))
 """
-NO_LOCKS = """
-import errno, fcntl
-
-def flock(*_):
-    raise OSError(errno.ENOLCK, "no locks")
-
-fcntl.flock = flock
-"""
 LOAD = """
 from drivesplat.callee import scaled
 print([scaled(2), scaled(2.0), scaled(2j)], sum(scaled.stats.cache_hits.values()))
 """
-SHOW = "from drivesplat.caller import total\nprint(total(10.0))\nprint(sum(total.stats.cache_hits.values()))\n"
+SERVER = """
+import errno, fcntl, json, os, sys
+from numba import config, njit
+njit("int64(int64)")(lambda number: number)  # sets up the compiler
+def flock(*_):
+    raise OSError(errno.ENOLCK, "no locks")
+for line in sys.stdin:
+    root, variables, locks = json.loads(line)
+    if not os.fork():
+        os.environ.update(variables)
+        config.reload_config()
+        sys.path.insert(0, root)
+        if not locks:
+            fcntl.flock = flock
+        from drivesplat.caller import total
+        print(total(10.0), sum(total.stats.cache_hits.values()), flush=True)
+        os._exit(0)
+    assert os.wait()[1] == 0
+"""
+"""Runs the kernel of each package that it is told in a process of its own, which need not import numba again."""
 
 
 USED = (
@@ -65,24 +79,37 @@ def small_package(root: Path, scale: float = 2.0) -> Path:
     return package
 
 
-def environment(root: Path, **variables: str) -> dict[str, str]:
+def environment(root: Path) -> dict[str, str]:
     """The environment of a process that uses the package at `root`."""
     known = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    return {**known, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1", **variables}
+    return {**known, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def show(root: Path, **variables: str) -> tuple[float, int]:
+@pytest.fixture(scope="module")
+def server(tmp_path_factory) -> Iterator[subprocess.Popen]:
+    nowhere = tmp_path_factory.mktemp("nowhere")
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", SERVER], env=environment(nowhere), cwd=nowhere, **pipes) as process:
+        yield process
+        process.stdin.close()
+
+
+@pytest.fixture
+def show(server) -> Callable[..., tuple[float, int]]:
     """The kernel's value in a new process, and its number of cache hits.
 
     The process writes no bytecode, which Python would also use for another source of the same size and second.
     """
-    env = environment(root, **variables)
-    done = subprocess.run([sys.executable, "-c", SHOW], env=env, cwd=root, capture_output=True, text=True, check=True)
-    value, hits = done.stdout.split()
-    return float(value), int(hits)
+
+    def shown(root: Path, locks: bool = True, **variables: str) -> tuple[float, int]:
+        print(json.dumps([str(root), variables, locks]), file=server.stdin, flush=True)
+        value, hits = server.stdout.readline().split()
+        return float(value), int(hits)
+
+    return shown
 
 
-def test_compiled_code_is_cached_until_an_imported_constant_changes_and_removed_after_two_weeks_unused(tmp_path):
+def test_compiled_code_is_cached_until_an_imported_constant_changes_and_removed_after_two_weeks_unused(show, tmp_path):
     package = small_package(tmp_path)
     assert show(tmp_path) == (22.0, 0)
     assert show(tmp_path) == (22.0, 1)
@@ -97,7 +124,7 @@ def test_compiled_code_is_cached_until_an_imported_constant_changes_and_removed_
     assert list((package / "__pycache__").glob("kernels-caller-*")) == [folders[1]]
 
 
-def test_checkouts_of_the_same_code_share_the_cache_in_a_folder_of_the_users(tmp_path):
+def test_checkouts_of_the_same_code_share_the_cache_in_a_folder_of_the_users(show, tmp_path):
     """Comments and file times do not change the code."""
     caches, roots = tmp_path / "cache", [tmp_path / name for name in ("one", "another")]
     for root in roots:
@@ -111,13 +138,12 @@ def test_checkouts_of_the_same_code_share_the_cache_in_a_folder_of_the_users(tmp
     assert show(roots[1], NUMBA_CACHE_DIR=str(caches)) == (33.0, 0)
 
 
-def test_the_users_cache_replaces_a_read_only_installation_also_where_files_cannot_be_locked(tmp_path):
+def test_the_users_cache_replaces_a_read_only_installation_also_where_files_cannot_be_locked(show, tmp_path):
     package, home = small_package(tmp_path), tmp_path / "home"
     (package / "__pycache__").write_text("a file, so that nothing can be written below it")
-    (tmp_path / "sitecustomize.py").write_text(NO_LOCKS)
     home.mkdir()
-    assert show(tmp_path, HOME=str(home)) == (22.0, 0)
-    assert show(tmp_path, HOME=str(home)) == (22.0, 1)
+    assert show(tmp_path, locks=False, HOME=str(home)) == (22.0, 0)
+    assert show(tmp_path, locks=False, HOME=str(home)) == (22.0, 1)
     assert len(list((home / ".cache" / "drivesplat").glob("kernels-caller-*"))) == 1
 
 
