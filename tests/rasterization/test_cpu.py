@@ -193,7 +193,7 @@ def test_gradients_are_those_of_finite_differences(antialiased):
         return rendering.image, rendering.alpha, rendering.depth
 
     assert float(seen(*inputs)[1].detach().mean()) > 0.1
-    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
+    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def test_too_few_coefficients_for_the_degree_are_an_error():
@@ -203,10 +203,10 @@ def test_too_few_coefficients_for_the_degree_are_an_error():
 
 
 def test_results_are_bitwise_equal_for_every_run_and_number_of_threads():
-    scene = with_harmonics(random_scene(39, n=5000, width=90, height=70), 39, degree=2).float()
+    scene = with_harmonics(random_scene(39, n=2500, width=90, height=70), 39, degree=2).float()
     scene.scales = scene.scales * 0.3
     results = []
-    for count in (1, 1, 2, 2, 3):
+    for count in (1, 2, 2, 3):
         with threads(count):
             results.append(seen_and_gradients(scene, "cpu", sh_degree=2, with_depth=True))
     assert all(torch.equal(found[name], value) for found in results[1:] for name, value in results[0].items())

@@ -193,11 +193,15 @@ def moving_scene() -> tuple[ScanScene, ScanMotion]:
     return scene, motion
 
 
+FIRINGS = [*range(0, 128, 4), 127]
+
+
 def firing_by_firing(scene: ScanScene, motion: ScanMotion) -> tuple[torch.Tensor, torch.Tensor]:
-    """Range and alpha, each firing on its own, from the sensor's pose and with Gaussians placed at its time."""
+    """Range and alpha of FIRINGS, each on its own, from the sensor's pose and with Gaussians placed at its time."""
     columns = []
     sensor_to_world = torch.linalg.inv(scene.world_to_sensor)
-    for j, offset in enumerate(scene.rays.offsets_s[0].tolist()):
+    for j in FIRINGS:
+        offset = scene.rays.offsets_s[0, j].item()
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec(offset * motion.angular.numpy()).as_matrix())
         pose[:3, 3] = offset * motion.linear
@@ -215,9 +219,9 @@ def test_motion_is_that_of_rays_rendered_firing_by_firing():
     found, still = scene.render(motion=motion), scene.render()
     seen = alpha > 0.9
     assert seen.float().mean() > 0.6
-    error, without = (abs(rendering.range - exact)[seen] for rendering in (found, still))
+    error, without = (abs(rendering.range[:, FIRINGS] - exact)[seen] for rendering in (found, still))
     assert error.median() < 0.005 and (error < 0.02).double().mean() > 0.95
     assert without.median() > 0.2
     assert error.max() < 0.05, "where the revolution begins and ends, too"
     assert (exact[:, 0] - exact[:, -1])[seen[:, 0]].abs().median() > 1.0
-    assert (found.alpha - alpha).abs().mean() < 0.01
+    assert (found.alpha[:, FIRINGS] - alpha).abs().mean() < 0.01

@@ -189,7 +189,7 @@ def test_gradients_are_those_of_finite_differences():
         return rendering.range * rendering.alpha, rendering.alpha, rendering.values
 
     assert float(seen(*inputs)[1].detach().mean()) > 0.05
-    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-4, rtol=1e-3)
+    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
 def test_gradients_of_projected_gaussians_are_those_of_finite_differences():
@@ -210,17 +210,17 @@ def test_gradients_of_projected_gaussians_are_those_of_finite_differences():
     limits = limits * 1e6
     assert (seen(scene.values, *inputs)[0] != free).any()
     limits = limits * 1e-6
-    inputs = [scene.values, *inputs]
-    assert torch.autograd.gradcheck(seen, [value.requires_grad_() for value in inputs], eps=1e-7, atol=1e-4, rtol=1e-3)
+    inputs = [value.requires_grad_() for value in (scene.values, *inputs)]
+    assert torch.autograd.gradcheck(seen, inputs, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
 def test_results_are_bitwise_equal_for_every_run_and_number_of_threads():
     """Of more Gaussians than torch gives to one thread."""
-    scene = random_scan(39, n=70_000, rays=uneven_rays(39, 16, 100)).float()
+    scene = random_scan(39, n=40_000, rays=uneven_rays(39, 8, 60)).float()
     scene.scales = scene.scales * 0.05
     before, results = torch.get_num_threads(), []
     try:
-        for count in (1, 2, 2, 3):
+        for count in (1, 2, 3):
             torch.set_num_threads(count)
             results.append(seen_and_gradients(scene, motion=_float(MOTION)))
     finally:
