@@ -37,31 +37,27 @@ def parts_film(scene: Scene, folder: Path, checkpoint: TrainedCheckpoint, **chan
 
 
 def test_scene_static_and_dynamic_parts_are_side_by_side(scene, tmp_path, reels):
-    """Each third is what a model of these parts alone shows; dynamic parts stand before grey instead of the sky."""
+    """Each third is what a model of these parts alone shows, and a film of them; dynamic parts stand before grey
+    instead of the sky."""
     whole = street_model()
     still, actors = street_model(whole.parts[0]), SplatModel([street_actors()], None).requires_grad_(False)
-    record = parts_film(scene, tmp_path, checkpoint_of(whole))
+    checkpoint = checkpoint_of(whole)
+    record = parts_film(scene, tmp_path, checkpoint)
     views = views_of(record, scene)
     assert (record["shows"], len(reels["parts"])) == (["all", "still", "moving"], len(views))
-    for picture, view in zip(reels["parts"], views, strict=True):
-        everything, without, alone = np.split(picture, 3, axis=1)
+    thirds = np.split(reels["parts"], 3, axis=2)
+    for everything, without, alone, view in zip(*thirds, views, strict=True):
         np.testing.assert_array_equal(everything, film_frame(whole, view))
         np.testing.assert_array_equal(without, film_frame(still, view))
         shown = actors.render(view)
         expected = shown.splats + BACKDROP * (1 - shown.alpha[..., None])
         np.testing.assert_allclose(alone, 255 * expected.clamp(max=1.0), atol=0.51)
-    before_grey = (np.split(reels["parts"], 3, axis=2)[2] == round(255 * BACKDROP)).all(axis=-1)
-    assert 0.3 < before_grey.mean() < 0.9
-
-
-@pytest.mark.parametrize(("parts", "panel"), [("all", 0), ("static", 1), ("moving", 2)])
-def test_a_film_of_some_parts_is_the_panel_of_the_film_of_parts(scene, tmp_path, reels, parts, panel):
-    checkpoint = checkpoint_of(street_model())
-    parts_film(scene, tmp_path, checkpoint)
-    job = FilmJob(**a_format().model_dump(), trajectory=TrajectorySettings(parts=parts))
-    record = render_film(scene, checkpoint, job, CPU, tmp_path / "some.mp4")
-    np.testing.assert_array_equal(reels["some"], np.split(reels["parts"], 3, axis=2)[panel])
-    assert record["parts"] == parts and "parts" not in record["offset"]
+    assert 0.3 < (thirds[2] == round(255 * BACKDROP)).all(axis=-1).mean() < 0.9
+    for parts, panel in zip(("all", "static", "moving"), thirds, strict=True):
+        job = FilmJob(**a_format().model_dump(), trajectory=TrajectorySettings(parts=parts))
+        some = render_film(scene, checkpoint, job, CPU, tmp_path / "some.mp4")
+        np.testing.assert_array_equal(reels["some"], panel)
+        assert some["parts"] == parts and "parts" not in some["offset"]
 
 
 def test_rendering_does_not_run_far_ahead_of_the_encoder(scene, tmp_path, monkeypatch):

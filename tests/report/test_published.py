@@ -46,25 +46,25 @@ def report_of(tmp_path, published: list[dict[str, Any]] = FIGURES) -> dict[str, 
     return gap_report(paths, job, NO_LOGS)
 
 
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> dict[str, Any]:
+    return report_of(tmp_path_factory.mktemp("published"))
+
+
 def selected(report: dict[str, Any], **values: Any) -> list[dict[str, Any]]:
     return [row for row in report["published"] if all(row[key] == value for key, value in values.items())]
 
 
-def test_measured_figures_follow_the_published_ones_of_their_scene(tmp_path):
-    report = report_of(tmp_path)
+def test_measured_figures_follow_the_published_ones_of_their_scene_region_group_and_publication(report):
     rows = selected(report, source="A & B 2026", scene="0061", region="all", group="interpolation")
-    assert [(row["method"], row["measured"], row["psnr"]) for row in rows] == [
-        ("SG", False, 22.87), ("<PVG>", False, 22.77), ("vanilla", True, 26.0), ("street", True, 28.0),
-    ]  # fmt: skip
-    assert [(row["ssim"], row["lpips"]) for row in rows] == [(0.65, 0.13), (None, None), (0.8, 0.3), (0.8, 0.3)]
-    assert [(row["train_minutes"], row["gpu"]) for row in rows] == [
-        (None, None), (31.5, "RTX 3090"), (1.5, "cpu"), (1.5, "cpu"),
-    ]  # fmt: skip
+    keys = ("method", "measured", "psnr", "ssim", "lpips", "train_minutes", "gpu")
+    assert [tuple(row[key] for key in keys) for row in rows] == [
+        ("SG", False, 22.87, 0.65, 0.13, None, None),
+        ("<PVG>", False, 22.77, None, None, 31.5, "RTX 3090"),
+        ("vanilla", True, 26.0, 0.8, 0.3, 1.5, "cpu"),
+        ("street", True, 28.0, 0.8, 0.3, 1.5, "cpu"),
+    ]
     assert json.loads(json.dumps(report, allow_nan=False)) == report
-
-
-def test_regions_groups_and_publications_are_compared_apart(tmp_path):
-    report = report_of(tmp_path)
     assert [row["psnr"] for row in selected(report, region="moving_vehicle")] == [23.2, 17.0, 17.0]
     beyond = selected(report, group="extrapolation")
     assert [(row["psnr"], row["ssim"]) for row in beyond] == [(None, 0.5), (21.0, 0.8), (21.0, 0.8)]
@@ -84,30 +84,28 @@ def test_a_scene_whose_compared_figures_are_no_numbers_is_left_out_and_named(tmp
     assert len(report["published"]) == 1
 
 
-def test_the_csv_has_published_figures_in_the_same_columns(tmp_path):
-    write_figures(tmp_path / "with.csv", report_of(tmp_path))
-    write_figures(tmp_path / "without.csv", report_of(tmp_path, []))
-    tables = {}
-    for name in ("with", "without"):
-        with open(tmp_path / f"{name}.csv", newline="", encoding="utf-8") as file:
-            tables[name] = list(csv.DictReader(file))
-    assert list(tables["without"][0]) == list(COLUMNS) and len(tables["without"]) == 4
-    assert list(tables["with"][0]) == [*COLUMNS, "source", "url"]
-    figures = [
-        (row["scene"], row["method"], row["source"], row["interpolation_psnr_frame_mean"]) for row in tables["with"]
-    ]
+def test_the_csv_has_published_figures_in_the_same_columns(tmp_path, report):
+    def table(made: dict[str, Any]) -> list[dict[str, str]]:
+        write_figures(tmp_path / "figures.csv", made)
+        with open(tmp_path / "figures.csv", newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    without, rows = table(report_of(tmp_path, [])), table(report)
+    assert list(without[0]) == list(COLUMNS) and len(without) == 4
+    assert list(rows[0]) == [*COLUMNS, "source", "url"]
+    figures = [(row["scene"], row["method"], row["source"], row["interpolation_psnr_frame_mean"]) for row in rows]
     assert figures[:5] == [
         ("0061", "vanilla", "", "26.0"), ("0061", "street", "", "28.0"), ("0103", "vanilla", "", "28.0"),
         ("0103", "street", "", "30.0"), ("0061", "SG", "A & B 2026", "22.87"),
     ]  # fmt: skip
     assert ("mean", "SG", "A & B 2026", "22.5") in figures and ("mean", "street", "", "29.0") in figures
-    (timed,) = [row for row in tables["with"] if row["method"] == "<PVG>"]
+    (timed,) = [row for row in rows if row["method"] == "<PVG>"]
     assert (timed["train_seconds"], timed["interpolation_psnr"], timed["url"]) == ("1890.0", "", PAPER["url"])
-    assert not any(row["interpolation_psnr_frame_mean"] == "23.2" for row in tables["with"]), "not of whole images"
+    assert not any(row["interpolation_psnr_frame_mean"] == "23.2" for row in rows), "not of whole images"
 
 
-def test_the_page_has_a_table_per_publication_with_its_link(tmp_path):
-    page = report_page(report_of(tmp_path), {})
+def test_the_page_has_a_table_per_publication_with_its_link(report):
+    page = report_page(report, {})
     assert page.count('<table class="published">') == 2
     assert '<h3><a href="https://example.org/a?b=c&amp;d">A &amp; B 2026</a></h3>' in page
     table = page.partition('<table class="published">')[2].partition("</table>")[0]
@@ -123,8 +121,8 @@ def test_the_page_has_a_table_per_publication_with_its_link(tmp_path):
     assert "mean over held-out images of the PSNR of each image" in page
 
 
-@pytest.mark.parametrize("change", [{"method": "</script>"}, {"source": "<img src=x>"}, {"gpu": "<u>"}])
-def test_texts_of_users_are_escaped(tmp_path, change):
-    page = report_page(report_of(tmp_path, [{**FIGURES[0], **change}]), {})
-    (value,) = change.values()
-    assert value not in re.sub(r"</script>\s*(?=<script>|</body>)", "", page)
+def test_texts_of_users_are_escaped(tmp_path):
+    changes = {"method": "</script>", "source": "<img src=x>", "gpu": "<u>"}
+    page = report_page(report_of(tmp_path, [{**FIGURES[0], **changes}]), {})
+    unscripted = re.sub(r"</script>\s*(?=<script>|</body>)", "", page)
+    assert not any(value in unscripted for value in changes.values())

@@ -1,4 +1,5 @@
-"""LiDAR in the report: rows, means, and the tables of the page, the CSV and the console."""
+"""LiDAR and views from beside the recorded path in the report: rows, means, and tables of the page, the CSV and the
+console."""
 
 import copy
 import json
@@ -49,7 +50,7 @@ def report(tmp_path) -> dict[str, Any]:
     return report_of(tmp_path, *RECORDS, methods=METHODS)
 
 
-def test_rows_are_of_methods_that_render_lidar_and_of_the_baselines(report):
+def test_rows_of_lidar_are_of_methods_that_render_it_and_of_baselines_and_means_over_scenes_with_the_figure(report):
     rows = report["lidar"]["rows"]
     assert [(row["scene"], row["method"], row["baseline"]) for row in rows] == [
         (scene, name, name != "street_lidar")
@@ -60,9 +61,6 @@ def test_rows_are_of_methods_that_render_lidar_and_of_the_baselines(report):
     assert rows[3]["interpolation_lidar_moving_vehicle_chamfer_m"] is None
     assert rows[3]["reasons"] == {"interpolation": {"moving_vehicle": FEW}, "extrapolation": {}}
     json.dumps(report, allow_nan=False)
-
-
-def test_means_are_over_scenes_with_the_figure_and_rays_are_summed(report):
     means = {mean["method"]: mean["figures"] for mean in report["lidar"]["means"]}
     assert list(means) == ["street_lidar", "nearest_scan", "neighbouring_scans"]
     own = means["street_lidar"]
@@ -73,8 +71,8 @@ def test_means_are_over_scenes_with_the_figure_and_rays_are_summed(report):
     assert own["interpolation_lidar_moving_vehicle_rays"] == 34720 + 3
 
 
-def page_rows(page: str) -> list[list[str]]:
-    (table,) = re.findall(r'<table class="sortable scans">(.*?)</table>', page, re.S)
+def page_rows(page: str, kind: str = "scans") -> list[list[str]]:
+    (table,) = re.findall(rf'<table class="sortable {kind}">(.*?)</table>', page, re.S)
     rows = re.findall(r"<tr[^>]*>\s*(<td.*?)</tr>", table, re.S)
     return [re.findall(r"<td[^>]*>([^<]*)", row) for row in rows]
 
@@ -113,3 +111,62 @@ def test_a_scene_whose_figures_of_scans_are_no_numbers_is_left_out_and_named(tmp
     assert {row["scene"] for row in report["rows"]} == {row["scene"] for row in report["lidar"]["rows"]} == {"0061"}
     (item,) = report["left_out"]
     assert item["scene"] == "0103" and why in item["why"]
+
+
+BOTH = ("vanilla", "street")
+
+
+def record_aside(scene: str, better: float) -> dict[str, Any]:
+    """A metrics.json with two views beside the path and a left-out camera; PSNRs of `street` are `better` dB higher."""
+
+    def view(static: float, **more: Any) -> dict[str, Any]:
+        return {"static": {"psnr": static}, "moving_vehicle": None, **more}
+
+    def of(more: float) -> dict[str, Any]:
+        far, near = (
+            view(psnr + more, depth={"median_relative_error": off}) for psnr, off in ((20.0, 0.4), (22.0, 0.2))
+        )
+        aside = {"lateral": {"4.0": far, "2.0": near}, "side_camera": {"CAM_BACK": view(18.0 + more)}}
+        return {**method(group(24.0, 17.0), group(22.0, 14.0)), **aside}
+
+    return metrics(scene, {"vanilla": of(0.0), "street": of(better)})
+
+
+@pytest.fixture
+def aside(tmp_path) -> dict[str, Any]:
+    return report_of(tmp_path, record_aside("0061", 1.0), record_aside("0103", 3.0), methods=BOTH)
+
+
+def test_rows_are_by_scene_view_and_method_and_means_over_scenes(aside):
+    rows = aside["aside"]["rows"]
+    assert [(row["view"], row["method"], row["static"], row["depth_error"]) for row in rows[:6]] == [
+        ("2.0", "vanilla", 22.0, 0.2), ("2.0", "street", 23.0, 0.2),
+        ("4.0", "vanilla", 20.0, 0.4), ("4.0", "street", 21.0, 0.4),
+        ("CAM_BACK", "vanilla", 18.0, None), ("CAM_BACK", "street", 19.0, None),
+    ]  # fmt: skip
+    means = {(mean["view"], mean["method"]): mean["figures"] for mean in aside["aside"]["means"]}
+    assert means["2.0", "street"]["static"] == {"mean": 24.0, "low": 23.0, "high": 25.0, "scenes": 2}
+    assert means["CAM_BACK", "street"]["depth_error"] is None and means["2.0", "street"]["moving_vehicle"] is None
+    json.dumps(aside, allow_nan=False)
+
+
+def test_the_page_has_a_row_for_each_view_means_of_several_scenes_and_no_table_without_such_views(aside, tmp_path):
+    rows = page_rows(report_page(aside, {}), "aside")
+    assert len(rows) == 12 + 6
+    assert rows[1] == ["0061", "2 m to the left", "street", "23.0", "–", "20.0%"]
+    assert rows[5] == ["0061", "CAM_BACK, left out", "street", "19.0", "–", "–"]
+    assert rows[13][:4] == ["mean", "2 m to the left", "street", "24.0"]
+    one = report_of(tmp_path / "one", record_aside("0061", 1.0), methods=BOTH)
+    assert len(page_rows(report_page(one, {}), "aside")) == 6
+    bare = metrics("0061", {name: method(group(24.0, 17.0), group(22.0, 14.0)) for name in BOTH})
+    none = report_of(tmp_path / "none", bare, methods=BOTH)
+    assert none["aside"] == {"rows": [], "means": []}
+    assert 'id="aside"' not in report_page(none, {}) and "beside the recorded path" not in console_table(none)
+
+
+def test_a_figure_that_is_no_number_leaves_the_scene_out(tmp_path):
+    broken = record_aside("0061", 1.0)
+    broken["methods"]["street"]["lateral"]["2.0"]["static"]["psnr"] = "high"
+    found = report_of(tmp_path, broken, record_aside("0103", 1.0), methods=BOTH)
+    assert [item["scene"] for item in found["left_out"]] == ["0061"]
+    assert "'high', not a number" in found["left_out"][0]["why"]
