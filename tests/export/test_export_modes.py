@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers.chromium import in_a_browser
 from helpers.hand_made import round_gaussians
-from helpers.hand_made_traffic import TURNING, with_turning_track
+from helpers.hand_made_traffic import TURNING
 from helpers.samples import sampled, sampled_with
 from helpers.viewer_pages import (
     a_model,
@@ -45,6 +45,7 @@ from drivesplat.model.timeline import TimeState
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit
 
+NO_TIMES = np.array([], dtype=np.int64)
 EDITED = {"walked": 0.7, "scale": 1.25, "phase": 0.3}
 
 
@@ -59,8 +60,8 @@ def model(people) -> SplatModel:
 
 
 @pytest.fixture(scope="module")
-def group(model, tiny_scene) -> SampledGroup:
-    return trained_groups(model, with_turning_track(tiny_scene), np.array([], dtype=np.int64), 1.0)[TURNING]
+def group(model, scene) -> SampledGroup:
+    return trained_groups(model, scene, NO_TIMES, 1.0)[TURNING]
 
 
 @pytest.fixture(scope="module")
@@ -157,15 +158,16 @@ def test_people_walk_as_recorded_and_as_edited(opened):
         assert psnr(settled(tab), expected(1.5, {"walked": 0.6}, 1.0)) < 32.0
 
 
-NO_TIMES = np.array([], dtype=np.int64)
-
-
 def means_in_box(people: Deformable, second: float) -> np.ndarray:
     return in_box(people, second).means.detach().numpy()
 
 
-def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, scene):
-    groups = trained_groups(model, scene, NO_TIMES)
+@pytest.fixture(scope="module")
+def groups(model, scene) -> dict[str, SampledGroup]:
+    return trained_groups(model, scene, NO_TIMES)
+
+
+def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, groups):
     shapes = groups[TURNING].shapes
     assert groups["background"].shapes is None, "what is rigid has none"
     assert all(part.shapes("nobody", [0.0]) is None for part in model.parts)
@@ -176,8 +178,7 @@ def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, 
     assert np.abs(shapes.means - shapes.means[0]).max() > 0.05
 
 
-def test_thinned_or_dropped_gaussians_leave_the_others_their_own_shapes(model, people, scene):
-    groups = trained_groups(model, scene, NO_TIMES)
+def test_thinned_or_dropped_gaussians_leave_the_others_their_own_shapes(people, scene, groups):
     kept, whole = thinned_groups(groups, 12)[TURNING], groups[TURNING]
     rows = [int((whole.gaussians.means == mean).all(dim=1).nonzero()) for mean in kept.gaussians.means]
     assert 0 < len(rows) < 30
@@ -191,8 +192,7 @@ def test_thinned_or_dropped_gaussians_leave_the_others_their_own_shapes(model, p
     assert len(finite.gaussians) == 29 and finite.shapes.means.shape[1] == 29
 
 
-def test_usd_plays_positions_orientations_and_extents(model, people, scene, tmp_path):
-    groups = trained_groups(model, scene, NO_TIMES)
+def test_usd_plays_positions_orientations_and_extents(people, scene, groups, tmp_path):
     write_usdz(tmp_path / "a.usdz", splat_stage(groups, [(0.0, Gf.Camera())], {}))
     stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     splat = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"/World/actors/_{TURNING}"))

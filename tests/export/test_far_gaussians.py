@@ -6,6 +6,7 @@ import logging
 import numpy as np
 import pytest
 import torch
+from helpers import hand_made_street
 from helpers.hand_made import Own, looking_at, recording_of, round_gaussians
 from pxr import Usd, UsdGeom
 
@@ -21,7 +22,7 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.export import ExportJob, SplatJob
-from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train import TrainSettings
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {}, "inputs": {}}
@@ -50,9 +51,7 @@ def checkpoint_of(places, sizes, opacities, colors=RED) -> TrainedCheckpoint:
         np.concatenate([near_opacities, np.broadcast_to(opacities, len(places))]),
         np.concatenate([np.tile(BLUE, (len(near_places), 1)), np.broadcast_to(colors, places.shape)]),
     )
-    model = SplatModel([part], ConstantSky(torch.tensor(SKY), 1e-2))
-    job = TrainJob(parts=("background",), sky="mask", train=TrainSettings(), random_seed=0)
-    return TrainedCheckpoint.of(model, job, PROVENANCE)
+    return hand_made_street.checkpoint_of(SplatModel([part], ConstantSky(torch.tensor(SKY), 1e-2)), TrainSettings())
 
 
 def disc_and_scattered() -> TrainedCheckpoint:

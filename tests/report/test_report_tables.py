@@ -1,19 +1,22 @@
-"""LiDAR and views from beside the recorded path in the report: rows, means, and tables of the page, the CSV and the
-console."""
+"""LiDAR, views from beside the recorded path and published figures in the report: rows, means and tables."""
 
 import copy
+import csv
 import json
 import math
 import re
 from typing import Any
 
 import pytest
-from helpers.reports import group, method, metrics, report_of
+from helpers.reports import NO_LOGS, expecting, group, method, metrics, region, report_of, stages
 
 from drivesplat.evaluation.scan_metrics import FIGURES, SCAN_REGIONS
+from drivesplat.io.storage import write_json
 from drivesplat.report.files import console_table
+from drivesplat.report.gaps import COLUMNS, gap_report
 from drivesplat.report.html import report_page
 from drivesplat.report.tables import write_figures
+from drivesplat.settings.published import PublishedFigures
 
 METHODS = ("vanilla", "street_lidar")
 FEW = "fewer than 100 measured rays"
@@ -170,3 +173,116 @@ def test_a_figure_that_is_no_number_leaves_the_scene_out(tmp_path):
     found = report_of(tmp_path, broken, record_aside("0103", 1.0), methods=BOTH)
     assert [item["scene"] for item in found["left_out"]] == ["0061"]
     assert "'high', not a number" in found["left_out"][0]["why"]
+
+
+PAPER = {"source": "A & B 2026", "url": "https://example.org/a?b=c&d"}
+BLOG = {"source": "A blog", "url": "https://example.org/blog"}
+PUBLISHED = [
+    {**PAPER, "scene": "0061", "method": "SG", "psnr": 22.87, "ssim": 0.65, "lpips": 0.13},
+    {**PAPER, "scene": "0061", "method": "<PVG>", "psnr": 22.77, "train_minutes": 31.5, "gpu": "RTX 3090"},
+    {**PAPER, "scene": "mean", "scenes": 2, "method": "SG", "psnr": 22.5},
+    {**PAPER, "scene": "mean", "scenes": 6, "method": "SG", "psnr": 22.9},
+    {**BLOG, "scene": "0061", "method": "SG", "psnr": 32.0},
+    {**BLOG, "scene": "0553", "method": "SG", "psnr": 31.0},
+    {**PAPER, "scene": "0061", "region": "moving_vehicle", "method": "SG", "psnr": 23.2},
+    {**PAPER, "scene": "0061", "group": "extrapolation", "method": "SG", "ssim": 0.5},
+]
+
+
+def of_scene(psnr: float, frame_mean: float) -> dict[str, Any]:
+    """A scene whose pooled PSNR differs from the mean over images."""
+    between = {**group(24.0, 17.0), "all": {**region(psnr, 0.3), "psnr_frame_mean": frame_mean}}
+    return method(between, group(22.0), seconds=90.0)
+
+
+def published_report(tmp_path, published: list[dict[str, Any]] = PUBLISHED) -> dict[str, Any]:
+    paths = []
+    for scene, psnr in (("0061", 25.0), ("0103", 27.0)):
+        measured = {"vanilla": of_scene(psnr, psnr + 1.0), "street": of_scene(psnr + 2.0, psnr + 3.0)}
+        write_json(tmp_path / scene / "metrics.json", metrics(scene, measured, stages(BOTH)))
+        paths.append(str(tmp_path / scene / "metrics.json"))
+    entries = tuple(PublishedFigures.model_validate(entry) for entry in published)
+    job = expecting("0061", "0103", methods=BOTH).model_copy(update={"published": entries})
+    return gap_report(paths, job, NO_LOGS)
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory) -> dict[str, Any]:
+    return published_report(tmp_path_factory.mktemp("published"))
+
+
+def selected(published: dict[str, Any], **values: Any) -> list[dict[str, Any]]:
+    return [row for row in published["published"] if all(row[key] == value for key, value in values.items())]
+
+
+def test_measured_figures_follow_the_published_ones_of_their_scene_region_group_and_publication(published):
+    rows = selected(published, source="A & B 2026", scene="0061", region="all", group="interpolation")
+    keys = ("method", "measured", "psnr", "ssim", "lpips", "train_minutes", "gpu")
+    assert [tuple(row[key] for key in keys) for row in rows] == [
+        ("SG", False, 22.87, 0.65, 0.13, None, None),
+        ("<PVG>", False, 22.77, None, None, 31.5, "RTX 3090"),
+        ("vanilla", True, 26.0, 0.8, 0.3, 1.5, "cpu"),
+        ("street", True, 28.0, 0.8, 0.3, 1.5, "cpu"),
+    ]
+    assert json.loads(json.dumps(published, allow_nan=False)) == published
+    assert [row["psnr"] for row in selected(published, region="moving_vehicle")] == [23.2, 17.0, 17.0]
+    beyond = selected(published, group="extrapolation")
+    assert [(row["psnr"], row["ssim"]) for row in beyond] == [(None, 0.5), (21.0, 0.8), (21.0, 0.8)]
+    assert [row["psnr"] for row in selected(published, source="A blog", scene="0061")] == [32.0, 26.0, 28.0]
+    assert [row["source"] for row in published["published"]] == sorted(row["source"] for row in published["published"])
+
+
+def test_a_scene_whose_compared_figures_are_no_numbers_is_left_out_and_named(tmp_path):
+    broken = {"vanilla": of_scene(25.0, 26.0)}
+    broken["vanilla"]["interpolation"]["moving_vehicle"]["ssim"] = "good"
+    write_json(tmp_path / "0061/metrics.json", metrics("0061", broken))
+    entry = PublishedFigures(**PAPER, scene="0061", region="moving_vehicle", method="SG", psnr=20.0)
+    job = expecting("0061").model_copy(update={"published": (entry,)})
+    published = gap_report([str(tmp_path / "0061/metrics.json")], job, NO_LOGS)
+    (left_out,) = published["left_out"]
+    assert "ssim of moving_vehicle is 'good', not a number" in left_out["why"] and published["rows"] == []
+    assert len(published["published"]) == 1
+
+
+def test_the_csv_has_published_figures_in_the_same_columns(tmp_path, published):
+    def table(made: dict[str, Any]) -> list[dict[str, str]]:
+        write_figures(tmp_path / "figures.csv", made)
+        with open(tmp_path / "figures.csv", newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    without, rows = table(published_report(tmp_path, [])), table(published)
+    assert list(without[0]) == list(COLUMNS) and len(without) == 4
+    assert list(rows[0]) == [*COLUMNS, "source", "url"]
+    figures = [(row["scene"], row["method"], row["source"], row["interpolation_psnr_frame_mean"]) for row in rows]
+    assert figures[:5] == [
+        ("0061", "vanilla", "", "26.0"), ("0061", "street", "", "28.0"), ("0103", "vanilla", "", "28.0"),
+        ("0103", "street", "", "30.0"), ("0061", "SG", "A & B 2026", "22.87"),
+    ]  # fmt: skip
+    assert ("mean", "SG", "A & B 2026", "22.5") in figures and ("mean", "street", "", "29.0") in figures
+    (timed,) = [row for row in rows if row["method"] == "<PVG>"]
+    assert (timed["train_seconds"], timed["interpolation_psnr"], timed["url"]) == ("1890.0", "", PAPER["url"])
+    assert not any(row["interpolation_psnr_frame_mean"] == "23.2" for row in rows), "not of whole images"
+
+
+def test_the_page_has_a_table_per_publication_with_its_link(published):
+    page = report_page(published, {})
+    assert page.count('<table class="published">') == 2
+    assert '<h3><a href="https://example.org/a?b=c&amp;d">A &amp; B 2026</a></h3>' in page
+    table = page.partition('<table class="published">')[2].partition("</table>")[0]
+    rows = [re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in table.split("<tr")[2:]]
+    assert rows[:3] == [
+        ["0061", "whole images", "SG", "published", "22.87", "0.650", "0.130", "–", "–"],
+        ["0061", "whole images", "&lt;PVG&gt;", "published", "22.77", "–", "–", "31.5", "RTX 3090"],
+        ["0061", "whole images", "vanilla", "measured here", "26.00", "0.800", "0.300", "1.5", "cpu"],
+    ]
+    assert ["mean of 6", "whole images", "SG", "published", "22.90", *"–––––"][:8] in [row[:8] for row in rows]
+    assert ["mean of 2", "whole images", "street", "measured here", "–", "–", "–", "–", "cpu"] in rows
+    assert [row[1] for row in rows if row[2] == "SG"][-2:] == ["moving vehicle", "whole images, extrapolation"]
+    assert "mean over held-out images of the PSNR of each image" in page
+
+
+def test_texts_of_users_are_escaped(tmp_path):
+    changes = {"method": "</script>", "source": "<img src=x>", "gpu": "<u>"}
+    page = report_page(published_report(tmp_path, [{**PUBLISHED[0], **changes}]), {})
+    unscripted = re.sub(r"</script>\s*(?=<script>|</body>)", "", page)
+    assert not any(value in unscripted for value in changes.values())
