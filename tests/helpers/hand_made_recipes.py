@@ -1,6 +1,7 @@
 """Hand-made results of recipes: eval.json files with given figures, and logs of failed jobs."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -66,3 +67,9 @@ def write_failure(path: Path, job: str, reason: str, level: str = "ERROR") -> Pa
         f"2026-11-21 20:31:20,123 {level} drivesplat.workflow.job: {job}: {reason}\n"
     )
     return path
+
+
+def table_cells(page: str) -> list[list[list[str]]]:
+    """The Markdown tables of a page: lines of cells."""
+    blocks = [block.splitlines() for block in page.split("\n\n") if block.startswith("|")]
+    return [[[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in block] for block in blocks]
