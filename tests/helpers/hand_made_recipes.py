@@ -10,14 +10,11 @@ import yaml
 from benchmarks.quality.recipes import RecipeFile, plan_runs, read_recipes
 from benchmarks.snakemake_run import SnakemakeRun
 from drivesplat.settings.method import with_seed
-from helpers import REPOSITORY
+from helpers import REPOSITORY, reports
 
-PROTOCOL = {
-    "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "eval_camera": "CAM_FRONT", "width": 640, "height": 360,
-    "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4},
-    "held_out_frames": {"interpolation": [4, 12, 20, 28], "extrapolation": [35, 36, 37, 38]}, "train_images": 31,
-    "poses": "nuscenes", "regions": "boxes", "extra_points": None, "lidar_missing": 38, "images_missing": 0,
-    "key_frame_range": None, "own_car": None,
+PROTOCOL = reports.PROTOCOL | {
+    "held_out_frames": {"interpolation": [4, 12, 20, 28], "extrapolation": [35, 36, 37, 38]}, "lidar_missing": 38,
+    "images_missing": 0, "key_frame_range": None, "own_car": None,
 }  # fmt: skip
 
 

@@ -188,8 +188,7 @@ def test_a_wrong_config_is_a_finding_and_datasets_are_searched_in_its_folders(ti
     (tmp_path / "bad.yaml").write_text("trian: 1\n")
     for name, word in (("bad.yaml", "trian"), ("absent.yaml", "absent.yaml")):
         assert word in facts_module._config([tmp_path / name])[1]
-    folders = {"tiny": tiny_root, "gone": tmp_path / "no"}
-    datasets = {name: {"dataroot": str(root), "scenes": ["0001"]} for name, root in folders.items()}
+    datasets = {"tiny": {"dataroot": str(tiny_root), "scenes": ["0001"]}, "gone": {"dataroot": str(tmp_path / "no")}}
     tiny, gone = facts_module._datasets(load({"datasets": datasets}))
     assert tiny.root == str(tiny_root) and not tiny.generated
     assert gone.root is None and str(tmp_path / "no") in gone.problem
