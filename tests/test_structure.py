@@ -19,7 +19,7 @@ from helpers.structure import (
     sibling_graph,
     top,
 )
-from helpers.syntax_trees import source_of, tree_of
+from helpers.syntax_trees import source_of, statements, tree_of
 
 MAX_PLACES, MAX_LOOSE_MODULES = 26, 2
 MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 8, 18
@@ -108,7 +108,7 @@ def test_readers_of_intermediates_return_typed_records():
     untyped = {
         node.name
         for path in modules().values()
-        for node in ast.walk(tree_of(path))
+        for node in statements(tree_of(path))
         if isinstance(node, ast.FunctionDef) and node.name.startswith("read_") and node.returns
         if "dict[str, Any]" in ast.unparse(node.returns)
     }
