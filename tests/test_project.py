@@ -1,14 +1,18 @@
 """The project as a whole: pins in one place, planning that stays quick, presets that load."""
 
+import ast
 import importlib.metadata
+import importlib.util
 import re
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 import yaml
 from helpers import REPOSITORY
+from helpers.syntax_trees import tree_of
 from packaging.requirements import Requirement
 
 from drivesplat.settings.config import load, merged
@@ -70,22 +74,22 @@ def test_supported_pythons_are_the_same_everywhere():
     assert f"{'|'.join(PYTHONS)}) ;;" in (REPOSITORY / "scripts/setup.sh").read_text()
 
 
-def printed_by(code: str) -> list[str]:
-    """The words that code prints in a new process."""
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout.split()
-
-
 def test_everything_that_the_devkits_tables_import_is_required():
     """It is installed without its requirements."""
-    code = (
-        "import sys; before = {*sys.modules}; from nuscenes.nuscenes import NuScenes; "
-        "print(' '.join({it.partition('.')[0] for it in {*sys.modules} - before}))"
-    )
+    folder = Path(importlib.util.find_spec("nuscenes").origin).parents[1]
+    waiting, loaded = ["nuscenes.nuscenes"], set()
+    while waiting:
+        name = waiting.pop()
+        files = [folder / f"{name.replace('.', '/')}{end}" for end in (".py", "/__init__.py")]
+        for node in (node for file in files if file.is_file() for node in tree_of(file).body):
+            names = [it.name for it in node.names] if isinstance(node, ast.Import) else [getattr(node, "module", "")]
+            found = {name for name in names if name} - loaded
+            waiting += [name for name in found if name.startswith("nuscenes.")]
+            loaded |= found
     packages = importlib.metadata.packages_distributions()
     asked = {Requirement(line).name.lower() for line in importlib.metadata.requires(DEVKIT)}
-    needed = {package.lower() for name in printed_by(code) for package in packages.get(name, [])} & asked
-    assert needed <= {one.name for one in requirements("requirements.txt")}
+    needed = {package.lower() for name in loaded for package in packages.get(name.partition(".")[0], [])} & asked
+    assert {"numpy", "pyquaternion"} <= needed <= {one.name for one in requirements("requirements.txt")}
 
 
 def test_planning_imports_nothing_heavy():
@@ -94,8 +98,10 @@ def test_planning_imports_nothing_heavy():
         "import sys, drivesplat.workflow.plan as _, drivesplat.readers.nuscenes.scene_tables as _; "
         "print(' '.join(sys.modules))"
     )
+    command = [sys.executable, "-c", code]
+    modules = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
     heavy = {"torch", "gsplat", "nuscenes", "scipy", "pandas", "skimage", "cv2", "matplotlib", "lpips"}
-    assert not heavy & set(printed_by(code))
+    assert not heavy & set(modules.split())
 
 
 def test_presets_are_valid_over_the_defaults():

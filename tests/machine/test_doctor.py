@@ -229,7 +229,8 @@ def test_the_exit_status_is_1_if_something_is_broken(monkeypatch, capsys):
 
 def test_a_python_without_the_packages_says_what_to_do():
     doctor = "drivesplat.machine.doctor.__main__"
-    code = f"import sys; sys.modules['pydantic'] = None; import {doctor} as d; sys.exit(d.main([]))"
+    absent = "sys.modules |= dict.fromkeys(['numpy', 'pydantic', 'torch', 'yaml'])"
+    code = f"import sys; {absent}; import {doctor} as d; sys.exit(d.main([]))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stdout.startswith("fix") and "make setup" in done.stdout
 
