@@ -149,7 +149,7 @@ def test_masks_of_the_user_are_used(two_images, tmp_path):
     )
     record = make_masks(two_images, settings, tmp_path / "masks")
     assert (record.regions, record.sky, record.visibility) == ("masks", "masks", None)
-    sky[SOME_LABELS == LABELS["own_car"]] = 0
+    sky[LABELS["own_car"] == SOME_LABELS] = 0
     assert record.sky_share == pytest.approx((sky > 0).mean())
     assert record.own_car == {"CAM_FRONT": "masks"}
     for frame in two_images.frames:

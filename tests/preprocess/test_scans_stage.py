@@ -195,7 +195,7 @@ def test_a_sweep_that_gives_no_scan_stops_and_is_named_or_is_left_out(columns, r
 
 def test_a_drive_without_lidar_is_refused_in_a_sentence():
     with pytest.raises(
-        DatasetError, match="scene hand has no LiDAR sweep that gives a scan.* tracks: discovered other"
+        DatasetError, match=r"scene hand has no LiDAR sweep that gives a scan.* tracks: discovered other"
     ):
         scan_records(scene_of([]), job())
 

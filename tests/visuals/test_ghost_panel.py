@@ -232,9 +232,8 @@ def test_titles_of_a_removal_say_whose_gaussians_are_removed_and_whether_the_veh
         assert titles(figure)[1] == "Without the vehicle's Gaussians"
 
 
-def test_saved_figures_are_landscape_pngs_1600_pixels_wide(panel_of_car, still, moving, tmp_path):
+def test_saved_figures_are_landscape_pngs_1600_pixels_wide(still, moving, tmp_path):
     figures = {
-        "panel.png": draw_panel(*panel_of_car[:2], "vanilla"),
         "still.png": draw_panel(*still, "vanilla"),
         "removal.png": draw_removal(*removal(moving), "vanilla"),
     }
