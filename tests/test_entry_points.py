@@ -3,7 +3,6 @@
 import re
 import runpy
 import sys
-from pathlib import Path
 
 import pytest
 from helpers import REPOSITORY
@@ -20,8 +19,7 @@ COMMANDS = sorted(
 )
 
 
-def test_the_commands_are_found():
-    assert {"drivesplat.settings.config_document", "drivesplat.machine.doctor", "benchmarks.speed"} <= set(COMMANDS)
+assert {"drivesplat.settings.config_document", "drivesplat.machine.doctor", "benchmarks.speed"} <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -37,32 +35,27 @@ def test_help_is_printed_and_nothing_else_happens(command, monkeypatch, capsys, 
     assert (REPOSITORY / "config.yaml").stat().st_mtime_ns == config and not list(tmp_path.iterdir())
 
 
-@pytest.fixture
-def changed(tmp_path) -> Path:
-    """A folder with a config.yaml in which a user has changed one value."""
-    (tmp_path / "config.yaml").write_text(config_yaml().replace("results_dir: results", "results_dir: elsewhere"))
-    return tmp_path
-
-
-def test_a_changed_config_is_kept_and_the_difference_is_shown(changed, capsys):
-    before = (changed / "config.yaml").read_text()
-    assert main([], changed) == 1
+def test_a_changed_config_is_kept_with_its_difference_shown_unless_forced(tmp_path, capsys):
+    changed = config_yaml().replace("results_dir: results", "results_dir: elsewhere")
+    (tmp_path / "config.yaml").write_text(changed)
+    assert main([], tmp_path) == 1
     printed = capsys.readouterr()
     assert "\n-results_dir: elsewhere\n+results_dir: results\n" in printed.out and "--force" in printed.err
-    assert (changed / "config.yaml").read_text() == before and not (changed / "config.schema.json").exists()
+    assert (tmp_path / "config.yaml").read_text() == changed and not (tmp_path / "config.schema.json").exists()
+    assert main(["--force"], tmp_path) == 0
+    assert (tmp_path / "config.yaml").read_text() == config_yaml()
 
 
-def test_force_overwrites_a_changed_config(changed):
-    assert main(["--force"], changed) == 0
-    assert (changed / "config.yaml").read_text() == config_yaml()
-
-
-def test_new_settings_come_into_a_config_that_has_no_others(tmp_path):
-    whole = config_yaml()
+def test_absent_files_are_written_and_new_settings_come_into_a_config_that_has_no_others(tmp_path):
+    whole, config = config_yaml(), tmp_path / "config.yaml"
+    assert main([], tmp_path) == 0 and main([], tmp_path) == 0
+    assert config.read_text() == whole
+    assert (tmp_path / "config.schema.json").read_text() == config_schema()
+    assert (tmp_path / "docs/settings.md").read_text() == settings_page()
     lines = whole.splitlines(keepends=True)
     (new,) = (i for i, line in enumerate(lines) if line.startswith("  drive_width:"))
-    (tmp_path / "config.yaml").write_text("".join(lines[: new - 1] + lines[new + 1 :]))
-    assert main([], tmp_path) == 0 and (tmp_path / "config.yaml").read_text() == whole
+    config.write_text("".join(lines[: new - 1] + lines[new + 1 :]))
+    assert main([], tmp_path) == 0 and config.read_text() == whole
 
 
 @pytest.mark.parametrize("old", ["  drive_width: null\n", "# Compute LPIPS."])
@@ -73,10 +66,3 @@ def test_a_config_of_a_user_with_lines_of_its_own_is_kept_though_it_lacks_settin
     assert changed != lacking
     (tmp_path / "config.yaml").write_text(changed)
     assert main([], tmp_path) == 1 and (tmp_path / "config.yaml").read_text() == changed
-
-
-def test_absent_files_are_written(tmp_path):
-    assert main([], tmp_path) == 0 and main([], tmp_path) == 0
-    assert (tmp_path / "config.yaml").read_text() == config_yaml()
-    assert (tmp_path / "config.schema.json").read_text() == config_schema()
-    assert (tmp_path / "docs/settings.md").read_text() == settings_page()

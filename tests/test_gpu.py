@@ -61,7 +61,7 @@ from drivesplat.training import step as step_module
 from drivesplat.training import strategies
 from drivesplat.training.augmentation import mirrored_at_random, with_dropout
 from drivesplat.training.graphs import captured_steps
-from drivesplat.training.loop import Trainer
+from drivesplat.training.loop import Trainer, TrainingSummary
 from drivesplat.training.scans import initial_lidar_logits, load_scans
 
 pytestmark = [
@@ -132,24 +132,19 @@ def test_gpu_tensors_are_rendered_by_gsplat(monkeypatch):
     assert {"means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"} <= info.keys()
 
 
-def test_without_a_gaussian_in_view_images_are_zero_and_gradients_finite():
+@pytest.mark.parametrize(("count", "with_depth"), [(50, True), (0, True), (0, False)])
+def test_without_a_gaussian_in_view_images_are_zero_and_gradients_finite(count, with_depth):
     scene = {name: value.to(GPU, torch.float32) for name, value in random_scene(50).items()}
     scene["means"][:, 2] = -5.0
     for name in INPUTS:
-        scene[name].requires_grad_()
-    rendering = rasterize(**scene, width=WIDTH, height=HEIGHT, sh_degree=3, with_depth=True)
-    assert all((seen == 0).all() for seen in (rendering.image, rendering.alpha, rendering.depth))
-    (rendering.image.sum() + rendering.depth.sum()).backward()
-    assert all(torch.isfinite(scene[name].grad).all() for name in INPUTS)
-
-
-@pytest.mark.parametrize("with_depth", [False, True])
-def test_an_empty_set_of_gaussians_gives_an_empty_image(with_depth):
-    scene = {name: tensor.to(GPU).float() for name, tensor in random_scene(count=5).items()}
-    none = [scene[name][:0] for name in INPUTS]
-    rendering = rasterize(*none, scene["viewmats"], scene["Ks"], WIDTH, HEIGHT, sh_degree=3, with_depth=with_depth)
+        scene[name] = scene[name][:count].requires_grad_()
+    rendering = rasterize(**scene, width=WIDTH, height=HEIGHT, sh_degree=3, with_depth=with_depth)
     assert rendering.image.shape == (2, HEIGHT, WIDTH, 3) and rendering.alpha.shape == (2, HEIGHT, WIDTH, 1)
-    assert not rendering.image.any() and not rendering.alpha.any() and (rendering.depth is not None) == with_depth
+    assert not rendering.image.any() and not rendering.alpha.any()
+    assert (rendering.depth is not None) == with_depth and not (with_depth and rendering.depth.any())
+    if count:
+        (rendering.image.sum() + rendering.depth.sum()).backward()
+        assert all(torch.isfinite(scene[name].grad).all() for name in INPUTS)
 
 
 def test_film_frames_and_removals_agree_with_the_cpu():
@@ -182,18 +177,23 @@ def test_film_frames_and_removals_agree_with_the_cpu():
 
 
 def test_actors_agree_with_the_cpu():
-    """Positions, colors and presence of two cars, one of which appears later, and the alpha of the objects alone."""
+    """Positions, colors and presence of two cars, one of which appears later, the colours of a recoloured one, and the
+    alpha of the objects alone."""
     model = untrained_street(settings_of())
     with torch.no_grad():
         for value in (value for value in model.parameters() if value.requires_grad):
             value += 0.1 * torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
+    matrix = np.array([[0.2, 0.7, 0.1], [0.0, 0.4, 0.3], [0.9, 0.0, 0.2]])
+    first, *others = (track.id for track in model.parts[1].timeline.tracks)
+    edited = Want(placements=(ActorPlacement(first, color_matrix=matrix), *map(ActorPlacement, others)))
+    wanted = [(0.7, edited), *((time, IMAGE) for time in (0.0, 0.3, 1.1, 1.9, 5.0))]
     view = recorded_views(1, width=96, height=64)[0].view
-    times = (0.0, 0.3, 1.1, 1.9, 5.0)
-    on_cpu = [model.at(time) for time in times]
+    on_cpu = [model.at(time, want) for time, want in wanted]
+    assert bool((on_cpu[0].sh != model.at(0.7).sh).any())
     alone_on_cpu = model.objects_alpha(model.render(view), view).detach()
     model, on_gpu = model.to(GPU), recorded_views(1, width=96, height=64, device=GPU)[0].view
-    for time, expected in zip(times, on_cpu, strict=True):
-        found = model.at(time)
+    for (time, want), expected in zip(wanted, on_cpu, strict=True):
+        found = model.at(time, want)
         for name, values in found.tensors.items():
             torch.testing.assert_close(values.cpu(), expected.tensors[name], rtol=1e-4, atol=1e-5)
     alone = model.objects_alpha(model.render(on_gpu), on_gpu).detach().cpu()
@@ -238,48 +238,21 @@ def gpu_views() -> list:
     return recorded_views(width=64, height=48, device=GPU)
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory) -> dict[str, float]:
-    """By strategy, the PSNR of a training without interruption."""
-    folder = tmp_path_factory.mktemp("uninterrupted")
-    models = {s: trained(folder / s, gpu_settings(s), gpu_views(), device=GPU)[0] for s in ("mcmc", "default")}
-    return {strategy: mean_psnr(model, gpu_views()) for strategy, model in models.items()}
-
-
-@pytest.mark.parametrize("strategy", ["mcmc", "default"])
-def test_a_training_increases_psnr(uninterrupted, strategy):
-    before = mean_psnr(untrained(gpu_settings(strategy)).to(GPU), gpu_views())
-    assert uninterrupted[strategy] > before + 3.0
-
-
-def test_a_summary_names_the_gpu_and_its_peak_memory(tmp_path):
-    _, summary = trained(tmp_path, gpu_settings("mcmc", iterations=5), gpu_views(), device=GPU)
-    assert summary.device == torch.cuda.get_device_name()
-    assert 0.0 < summary.peak_gpu_memory_gb <= torch.cuda.max_memory_reserved() / 1e9
-
-
-@pytest.mark.parametrize("strategy", ["mcmc", "default"])
-def test_a_resumed_training_ends_as_an_uninterrupted_one(uninterrupted, strategy, tmp_path):
-    settings = gpu_settings(strategy)
-    with pytest.raises(EndedError):
-        trained(tmp_path, settings, EndingViews(gpu_views(), 120), device=GPU)
-    model, summary = trained(tmp_path, settings, gpu_views(), device=GPU)
-    assert summary.resumed_at == [80] and summary.iterations == 200
-    assert mean_psnr(model, gpu_views()) == pytest.approx(uninterrupted[strategy], abs=0.3)
-
-
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
 def test_a_training_of_actors_learns_and_resumes(strategy, tmp_path):
-    """With all loss terms, and corrections of tracks."""
+    """With all loss terms, and corrections of tracks. Its summary names the GPU and its peak memory."""
     settings = gpu_settings(strategy, **ALL_TERMS)
+
+    def ended(name: str, views: list) -> tuple[SplatModel, TrainingSummary]:
+        return trained(tmp_path / name, settings, views, device=GPU, model=untrained_street(settings))
+
     before = mean_psnr(untrained_street(settings).to(GPU), guided_views(GPU))
-    whole, _ = trained(tmp_path / "whole", settings, guided_views(GPU), device=GPU, model=untrained_street(settings))
+    whole, summary = ended("whole", guided_views(GPU))
+    assert summary.device == torch.cuda.get_device_name()
+    assert 0.0 < summary.peak_gpu_memory_gb <= torch.cuda.max_memory_reserved() / 1e9
     with pytest.raises(EndedError):
-        views = EndingViews(guided_views(GPU), 120)
-        trained(tmp_path / "it", settings, views, device=GPU, model=untrained_street(settings))
-    resumed, summary = trained(
-        tmp_path / "it", settings, guided_views(GPU), device=GPU, model=untrained_street(settings)
-    )
+        ended("it", EndingViews(guided_views(GPU), 120))
+    resumed, summary = ended("it", guided_views(GPU))
     assert summary.resumed_at == [80] and resumed.parts[1].shared["translation"].any()
     found, expected = (mean_psnr(model, guided_views(GPU)) for model in (resumed, whole))
     assert expected > before + 3.0 and found == pytest.approx(expected, abs=0.5)
@@ -290,13 +263,14 @@ def train_until_killed(folder: str) -> None:
     trained(Path(folder), gpu_settings("mcmc"), EndingViews(gpu_views(), 120, kill=True), device=GPU)
 
 
-def test_a_killed_training_ends_as_an_uninterrupted_one(uninterrupted, tmp_path):
+def test_a_killed_training_ends_as_an_uninterrupted_one(tmp_path):
+    whole, _ = trained(tmp_path / "whole", gpu_settings("mcmc"), gpu_views(), device=GPU)
     process = in_subprocess(train_until_killed, str(tmp_path))
     _, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == -signal.SIGKILL, errors
     model, summary = trained(tmp_path, gpu_settings("mcmc"), gpu_views(), device=GPU)
     assert summary.resumed_at == [80] and summary.iterations == 200
-    assert mean_psnr(model, gpu_views()) == pytest.approx(uninterrupted["mcmc"], abs=0.3)
+    assert mean_psnr(model, gpu_views()) == pytest.approx(mean_psnr(whole, gpu_views()), abs=0.3)
 
 
 def print_what_stops(folder: str, strategy: str, fault: str) -> None:
@@ -358,6 +332,7 @@ def test_exhausted_memory_is_reported_with_the_number_of_gaussians_and_a_remedy(
 
 
 def test_too_little_free_memory_is_refused_with_both_numbers():
+    assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU
     free, total = (size / 1e9 for size in torch.cuda.mem_get_info())
     asked = min(1000.0, math.ceil(total) + 1.0)
     with pytest.raises(DeviceError) as error:
@@ -366,10 +341,6 @@ def test_too_little_free_memory_is_refused_with_both_numbers():
     named = float(re.search(r"has ([\d.]+) GB of free memory", message).group(1))
     assert named == pytest.approx(free, abs=0.05 * total)
     assert f"asks for {asked:g}" in message
-
-
-def test_a_gpu_with_enough_memory_is_chosen():
-    assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU
 
 
 Film = tuple[SplatModel, list[View], list[np.ndarray]]
@@ -409,17 +380,6 @@ def assert_frames(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
         np.testing.assert_allclose(frame.astype(int), alone, atol=1)
 
 
-def test_a_recoloured_actor_has_the_colours_of_the_cpu():
-    model = untrained_street(settings_of()).requires_grad_(False)
-    matrix = np.array([[0.2, 0.7, 0.1], [0.0, 0.4, 0.3], [0.9, 0.0, 0.2]])
-    first, *others = (track.id for track in model.parts[1].timeline.tracks)
-    edited = Want(placements=(ActorPlacement(first, color_matrix=matrix), *map(ActorPlacement, others)))
-    expected, plain = model.at(0.7, edited).sh, model.at(0.7).sh
-    found = model.to(GPU).at(0.7, edited).sh.cpu()
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-    assert bool((expected != plain).any())
-
-
 def test_the_frames_of_a_film_equal_single_frames(street_film, captures, monkeypatch):
     """With one capture; also with other Gaussians and another size in between, and for two films alternately."""
     model, views, expected = street_film
@@ -457,19 +417,15 @@ def test_an_abandoned_film_does_not_affect_the_next(street_film, captures):
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
 
 
-def test_a_static_film_is_captured_too(street_film, captures, monkeypatch):
-    model, views, _ = street_film
-    monkeypatch.setattr(capacity, "MARGIN", 4.0)
-    alone = SplatModel([model.parts[0]], model.sky)
-    assert_frames([*film_frames(alone, [(view, None) for view in views])], [film_frame(alone, view) for view in views])
-    assert len(captures) == 1
-
-
-def test_frames_of_a_camera_of_the_rig_are_not_captured(street_film, captures):
+def test_a_static_film_is_captured_too_and_frames_of_a_camera_of_the_rig_are_not(street_film, captures, monkeypatch):
     model, views, expected = street_film
     of_rig = [(replace(view, camera="CAM_BACK"), None) for view in views]
     assert_frames([*film_frames(model, of_rig)], expected)
     assert not captures
+    monkeypatch.setattr(capacity, "MARGIN", 4.0)
+    alone = SplatModel([model.parts[0]], model.sky)
+    assert_frames([*film_frames(alone, [(view, None) for view in views])], [film_frame(alone, view) for view in views])
+    assert len(captures) == 1
 
 
 def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film, monkeypatch, caplog):
@@ -536,16 +492,22 @@ def continued(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
     return terms
 
 
+def with_and_without_graphs(caplog, graphs: int, **training) -> tuple[Trainer, Trainer, list[float]]:
+    """Trainings by so many graphs and by none, whose losses agree, and the losses."""
+    captured, mine = trained_with(True, **training)
+    eager, theirs = trained_with(False, **training)
+    assert not caplog.records, "nothing was refused"
+    assert len(captured.steps.graphs._graphs) == graphs and not eager.steps.graphs._graphs
+    np.testing.assert_allclose(mine, theirs, rtol=0.02)
+    return captured, eager, mine
+
+
 @pytest.mark.parametrize(("shutters", "night"), [(False, False), (True, False), (False, True)])
 def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, night, caplog):
     """Also parameters that learn late: colours depend on direction after images have been captured. Images with rolling
     shutters have a graph each, others one together."""
-    captured, mine = trained_with(True, shutters=shutters, night=night, sh_every=0.5)
-    eager, theirs = trained_with(False, shutters=shutters, night=night, sh_every=0.5)
-    assert not caplog.records, "nothing was refused"
-    graphs = len(captured.images.views) if shutters else 1
-    assert len(captured.steps.graphs._graphs) == graphs and not eager.steps.graphs._graphs
-    np.testing.assert_allclose(mine, theirs, rtol=0.02)
+    graphs = len(guided_views()) if shutters else 1
+    captured, eager, mine = with_and_without_graphs(caplog, graphs, shutters=shutters, night=night, sh_every=0.5)
     assert mine[-1] < 0.8 * mine[0] and steps_of(captured) == steps_of(eager)
     before = untrained_street(captured.schedule.settings).state_dict()
     for name, value in ((name, value) for name, value in eager.state.model.state_dict().items() if name in before):
@@ -555,22 +517,11 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, night
             assert float(apart.quantile(0.5)) <= 0.1 * float(moved.max()), name
 
 
-def test_people_are_captured_and_learn_what_they_learn_without_graphs(caplog):
-    captured, mine = trained_with(True, people=True)
-    eager, theirs = trained_with(False, people=True)
-    assert not caplog.records, "nothing was refused"
-    assert len(captured.steps.graphs._graphs) == 1 and not eager.steps.graphs._graphs
-    np.testing.assert_allclose(mine, theirs, rtol=0.02)
-    assert captured.state.model.parts[1].shared["lattice"].abs().max() > 1e-4
-
-
-def test_drifting_gaussians_are_captured_and_learn_what_they_learn_without_graphs(caplog):
-    captured, mine = trained_with(True, drifting=True)
-    eager, theirs = trained_with(False, drifting=True)
-    assert not caplog.records, "nothing was refused"
-    assert len(captured.steps.graphs._graphs) == 1 and not eager.steps.graphs._graphs
-    np.testing.assert_allclose(mine, theirs, rtol=0.02)
-    assert mine[-1] < mine[0]
+@pytest.mark.parametrize("part", ["people", "drifting"])
+def test_people_and_drifting_gaussians_are_captured_and_learn_what_they_learn_without_graphs(part, caplog):
+    captured, _, mine = with_and_without_graphs(caplog, 1, **{part: True})
+    assert part == "people" or mine[-1] < mine[0]
+    assert part == "drifting" or captured.state.model.parts[1].shared["lattice"].abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("limits", [{}, {"fine_tune": 0.3, "geometry": 0.1}, {"geometry": 0.0}])
@@ -580,11 +531,7 @@ def test_scans_are_captured_and_learn_what_they_learn_without_graphs(limits, cap
     recorded = [replace(scan_of_a_wall(x), seconds=x, **moving) for x in (0.5, 1.0, 1.5)]
     beside = ScanTrainingSettings(per_image=1.0, **limits)
     monkeypatch.setattr(captured_steps, "MEASURED_SCANS", 2)
-    captured, mine = trained_with(True, recorded=recorded, scans=beside)
-    eager, theirs = trained_with(False, recorded=recorded, scans=beside)
-    assert not caplog.records, "nothing was refused"
-    assert len(captured.steps.graphs._graphs) == 2 and not eager.steps.graphs._graphs
-    np.testing.assert_allclose(mine, theirs, rtol=0.02)
+    captured, eager, mine = with_and_without_graphs(caplog, 2, recorded=recorded, scans=beside)
     assert steps_of(captured) == steps_of(eager), "a replay that created a state again would count from 0"
     assert mine[-1] < mine[1], "scans"
     assert beside.fine_tune or mine[-2] < mine[0], "images, with which scans take turns unless they fine-tune"
@@ -665,9 +612,16 @@ def test_each_replay_drops_out_other_gaussians():
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_each_replay_mirrors_objects_at_random(degree):
-    model = untrained_street(settings_of(deformable=DeformableSettings(sh_degree=degree)), people=True)
-    model.parts[1].mirrored = torch.full((2,), 0.5)
+def test_each_replay_mirrors_objects_at_random(degree, monkeypatch, caplog):
+    """And a training with mirrored people is captured."""
+    street, deformable = untrained_street, DeformableSettings(sh_degree=degree)
+
+    def mirrored(*arguments, **named):
+        model = street(*arguments, **named)
+        model.parts[1].mirrored = torch.full((2,), 0.5)
+        return model
+
+    model = mirrored(settings_of(deformable=deformable), people=True)
     states = model.to(GPU).states(0.5)
 
     def shown() -> torch.Tensor:
@@ -683,19 +637,8 @@ def test_each_replay_mirrors_objects_at_random(degree):
             graph.replay()
             places.add(round(float(graph.result.sum()), 3))
     assert len(places) == 4, "two objects, each on two sides"
-
-
-@pytest.mark.parametrize("degree", [0, 1])
-def test_a_training_with_mirrored_people_is_captured(degree, monkeypatch, caplog):
-    street = untrained_street
-
-    def mirrored(*arguments):
-        model = street(*arguments)
-        model.parts[1].mirrored = torch.full((2,), 0.5)
-        return model
-
     monkeypatch.setitem(globals(), "untrained_street", mirrored)
-    trainer, losses = trained_with(True, people=True, deformable=DeformableSettings(sh_degree=degree))
+    trainer, losses = trained_with(True, people=True, deformable=deformable)
     assert not caplog.records, "nothing was refused"
     assert len(trainer.steps.graphs._graphs) == 1 and losses[-1] < losses[0]
 

@@ -16,10 +16,7 @@ APACHE_2_0 = "cfc7749b96f63bd31c3c42b5c471bf756814053e847c10f3eb003417bc523d30"
 PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
 NOTICES = (REPOSITORY / "THIRD_PARTY_NOTICES.md").read_text(encoding="utf-8")
 LISTED = dict(re.findall(r"^\| ([\w.*-]+) \| ([^|]+?) \|", NOTICES, re.M))
-PERMISSIVE = re.compile(
-    r"MIT|BSD|Apache|ISC\b|PSF|Python Software Foundation|Kiwi|Public Domain|TOST",
-    re.IGNORECASE,
-)
+PERMISSIVE = re.compile(r"MIT|BSD|Apache|ISC\b|PSF|Python Software Foundation|Kiwi|Public Domain|TOST", re.IGNORECASE)
 CONDITIONS = re.compile(r"GPL|General Public|Mozilla|MPL|Proprietary|EULA|non-commercial|CC.BY.NC", re.IGNORECASE)
 
 
@@ -59,6 +56,13 @@ def installed_requirements(name: str, seen: set[str]) -> Iterator[str]:
             yield from installed_requirements(requirement.name, seen)
 
 
+@pytest.fixture(scope="module")
+def required() -> list[str]:
+    """The named packages and those behind them."""
+    seen: set[str] = set()
+    return [it for name in named_requirements() for it in installed_requirements(name, seen)]
+
+
 def test_project_is_licensed_under_apache_2_0():
     text = (REPOSITORY / "LICENSE").read_bytes()
     assert hashlib.sha256(text).hexdigest() == APACHE_2_0
@@ -70,30 +74,19 @@ def test_project_is_licensed_under_apache_2_0():
     assert "](LICENSE)" in (REPOSITORY / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", named_requirements())
-def test_named_package_is_listed(name):
-    assert name in LISTED
-
-
-def test_listed_packages_are_named_or_installed_behind_named_ones():
-    seen: set[str] = set()
-    required = {it for name in named_requirements() for it in installed_requirements(name, seen)}
-    assert {*LISTED} - required <= {"nvidia-*", "certifi", "docutils", "pathspec", "package", "origin"}
+def test_listed_packages_are_named_or_installed_behind_named_ones(required):
+    assert {*LISTED} - {*required} <= {"nvidia-*", "certifi", "docutils", "pathspec", "package", "origin"}
 
 
 FAMILIES = {
-    "MIT": "MIT",
-    "BSD": "BSD",
-    "Apache": "Apache",
-    "PSF": "Python Software Foundation|PSF",
-    "GPL": "GPL|General Public",
-    "MPL": "MPL|Mozilla",
-    "TOST": "TOST",
-}
+    "MIT": "MIT", "BSD": "BSD", "Apache": "Apache", "PSF": "Python Software Foundation|PSF",
+    "GPL": "GPL|General Public", "MPL": "MPL|Mozilla", "TOST": "TOST",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", named_requirements())
-def test_listed_licence_is_the_one_that_the_installed_package_declares(name):
+def test_named_package_is_listed_with_the_licence_that_the_installed_one_declares(name):
+    assert name in LISTED
     try:
         said = declared(name)
     except importlib.metadata.PackageNotFoundError:
@@ -103,12 +96,10 @@ def test_listed_licence_is_the_one_that_the_installed_package_declares(name):
         assert expected & {family for family in FAMILIES if family in LISTED[name]}, said
 
 
-def test_packages_with_conditions_are_listed():
+def test_packages_with_conditions_are_listed(required):
     """Copyleft and proprietary packages behind the named ones; none is for non-commercial use alone."""
-    seen: set[str] = set()
-    packages = [it for name in named_requirements() for it in installed_requirements(name, seen)]
-    assert len(packages) > 50
-    for name in packages:
+    assert len(required) > 50
+    for name in required:
         said = declared(name)
         if not CONDITIONS.search(said):
             assert not said or PERMISSIVE.search(said) or "Copyright" in said or "License" in said, f"{name}: {said}"

@@ -1,14 +1,18 @@
 """The project as a whole: pins in one place, planning that stays quick, presets that load."""
 
+import ast
 import importlib.metadata
+import importlib.util
 import re
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 import yaml
 from helpers import REPOSITORY
+from helpers.syntax_trees import tree_of
 from packaging.requirements import Requirement
 
 from drivesplat.settings.config import load, merged
@@ -16,6 +20,8 @@ from drivesplat.settings.config import load, merged
 DEVKIT = "nuscenes-devkit"
 """Installed without its requirements, beside those of requirements.txt."""
 PYTHONS = ("3.11", "3.12", "3.13")
+PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = PYPROJECT["project"]
 
 
 def pins(lines: list[str], python: str) -> dict[str, str]:
@@ -50,40 +56,40 @@ def requirements(name: str) -> list[Requirement]:
 
 @pytest.mark.parametrize("python", PYTHONS)
 def test_every_requirement_is_pinned_within_its_range(python):
+    """The extra pins the devkit where its numpy has wheels."""
     pinned = constraints(python)
     required = [*requirements("requirements.txt"), *requirements("requirements-dev.txt")]
     assert {requirement.name for requirement in required} == pinned.keys() - {DEVKIT}
     assert [one.name for one in required if pinned[one.name] not in one.specifier] == []
     bounded = {one.name: {part.operator for part in one.specifier} for one in requirements("requirements.txt")}
     assert {name for name, operators in bounded.items() if operators != {">=", "<"}} == set(), "from, and up to"
+    (devkit,) = map(Requirement, PROJECT["optional-dependencies"]["nuscenes"])
+    assert devkit.name == DEVKIT and pinned[DEVKIT] in devkit.specifier
+    assert devkit.marker.evaluate({"python_version": python}) == pinned["numpy"].startswith("1.")
 
 
 def test_supported_pythons_are_the_same_everywhere():
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-    named = [name.rpartition(" ")[2] for name in project["classifiers"] if "Python :: 3." in name]
-    assert tuple(named) == PYTHONS and project["requires-python"] == ">=3.11,<3.14"
+    named = [name.rpartition(" ")[2] for name in PROJECT["classifiers"] if "Python :: 3." in name]
+    assert tuple(named) == PYTHONS and PROJECT["requires-python"] == ">=3.11,<3.14"
     assert f"{'|'.join(PYTHONS)}) ;;" in (REPOSITORY / "scripts/setup.sh").read_text()
-
-
-@pytest.mark.parametrize("python", PYTHONS)
-def test_the_extra_pins_the_devkit_where_its_numpy_has_wheels(python):
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-    (devkit,) = map(Requirement, project["optional-dependencies"]["nuscenes"])
-    assert devkit.name == DEVKIT and constraints(python)[DEVKIT] in devkit.specifier
-    assert devkit.marker.evaluate({"python_version": python}) == constraints(python)["numpy"].startswith("1.")
 
 
 def test_everything_that_the_devkits_tables_import_is_required():
     """It is installed without its requirements."""
-    code = (
-        "import sys; before = {*sys.modules}; from nuscenes.nuscenes import NuScenes; "
-        "print(' '.join({it.partition('.')[0] for it in {*sys.modules} - before}))"
-    )
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    folder = Path(importlib.util.find_spec("nuscenes").origin).parents[1]
+    waiting, loaded = ["nuscenes.nuscenes"], set()
+    while waiting:
+        name = waiting.pop()
+        files = [folder / f"{name.replace('.', '/')}{end}" for end in (".py", "/__init__.py")]
+        for node in (node for file in files if file.is_file() for node in tree_of(file).body):
+            names = [it.name for it in node.names] if isinstance(node, ast.Import) else [getattr(node, "module", "")]
+            found = {name for name in names if name} - loaded
+            waiting += [name for name in found if name.startswith("nuscenes.")]
+            loaded |= found
     packages = importlib.metadata.packages_distributions()
     asked = {Requirement(line).name.lower() for line in importlib.metadata.requires(DEVKIT)}
-    needed = {package.lower() for name in loaded for package in packages.get(name, [])} & asked
-    assert needed <= {one.name for one in requirements("requirements.txt")}
+    needed = {package.lower() for name in loaded for package in packages.get(name.partition(".")[0], [])} & asked
+    assert {"numpy", "pyquaternion"} <= needed <= {one.name for one in requirements("requirements.txt")}
 
 
 def test_planning_imports_nothing_heavy():
@@ -92,23 +98,18 @@ def test_planning_imports_nothing_heavy():
         "import sys, drivesplat.workflow.plan as _, drivesplat.readers.nuscenes.scene_tables as _; "
         "print(' '.join(sys.modules))"
     )
-    modules = subprocess.run(
-        [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
-    ).stdout
+    command = [sys.executable, "-c", code]
+    modules = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
     heavy = {"torch", "gsplat", "nuscenes", "scipy", "pandas", "skimage", "cv2", "matplotlib", "lpips"}
     assert not heavy & set(modules.split())
 
 
-PRESETS = [
-    path for pattern in ("*.yaml", "protocols/*.yaml") for path in sorted((REPOSITORY / "presets").glob(pattern))
-]
-
-
-@pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
-def test_presets_are_valid_over_the_defaults(preset):
+def test_presets_are_valid_over_the_defaults():
     defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
-    config = load(merged(defaults, yaml.safe_load(preset.read_text())))
-    assert config.scenes
+    presets = [path for pattern in ("*.yaml", "protocols/*.yaml") for path in (REPOSITORY / "presets").glob(pattern)]
+    assert len(presets) > 5
+    for preset in presets:
+        assert load(merged(defaults, yaml.safe_load(preset.read_text()))).scenes, preset.name
 
 
 def test_scripts_are_thin():
@@ -120,8 +121,8 @@ def test_each_test_that_make_test_leaves_out_is_run_by_a_target_of_its_own():
     makefile = (REPOSITORY / "Makefile").read_text()
     recipes = dict(re.findall(r"^([\w-]+):.*\n((?:\t.*\n)+)", makefile, re.M))
     left_out = re.findall(r"not (\w+)", recipes["test"])
-    pytest_settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
-    assert [it.partition(":")[0] for it in pytest_settings["markers"] if "(make test-" in it] == left_out
+    markers = PYPROJECT["tool"]["pytest"]["ini_options"]["markers"]
+    assert [it.partition(":")[0] for it in markers if "(make test-" in it] == left_out
     for marker in left_out:
         command = next(line for line in recipes[f"test-{marker}"].splitlines() if f"-m {marker}" in line)
         (files,) = re.findall(r"tests/\S+", command) or ["tests"]
@@ -135,10 +136,9 @@ def test_citation_and_catalog_entry_hold_what_their_readers_require():
     for reference in citation["references"]:
         assert {"type", "title", "authors", "year"} <= reference.keys() and {"doi", "url"} & reference.keys()
     usage = yaml.safe_load((REPOSITORY / ".snakemake-workflow-catalog.yml").read_text())["usage"]
-    assert (
-        usage["mandatory-flags"]["flags"].split() == ["--cores", "all"] and usage["software-stack-deployment"]["conda"]
-    )
-    named = re.findall(r"[\w./]+\.(?:yaml|md)\b", usage["mandatory-flags"]["desc"])
+    flags = usage["mandatory-flags"]
+    assert flags["flags"].split() == ["--cores", "all"] and usage["software-stack-deployment"]["conda"]
+    named = re.findall(r"[\w./]+\.(?:yaml|md)\b", flags["desc"])
     assert len(named) == 2 and all((REPOSITORY / name).is_file() for name in named)
 
 

@@ -19,11 +19,12 @@ from helpers.structure import (
     sibling_graph,
     top,
 )
-from helpers.syntax_trees import source_of, tree_of
+from helpers.syntax_trees import source_of, statements, tree_of
 
 MAX_PLACES, MAX_LOOSE_MODULES = 26, 2
 MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 8, 18
 MAX_LINES = 400
+SIGNED = packages(LIBRARY, "benchmarks")
 
 
 def test_few_places_are_directly_in_the_library():
@@ -33,22 +34,10 @@ def test_few_places_are_directly_in_the_library():
     assert len(loose) <= MAX_LOOSE_MODULES, loose
 
 
-def test_modules_are_short():
+def test_modules_are_short_and_packages_say_what_they_hold():
     long = {name: lines for name in modules() if (lines := len(source_of(modules()[name]).splitlines())) > MAX_LINES}
     assert not long, "a concept is missing: move it to a module of its own"
-
-
-def test_modules_import_in_no_circle_and_in_short_chains():
-    chain = longest_chain(module_graph())
-    assert len(chain) <= MAX_MODULE_CHAIN, " > ".join(chain)
-
-
-SIGNED = packages(LIBRARY, "benchmarks")
-
-
-@pytest.mark.parametrize("package", SIGNED)
-def test_a_package_says_what_it_holds(package):
-    assert ast.get_docstring(tree_of(SIGNED[package]))
+    assert [package for package, path in SIGNED.items() if not ast.get_docstring(tree_of(path))] == []
 
 
 def test_the_page_for_contributors_lists_every_package():
@@ -59,14 +48,15 @@ def test_the_page_for_contributors_lists_every_package():
     assert sorted(listed) == sorted([*names, "errors"])
 
 
-@pytest.mark.parametrize("package", packages(LIBRARY))
-def test_places_of_a_package_import_in_no_circle(package):
-    longest_chain(sibling_graph(module_graph(), package))  # raises CycleError with the circle
-
-
-def test_packages_at_any_depth_import_in_no_circle_and_in_short_chains():
-    chain = longest_chain(package_graph(module_graph(), packages(LIBRARY)))
-    assert len(chain) <= MAX_PACKAGE_CHAIN, " > ".join(chain)
+def test_modules_and_packages_at_any_depth_import_in_no_circle_and_in_short_chains():
+    for graph, most in (
+        (module_graph(), MAX_MODULE_CHAIN),
+        (package_graph(module_graph(), packages(LIBRARY)), MAX_PACKAGE_CHAIN),
+    ):
+        chain = longest_chain(graph)
+        assert len(chain) <= most, " > ".join(chain)
+    for package in packages(LIBRARY):
+        longest_chain(sibling_graph(module_graph(), package))  # raises CycleError with the circle
 
 
 def test_circles_at_any_depth_are_found():
@@ -118,7 +108,7 @@ def test_readers_of_intermediates_return_typed_records():
     untyped = {
         node.name
         for path in modules().values()
-        for node in ast.walk(tree_of(path))
+        for node in statements(tree_of(path))
         if isinstance(node, ast.FunctionDef) and node.name.startswith("read_") and node.returns
         if "dict[str, Any]" in ast.unparse(node.returns)
     }

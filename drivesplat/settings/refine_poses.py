@@ -42,6 +42,19 @@ class PriorSettings(Settings):
     """Change of the error within one second, as a fraction of the above: pose errors change slowly."""
 
 
+class RegisteredPriorSettings(PriorSettings):
+    """The same of poses whose LiDAR sweeps were registered to each other."""
+
+    position: float = Field(0.03, gt=0)
+    """Horizontal position (metres)."""
+    height: float = Field(0.03, gt=0)
+    """Height (metres)."""
+    tilt: float = Field(0.003, gt=0)
+    """Roll and pitch (radians)."""
+    heading: float = Field(0.002, gt=0)
+    """Heading (radians)."""
+
+
 class LimitSettings(Settings):
     """Limits beyond which a refinement is rejected: the given poses are kept and a warning names the limit. With
     `start: images` only min_points, min_images and max_scale_drift apply, and the rule fails."""
@@ -78,7 +91,7 @@ class RefinePosesSettings(Settings):
     for drives without poses, and fails where the drive does not allow it. docs/poses.md"""
     features: FeatureSettings = FeatureSettings()
     priors: PriorSettings = PriorSettings()
-    priors_with_lidar: PriorSettings = PriorSettings(position=0.03, height=0.03, tilt=0.003, heading=0.002)
+    priors_with_lidar: RegisteredPriorSettings = RegisteredPriorSettings()
     """The same for images, of drives whose LiDAR sweeps are registered to each other first."""
     limits: LimitSettings = LimitSettings()
     min_angle: float = Field(1.0, gt=0, le=90)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 from helpers import REPOSITORY
-from helpers.hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_evaluation, write_failure
+from helpers.hand_made_recipes import PROTOCOL, evaluation, recipe_file, table_cells, write_evaluation, write_failure
 from helpers.patience import PATIENCE_S
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
@@ -53,15 +53,6 @@ def compared(tmp_path_factory):
     return compare
 
 
-def rows(text: str) -> list[list[list[str]]]:
-    """The Markdown tables of a page: lines of cells."""
-    blocks = [block for block in text.split("\n\n") if block.startswith("|")]
-    return [
-        [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in block.splitlines()]
-        for block in blocks
-    ]
-
-
 TWO = {"plain": {}, "street": {"of": "street"}}
 EVALS = {
     "plain": [evaluation(24.0, 18.0, ssim=0.7), evaluation(25.0, 17.0, ssim=0.8)],
@@ -72,24 +63,20 @@ EVALS = {
 }
 
 
-def test_the_table_compares_recipes_with_the_first_one(compared):
+def test_the_table_compares_recipes_with_the_first_one_per_group_and_by_cost(compared):
     """Static PSNR 24 and 25 against 25 and 27: differences +1 and +2, mean 1.5, standard error 0.5."""
     record = compared(EVALS, TWO)
     (table,) = record["tables"]
     plain, street = table["rows"]
-    assert (table["reference"], [row["recipe"] for row in table["rows"]]) == ("plain", ["plain", "street"])
-    assert plain["interpolation"]["difference"]["static"] is None
+    assert (table["reference"], plain["recipe"], street["recipe"]) == ("plain", "plain", "street")
+    assert plain["interpolation"]["difference"]["static"] is None and record["failed"] == []
     off = street["interpolation"]["difference"]["static"]
     assert (off["mean"], off["by_seed"]) == (1.5, [1.0, 2.0])
     assert off["standard_error"] == pytest.approx(sqrt(0.5) / sqrt(2.0))
     assert street["interpolation"]["gap_db"]["by_seed"] == [3.0, 6.0]
     assert street["extrapolation"]["static"]["by_seed"] == [20.0, 22.0]
     assert (street["peak_gpu_memory_gb"]["mean"], street["train_seconds"]["max"]) == (3.0, 130.0)
-    assert record["failed"] == []
-
-
-def test_the_page_has_a_table_for_each_group_and_one_of_costs(compared):
-    between, beyond, costs = rows(markdown(compared(EVALS, TWO)))
+    between, beyond, costs = table_cells(markdown(record))
     assert between[0] == ["recipe", "static", "difference", "moving vehicles", "difference", "gap", "SSIM"]
     assert between[2] == ["`plain`", "24.5 (24.0 to 25.0)", "-", "17.5 (17.0 to 18.0)", "-", "7.0", "0.750"]
     assert between[3] == [
@@ -104,23 +91,17 @@ def test_the_page_has_a_table_for_each_group_and_one_of_costs(compared):
 def test_figures_against_the_truth_have_tables_of_their_own(compared):
     evals = json.loads(json.dumps(EVALS))
     for seed, content in enumerate(evals["street"]):
-        content["result"] |= {
-            "lateral": {
-                "4.0": {"static": {"psnr": 20.0 + seed}, "moving_vehicle": None, "depth": None},
-                "-2.0": {
-                    "static": {"psnr": 22.0 + seed},
-                    "moving_vehicle": {"psnr": 18.0},
-                    "depth": {"median_relative_error": 0.01 + 0.02 * seed},
-                },
-            },
-            "removal": {"box": {"psnr": 17.0 + seed}, "not_removed": {"box": {"psnr": 12.0}}},
-        }
+        left = {"static": {"psnr": 20.0 + seed}, "moving_vehicle": None, "depth": None}
+        depth = {"median_relative_error": 0.01 + 0.02 * seed}
+        right = {"static": {"psnr": 22.0 + seed}, "moving_vehicle": {"psnr": 18.0}, "depth": depth}
+        removal = {"box": {"psnr": 17.0 + seed}, "not_removed": {"box": {"psnr": 12.0}}}
+        content["result"] |= {"lateral": {"4.0": left, "-2.0": right}, "removal": removal}
     record = compared(evals, TWO)
     plain, street = (row["truth"] for row in record["tables"][0]["rows"])
     assert plain == {"lateral": {}, "side_camera": {}, "removal": {"removed": None, "not_removed": None}}
     assert street["lateral"]["-2.0"]["static"]["by_seed"] == [22.0, 23.0]
     page = markdown(record)
-    *_, lateral, removal, _ = rows(page)
+    *_, lateral, removal, _ = table_cells(page)
     assert lateral[0] == ["recipe", "view", "static", "moving vehicles", "depth error"]
     assert lateral[2:] == [
         ["`street`", "2 m to the right", "22.5 (22.0 to 23.0)", "18.0 (18.0 to 18.0)", "2.0%"],
@@ -142,42 +123,34 @@ OTHERWISE = {
 }  # fmt: skip
 
 
-def spelled(value: Any) -> str:
-    """A value as one line of YAML."""
-    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False).split("\n")[0]
-
-
-@pytest.mark.parametrize("key", OTHERWISE)
-def test_results_measured_under_another_protocol_get_their_own_table(compared, key):
-    evals = {**EVALS, "other": [evaluation(30.0, protocol=OTHERWISE[key])] * 2}
-    record = compared(evals, {"plain": TWO["plain"], "other": BAD, "street": TWO["street"]})
-    assert [[row["recipe"] for row in table["rows"]] for table in record["tables"]] == [["plain", "street"], ["other"]]
-    assert record["tables"][1]["rows"][0]["interpolation"]["difference"]["static"] is None, "to itself alone"
+def test_results_measured_under_another_protocol_get_their_own_table(compared):
+    evals = {**EVALS, **{key: [evaluation(30.0, protocol=changed)] * 2 for key, changed in OTHERWISE.items()}}
+    others = {key: {"overrides": {"train": {"iterations": 100 + i}}} for i, key in enumerate(OTHERWISE)}
+    record = compared(evals, {"plain": TWO["plain"], **others, "street": TWO["street"]})
+    recipes = [[row["recipe"] for row in table["rows"]] for table in record["tables"]]
+    assert recipes == [["plain", "street"], *([key] for key in OTHERWISE)]
     text = markdown(record)
-    (note,) = (line for line in text.splitlines() if line.startswith("The protocol differs from"))
-    assert f"{key} " in note and spelled(PROTOCOL[key]) in note
-    assert len(re.findall("^Difference|Difference from `other`", text)) == 1
+    notes = [line for line in text.splitlines() if line.startswith("The protocol differs from")]
+    for key, table, note in zip(OTHERWISE, record["tables"][1:], notes, strict=True):
+        assert table["rows"][0]["interpolation"]["difference"]["static"] is None, "to itself alone"
+        usual = yaml.safe_dump(PROTOCOL[key], default_flow_style=True, sort_keys=False).split("\n")[0]
+        assert f"{key} " in note and usual in note
+        assert text.count(f"Difference from `{key}`") == 1
 
 
-def test_a_failed_recipe_is_listed_with_its_reason_beside_the_others(compared):
+def test_a_failed_recipe_is_listed_and_recorded_with_its_reason_beside_the_figures_of_the_others(compared):
     record = compared({**EVALS, "bad": [None, None]}, {**TWO, "bad": BAD})
     assert [(item["recipe"], item["seed"]) for item in record["failed"]] == [("bad", 0), ("bad", 1)]
-    between, beyond, costs = rows(markdown(record))
+    between, beyond, costs = table_cells(markdown(record))
     assert between[4] == ["`bad`", r"failed: train: a loss \| no number", "", "", "", "", ""] and len(beyond) == 5
     assert [line[0] for line in costs[2:]] == ["`plain`", "`street`"]
     assert "- `bad`, seed 1: train: a loss | no number" in markdown(record)
-
-
-def test_the_record_holds_the_figures_and_source_of_every_seed(compared):
-    record = compared({**EVALS, "bad": [None, None]}, {**TWO, "bad": BAD})
     assert json.loads(json.dumps(record, allow_nan=False)) == record
-    assert [(name, [run["seed"] for run in runs]) for name, runs in record["runs"].items()] == [
-        ("plain", [0, 1]), ("street", [0, 1]), ("bad", [0, 1]),
-    ]  # fmt: skip
+    seeds = {name: [run["seed"] for run in runs] for name, runs in record["runs"].items()}
+    assert seeds == {"plain": [0, 1], "street": [0, 1], "bad": [0, 1]}
     run = record["runs"]["street"][1]
     assert run["result"] == EVALS["street"][1]["result"] and run["protocol"] == PROTOCOL
-    assert "street-seed1/train" in run["provenance"]["stages"]
-    assert record["runs"]["bad"][0]["result"] is None
+    assert "street-seed1/train" in run["provenance"]["stages"] and record["runs"]["bad"][0]["result"] is None
     assert (record["scene"], record["seeds"], record["recipes"]["bad"]["overrides"]) == (
         "0061",
         [0, 1],
@@ -185,31 +158,22 @@ def test_the_record_holds_the_figures_and_source_of_every_seed(compared):
     )
 
 
-@pytest.fixture
-def called(tmp_path, monkeypatch):
-    """Calls the command with `words`; a fake Snakemake writes the results of the recipes in `done`. Returns the exit
-    status and Snakemake's arguments."""
+def test_the_command_passes_arguments_to_snakemake_and_writes_page_and_record(tmp_path, monkeypatch, capsys):
+    """A fake Snakemake writes the results."""
+    recipe_file(tmp_path, recipes=TWO)
+    passed: list[str] = []
 
-    def call(words: list[str], done: tuple[str, ...] = ("plain", "street"), status: int = 0) -> tuple[int, list[str]]:
-        recipe_file(tmp_path, recipes=TWO)
-        passed: list[str] = []
+    def start(run: SnakemakeRun, arguments: list[str], workflow: Path) -> Outcome:
+        passed.extend(arguments)
+        for recipe, contents in EVALS.items():
+            for seed, content in enumerate(contents):
+                write_evaluation(run, recipe, seed, content)
+        return Outcome(0)
 
-        def start(run: SnakemakeRun, arguments: list[str], workflow: Path) -> Outcome:
-            passed.extend(arguments)
-            for recipe in done:
-                for seed, content in enumerate(EVALS[recipe]):
-                    write_evaluation(run, recipe, seed, content)
-            return Outcome(status)
-
-        monkeypatch.setattr(SnakemakeRun, "start", start)
-        monkeypatch.chdir(REPOSITORY)
-        return main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), *words]), passed
-
-    return call
-
-
-def test_the_command_passes_arguments_to_snakemake_and_writes_page_and_record(called, tmp_path, capsys):
-    assert called(["--", "--cores", "4", "--resources", "gpu=2"]) == (0, ["--cores", "4", "--resources", "gpu=2"])
+    monkeypatch.setattr(SnakemakeRun, "start", start)
+    monkeypatch.chdir(REPOSITORY)
+    words = ["--cores", "4", "--resources", "gpu=2"]
+    assert main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), "--", *words]) == 0 and passed == words
     page = (tmp_path / "out/quality.md").read_text(encoding="utf-8")
     record = json.loads((tmp_path / "out/quality.json").read_text())
     assert page == markdown(record) and page in capsys.readouterr().out

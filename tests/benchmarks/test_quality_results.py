@@ -95,10 +95,8 @@ def test_figures_of_earlier_settings_or_code_do_not_count(runs):
         path = write_evaluation(both, recipe, seed, evaluation(20.0))
         content = json.loads(path.read_text())
         train = content["provenance"]["stages"][f"{recipe}-seed{seed}/train"]
-        if change == "settings":
-            train["settings"]["train"]["iterations"] = 3
-        elif change == "code":
-            train["code"] = "other"
+        train["settings"]["train"] |= {"iterations": 3} if change == "settings" else {}
+        train |= {"code": "other"} if change == "code" else {}
         path.write_text(json.dumps(content))
     fails(both, "b", 1)
     found = ended(runs)

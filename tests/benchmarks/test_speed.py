@@ -11,6 +11,7 @@ import pytest
 import torch
 import yaml
 from helpers import REPOSITORY
+from helpers.hand_made_recipes import table_cells
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from benchmarks.speed import __main__ as command
@@ -88,8 +89,7 @@ def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_pa
 )
 def test_errors_are_reported_in_one_line(tmp_path, content, words):
     path = tmp_path / "mine.yaml"
-    text = content if isinstance(content, str) else yaml.safe_dump({"scene": "0061", **content})
-    path.write_text(text)
+    path.write_text(content if isinstance(content, str) else yaml.safe_dump({"scene": "0061", **content}))
     with pytest.raises(ConfigError) as failure:
         plan_run(read_speed_file(path, {}), tmp_path / "out", REPOSITORY)
     message = str(failure.value)
@@ -126,12 +126,6 @@ RUNS += [ended("plain", 1, 50.0, 22.0)]
 TWO = SpeedFile(scene="0061", seeds=(0, 1), iterations=(300, 700), profiled=10)
 
 
-def rows(text: str) -> list[list[list[str]]]:
-    """The Markdown tables of a page: lines of cells."""
-    blocks = [block for block in text.split("\n\n") if block.startswith("|")]
-    return [[[c.strip() for c in line.split("|")[1:-1]] for line in block.splitlines()] for block in blocks]
-
-
 def test_the_table_gives_times_with_the_quality_reached():
     """Loops of 60 and 50 s against 30 and 20 s: 2 and 2.5 times as fast. Static PSNR: +2 and +3."""
     record = speed(TWO, RUNS, [])
@@ -142,7 +136,7 @@ def test_the_table_gives_times_with_the_quality_reached():
     assert table["rows"][0]["times_as_fast"] is None
     assert table["rows"][1]["iterations_per_second"]["by_seed"] == [10.0, 15.0]
     assert table["rows"][1]["interpolation"]["difference"]["static"]["by_seed"] == [2.0, 3.0]
-    between, beyond = rows(markdown(record))
+    between, beyond = table_cells(markdown(record))
     assert between[0] == [
         "recipe", "loop", "whole", "iterations/s", "times as fast", "Gaussians", "GPU memory", "static", "difference",
         "all", "difference",
@@ -159,20 +153,15 @@ def test_the_table_gives_times_with_the_quality_reached():
     assert json.loads(json.dumps(record, allow_nan=False)) == record and record["runs"] == RUNS
 
 
-def points(*of: tuple[float, float]) -> list[dict[str, float]]:
-    return [{"iteration": 10 * i, "seconds": seconds, "static": psnr} for i, (seconds, psnr) in enumerate(of, 1)]
-
-
 def test_the_table_gives_the_time_to_quality():
     """The plain recipe is within 0.3 dB of its best, 21.0, half-way between its stops; the method reaches that value
     after 2 s with one seed, and never with the other."""
-    curves = {
-        ("plain", 0): points((10.0, 20.4), (20.0, 21.0), (30.0, 20.9)),
-        ("ours", 0): points((2.0, 21.0), (4.0, 24.0), (6.0, 25.0)),
-        ("plain", 1): points((10.0, 22.0)),
-        ("ours", 1): points((2.0, 20.0), (4.0, 21.0)),
-    }
-    runs_of = [{**run, "curve": curves[run["recipe"], run["seed"]]} for run in RUNS]
+    curves = [[(10.0, 20.4), (20.0, 21.0), (30.0, 20.9)], [(2.0, 21.0), (4.0, 24.0), (6.0, 25.0)]]
+    curves += [[(2.0, 20.0), (4.0, 21.0)], [(10.0, 22.0)]]
+    runs_of = [
+        {**run, "curve": [{"iteration": 10 * i, "seconds": s, "static": psnr} for i, (s, psnr) in enumerate(of, 1)]}
+        for run, of in zip(RUNS, curves, strict=True)
+    ]
     (one,) = speed(TWO.model_copy(update={"seeds": (0,)}), runs_of, [])["tables"]
     plain, ours = (row["time_to_quality"] for row in one["rows"])
     assert (plain["best"]["mean"], plain["near_best"]["mean"], plain["best_of_plain"]["mean"]) == (21.0, 15.0, 20.0)
@@ -183,7 +172,7 @@ def test_the_table_gives_the_time_to_quality():
     assert table["rows"][1]["time_to_quality"]["best_of_plain"] is None, "one seed does not reach it"
     page = markdown(record)
     assert "at 3 stops of each training" in page
-    assert ["`vanilla`", "23.0 (21.0 to 25.0)", "4.4 (3.4 to 5.4) s", "-"] in rows(page)[2]
+    assert ["`vanilla`", "23.0 (21.0 to 25.0)", "4.4 (3.4 to 5.4) s", "-"] in table_cells(page)[2]
     assert "Time to quality" not in markdown(speed(TWO, RUNS, []))
 
 
@@ -198,8 +187,9 @@ def test_the_table_compares_stages_by_their_share_of_the_iteration():
     profiles += [{"recipe": "ours", "iterations": 300, "stages": ours}]
     text = markdown(speed(TWO, RUNS, profiles))
     assert "over 10 iterations that continue from the trained models of seed 0" in text
-    assert rows(text)[2][0] == ["stage", "`plain`", "`vanilla`"]
-    assert rows(text)[2][2:] == [
+    *_, stages = table_cells(text)
+    assert stages[0] == ["stage", "`plain`", "`vanilla`"]
+    assert stages[2:] == [
         ["render", "2.00 (50%)", "1.00 (50%)"], ["checks", "-", "0.50 (25%)"], ["data", "1.00 (25%)", "-"],
         ["other", "1.00 (25%)", "0.50 (25%)"], ["iteration", "4.00", "2.00"],
     ]  # fmt: skip
@@ -233,27 +223,19 @@ TINY = {
 }
 
 
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory):
-    """A timed tiny drive: the workflow's folder and the printed text."""
-    copy = WorkflowCopy.make(tmp_path_factory.mktemp("speed") / "copy")
-    (copy.folder / "tiny.yaml").write_text(yaml.safe_dump(TINY))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(copy.folder)
-        patch.setattr(command, "run_in_process", lambda function, *args: function(*args))
-        status = command.main(["tiny.yaml", "--", "--cores", "2"])
-    assert status == 0
-    return copy
-
-
 @pytest.mark.slow
 @pytest.mark.workflow
-@pytest.mark.xdist_group("speed")
-def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record(measured):
-    record = measured.read("results/speed/tiny/speed.json")
+def test_the_command_trains_and_measures_all_recipes_as_rule_train_does(tmp_path, monkeypatch):
+    """Equal settings and files give the same model as the function that the rule calls."""
+    copy = WorkflowCopy.make(tmp_path / "copy")
+    (copy.folder / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    monkeypatch.chdir(copy.folder)
+    monkeypatch.setattr(command, "run_in_process", lambda function, *args: function(*args))
+    assert command.main(["tiny.yaml", "--", "--cores", "2"]) == 0
+    record = copy.read("results/speed/tiny/speed.json")
     (table,) = record["tables"]
-    plain, with_sky, ours = table["rows"]
-    for row in (plain, with_sky, ours):
+    plain, _, ours = table["rows"]
+    for row in table["rows"]:
         assert row["extrapolation"]["static"]["mean"] > 5.0, "it was measured"
         assert 0.0 < row["loop"]["mean"] <= row["whole"]["mean"]
         assert row["gaussians"]["mean"] > 0 and row["peak_gpu_memory_gb"] is None
@@ -269,27 +251,15 @@ def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record
         assert [point["iteration"] for point in run["curve"]] == [4, 8, 12]
         assert 0.0 < run["curve"][0]["seconds"] < run["curve"][1]["seconds"] <= run["loop"]
         if run["recipe"] != "ours":
-            assert_curve_ends_at_result(run)
-    page = (measured.folder / "results/speed/tiny/speed.md").read_text(encoding="utf-8")
+            group = next(group for group in run["result"].values() if group["static"])
+            assert run["curve"][-1]["static"] == pytest.approx(group["static"]["psnr"], abs=1e-4), "as in metrics.json"
+    page = (copy.folder / "results/speed/tiny/speed.md").read_text(encoding="utf-8")
     assert page == markdown(record) and "| `plain` |" in page and "| `vanilla` |" in page
 
-
-def assert_curve_ends_at_result(run: dict[str, Any]) -> None:
-    group = next(group for group in run["result"].values() if group["static"])
-    assert run["curve"][-1]["static"] == pytest.approx(group["static"]["psnr"], abs=1e-4), "as in metrics.json"
-
-
-@pytest.mark.slow
-@pytest.mark.workflow
-@pytest.mark.xdist_group("speed")
-def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkeypatch):
-    """Both call the same function, and equal settings and files give the same model."""
     script = (REPOSITORY / "workflow_scripts/train.py").read_text()
     assert re.search(r"^from drivesplat\.training\.stage import .*\brun_training$", script, re.MULTILINE)
     assert runs.run_training is run_training and runs.read_inputs is read_inputs
-    monkeypatch.chdir(measured.folder)
-    file = read_speed_file("tiny.yaml", {})
-    out = Path("results/speed/tiny")
+    file, out = read_speed_file("tiny.yaml", {}), Path("results/speed/tiny")
     *_, task = tasks_of(file, plan_run(file, out, Path()), out)
     timed = read_checkpoint(task.folder / "checkpoint.npz")
     inputs, _ = read_inputs(task.files.parser, [task.files.masks], (), (), ())

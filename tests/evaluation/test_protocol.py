@@ -47,7 +47,4 @@ def test_at_10_hz_it_states_rate_neighbourhood_and_distance_to_training(holdout,
     made = stated(10.0, train, **holdout)
     assert made["holdout"]["neighbourhood_s"] == neighbourhood
     assert made["key_frame_hz"] == 10.0 and made["nearest_training_s"] == pytest.approx(nearest)
-
-
-def test_without_training_images_there_is_no_distance():
-    assert stated(10.0, [])["nearest_training_s"] is None
+    assert stated(10.0, [])["nearest_training_s"] is None, "without training images there is no distance"

@@ -68,12 +68,8 @@ def path(scene, tmp_path_factory) -> Path:
     folder.mkdir(parents=True)
     np.savez(folder / "pattern.npz", elevations=ELEVATIONS, azimuths=AZIMUTHS + 0.5 * np.pi, offsets=OFFSETS)
     scans = []
-    for name, left, without in (
-        ("recorded", 0.0, None),
-        ("left", 2.0, None),
-        ("right", -2.0, None),
-        ("no", 0.0, AHEAD),
-    ):
+    views = [("recorded", 0.0, None), ("left", 2.0, None), ("right", -2.0, None), ("no", 0.0, AHEAD)]
+    for name, left, without in views:
         for index in KEY_FRAMES:
             sweep = scene.sweeps[index]
             seconds = seconds_of(sweep.timestamp)
@@ -120,10 +116,6 @@ def street(wall_at: float = WALL_AT, car_ahead: float = 0.0, intensity: float = 
     return SplatModel([wall, car], None).requires_grad_(False)
 
 
-def median(ranges: np.ndarray) -> float:
-    return float(np.median(ranges))
-
-
 def test_true_scans_are_seen_from_the_recorded_place_moved_as_the_truth_says(known, scene):
     recorded, left = ([scan for scan, _ in known.scans(left_m)] for left_m in (0.0, 2.0))
     assert [scan.sample_index for scan in recorded] == [*KEY_FRAMES]
@@ -141,7 +133,15 @@ def test_true_scans_are_seen_from_the_recorded_place_moved_as_the_truth_says(kno
 
 
 def test_scans_from_beside_the_path_are_compared_with_the_truth_from_there(known):
-    found = lateral_scan_metrics(street(), known, SPREAD, CPU)
+    """The figures have the places of those of images."""
+    figures = scan_truth_metrics(street(), known, MARGIN, SPREAD, CPU)
+    json.dumps(figures, allow_nan=False)
+    assert set(figures) == {"lateral", "removal"}
+    assert set(figures["removal"]["lidar"]) == {"box", "outside", "not_removed"}
+    group = {"static": None}
+    method = {**figures, "interpolation": group, "extrapolation": group, "gaussians": 1, "train_seconds": 1.0}
+    assert sentences({"methods": {"m": {**method, "device": "cpu"}}}, "metrics.json")
+    found = {offset: view["lidar"] for offset, view in figures["lateral"].items()}
     assert set(found) == {"2.0", "-2.0"}
     for regions in found.values():
         assert set(regions) == {"all", "static", "moving_vehicle"}
@@ -155,53 +155,31 @@ def test_scans_from_beside_the_path_are_compared_with_the_truth_from_there(known
     assert moved == pytest.approx(0.2, abs=0.05)
 
 
-def shadow_rays() -> int:
-    return sum(int(cast(0.5 * index, 0.0, True)["instance"].sum()) for index in KEY_FRAMES)
-
-
 def test_without_the_car_its_rays_meet_what_is_behind_it(known):
-    found = removal_scan_metrics(street(WALL_AT + 0.3), known, MARGIN, SPREAD, CPU)
-    assert set(found) == {"box", "outside", "not_removed"}
-    assert found["box"]["rays"] == shadow_rays() > 100
-    assert found["outside"]["rays"] == len(KEY_FRAMES) * 9 * 201 - shadow_rays()
-    assert found["box"]["range_error_median_m"] == pytest.approx(0.3, abs=0.03)
-    assert found["outside"]["range_error_median_m"] == pytest.approx(0.3, abs=0.03)
-    untouched = found["not_removed"]
-    gaps = []
+    found, gaps, shadow = removal_scan_metrics(street(WALL_AT + 0.3), known, MARGIN, SPREAD, CPU), [], 0
     for index in KEY_FRAMES:
         with_car, without = (cast(0.5 * index, 0.0, there) for there in (True, False))
         met = (with_car["instance"] == 1) & with_car["returned"]
         gaps.append(without["range"][met] - with_car["range"][met])
-    assert untouched["box"]["range_error_median_m"] == pytest.approx(median(np.concatenate(gaps)), abs=0.5)
-    assert untouched["outside"]["range_error_median_m"] == pytest.approx(0.3, abs=0.03)
+        shadow += int(with_car["instance"].sum())
+    assert set(found) == {"box", "outside", "not_removed"}
+    assert found["box"]["rays"] == shadow > 100
+    assert found["outside"]["rays"] == len(KEY_FRAMES) * 9 * 201 - shadow
+    for region in (found["box"], found["outside"], found["not_removed"]["outside"]):
+        assert region["range_error_median_m"] == pytest.approx(0.3, abs=0.03)
+    untouched = found["not_removed"]["box"]["range_error_median_m"]
+    assert untouched == pytest.approx(float(np.median(np.concatenate(gaps))), abs=0.5)
 
 
 def test_a_model_without_actors_loses_what_lies_in_the_box(known):
     """A car in its static part is removed by its box, in each scan."""
     moving = street()
-    car = sampled(moving.parts[1], scan_seconds(known))
+    car = sampled(moving.parts[1], next(scan.seconds for scan, _ in known.scans()))
     static = round_gaussians(car.means.numpy(), 0.08, 0.99)
     set_lidar_logits(static, 0.5)
     model = SplatModel([moving.parts[0], static], None).requires_grad_(False)
     found = removal_scan_metrics(model, known, MARGIN, SPREAD, CPU)
     assert found["not_removed"]["box"]["range_error_mean_m"] > found["box"]["range_error_mean_m"] + 1.0
-
-
-def scan_seconds(known: ScanTruth) -> float:
-    return next(scan.seconds for scan, _ in known.scans())
-
-
-def test_the_figures_have_the_places_of_those_of_images(known):
-    found = scan_truth_metrics(street(), known, MARGIN, SPREAD, CPU)
-    assert set(found) == {"lateral", "removal"} and set(found["lateral"]) == {"2.0", "-2.0"}
-    assert set(found["lateral"]["2.0"]["lidar"]) == {"all", "static", "moving_vehicle"}
-    assert set(found["removal"]["lidar"]) == {"box", "outside", "not_removed"}
-    json.dumps(found, allow_nan=False)
-    method = {
-        **found, "interpolation": {"static": None}, "extrapolation": {"static": None}, "gaussians": 1,
-        "train_seconds": 1.0, "device": "cpu",
-    }  # fmt: skip
-    assert sentences({"methods": {"m": method}}, "metrics.json")
 
 
 def test_a_missing_or_damaged_file_is_named_in_one_sentence(path, scene, known):

@@ -30,14 +30,9 @@ from examples.pandas_pickle import read_table
 
 LIDAR = rigid(Rotation.from_euler("z", -90, degrees=True).as_matrix(), np.array([0.0, 0.0, 2.1]))
 """In the ego frame: x to the right, y forward."""
-FRONT = LIDAR @ inverse(
-    rigid(
-        Rotation.from_quat(
-            [0.0030578899383849464, 0.7114721800418571, -0.7025205466606356, 0.016213200031258722]
-        ).as_matrix(),
-        np.array([0.0002585796504896516, -0.03907777167811011, -0.0440125762408362]),
-    )
-)
+FRONT_TURN = Rotation.from_quat([0.0030578899383849464, 0.7114721800418571, -0.7025205466606356, 0.016213200031258722])
+FRONT_PLACE = np.array([0.0002585796504896516, -0.03907777167811011, -0.0440125762408362])
+FRONT = LIDAR @ inverse(rigid(FRONT_TURN.as_matrix(), FRONT_PLACE))
 ELEVATIONS = np.radians(np.linspace(-25.0, 3.0, 8))
 SPIN, DELAY = 50_000, 13_000
 """Microseconds of half a revolution, and of the left camera after the front camera."""
@@ -153,22 +148,22 @@ def test_pandaset_shows_the_world_that_it_recorded(scene, drive):
     assert [track.category for track in scene.tracks] == list(LABELS.values())
     assert [track.object_class for track in scene.tracks] == ["car", "truck", "pedestrian"]
     assert all(len(track.timestamps) == len(TIMES) for track in scene.tracks)
-
-
-def test_returns_of_pandaset_are_those_of_the_spinning_lidar(scene, drive):
     table, hits = scan(drive, int(TIMES[2]))
-    np.testing.assert_allclose(world_points(scene, 2, drive), hits, atol=2e-3)
+    np.testing.assert_allclose(world_points(scene, 2, drive), hits, atol=2e-3), "those of the spinning LiDAR"
     returns = read_returns(scene.sweeps[2])
     np.testing.assert_allclose(returns.offsets_s, table["t"][:-1] - TIMES[2] * 1e-6, atol=1e-6)
     np.testing.assert_allclose(returns.intensity, 0.2, atol=1e-6)
 
 
-def test_both_cameras_are_converted_with_the_front_camera_first(sequence, tmp_path):
+def test_both_cameras_are_converted_with_the_front_camera_first(sequence, tmp_path, capsys):
     assert pandaset.main([str(sequence), str(tmp_path / "out")]) == 0
-    assert list(read_drive(tmp_path / "out").cameras) == ["front_camera", "left_camera"]
-    np.testing.assert_allclose(
-        read_drive(tmp_path / "out").cameras["front_camera"].sensor_to_ego.translation, FRONT[:3, 3]
-    )
+    cameras = read_drive(tmp_path / "out").cameras
+    assert list(cameras) == ["front_camera", "left_camera"]
+    np.testing.assert_allclose(cameras["front_camera"].sensor_to_ego.translation, FRONT[:3, 3])
+    assert pandaset.main([str(tmp_path), str(tmp_path / "out")]) == 1
+    assert "has no folder front_camera" in capsys.readouterr().err
+    assert pandaset.main([str(sequence), str(tmp_path / "out"), "--cameras", "roof"]) == 1
+    assert "has no folder roof; there are: front_camera, left_camera" in capsys.readouterr().err
 
 
 def test_the_recorded_frame_of_pandaset_is_converted(tmp_path):
@@ -215,7 +210,7 @@ class OldFrame:
         return copyreg.__newobj__, (pandas.DataFrame,), {"_data": OldManager(), "_typ": "dataframe", "attrs": {}}
 
 
-@pytest.mark.parametrize("protocol", [3, 4, 5])
+@pytest.mark.parametrize("protocol", [3, 5])
 @pytest.mark.parametrize("frame", [pandas.DataFrame(TABLE), pandas.DataFrame(TABLE, index=[7, 5, 6]), OldFrame()])
 def test_tables_are_read_as_they_were_written(frame, protocol, tmp_path):
     path = tmp_path / "a.pkl"
@@ -267,9 +262,8 @@ class Forged:
         return np.zeros(1).__reduce_ex__(5)[0], self.arguments
 
 
-@pytest.mark.parametrize(
-    ("array", "reason"),
-    [
+def test_arrays_that_do_not_fit_their_bytes_are_refused(tmp_path):
+    for array, reason in (
         (Forged(b"12345678", "O", (1,)), "an array of objects has no bytes"),
         (Forged(b"12345678", "f8", (2,)), "another number of bytes"),
         (Forged(b"", "f8", (-1, 0)), "no shape"),
@@ -277,22 +271,13 @@ class Forged:
         (Forged(b"\2", "?", (1,)), "no truth values"),
         (Forged(b"\xff" * 4, "<U1", (1,)), "no truth values or characters"),
         (Forged(b"12345678", "M8[s]", (1,)), "another dtype"),
-    ],
-)
-def test_arrays_that_do_not_fit_their_bytes_are_refused(array, reason, tmp_path):
-    (tmp_path / "a.pkl").write_bytes(pickle.dumps(array, protocol=4))
-    with pytest.raises(DatasetError, match=rf"a\.pkl cannot be read as a table of pandas.*{reason}"):
-        read_table(tmp_path / "a.pkl")
+    ):
+        (tmp_path / "a.pkl").write_bytes(pickle.dumps(array, protocol=4))
+        with pytest.raises(DatasetError, match=rf"a\.pkl cannot be read as a table of pandas.*{reason}"):
+            read_table(tmp_path / "a.pkl")
 
 
-def test_a_damaged_sequence_ends_with_a_sentence(sequence, tmp_path, capsys):
-    assert pandaset.main([str(tmp_path), str(tmp_path / "out")]) == 1
-    assert "has no folder front_camera" in capsys.readouterr().err
-    assert pandaset.main([str(sequence), str(tmp_path / "out"), "--cameras", "roof"]) == 1
-    assert "has no folder roof; there are: front_camera, left_camera" in capsys.readouterr().err
-
-
-@damages(50, 200)
+@damages(15, 200)
 def test_damaged_sequences_are_refused_in_one_line_or_sound(short_sequence, tmp_path, capsys, random):
     files = sorted(path.relative_to(short_sequence) for path in short_sequence.rglob("*") if path.is_file())
     chosen = random.choice([file for file in files if file.name != "00.jpg" or likely(random, 3)])

@@ -29,7 +29,7 @@ def exported(folder, scene, record) -> pycolmap.Reconstruction:
     return model
 
 
-def test_images_have_their_names_poses_and_intrinsics(tmp_path, tiny_scene, record, tiny_root):
+def test_images_have_their_names_poses_and_intrinsics_and_points_are_the_seed(tmp_path, tiny_scene, record, tiny_root):
     model = exported(tmp_path, tiny_scene, record)
     assert len(model.images) == len(tiny_scene.frames) == 19 and len(model.cameras) == 1
     rng = np.random.default_rng(1)
@@ -41,6 +41,10 @@ def test_images_have_their_names_poses_and_intrinsics(tmp_path, tiny_scene, reco
         points = frame.ego_to_world[:3, 3] + rng.uniform([8, -4, -1], [30, 4, 4], (20, 3))
         expected, _ = project(points, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
         np.testing.assert_allclose([image.project_point(point) for point in points], expected, atol=1e-6)
+    assert sorted(model.points3D) == list(range(1, 26))
+    for i, point in model.points3D.items():
+        np.testing.assert_allclose(point.xyz, record.points[i - 1], atol=1e-4)
+        assert point.color.tolist() == record.points_rgb[i - 1].tolist()
 
 
 def test_cameras_of_a_rig_are_kept_apart(tmp_path, tiny_scene, record):
@@ -55,14 +59,6 @@ def test_cameras_of_a_rig_are_kept_apart(tmp_path, tiny_scene, record):
     for frame in frames:
         (image,) = (image for image in model.images.values() if frame.image_path.endswith(image.name))
         assert image.camera.focal_length_x == pytest.approx(frame.intrinsics[0, 0])
-
-
-def test_points_are_the_seed(tmp_path, tiny_scene, record):
-    model = exported(tmp_path, tiny_scene, record)
-    assert sorted(model.points3D) == list(range(1, 26))
-    for i, point in model.points3D.items():
-        np.testing.assert_allclose(point.xyz, record.points[i - 1], atol=1e-4)
-        assert point.color.tolist() == record.points_rgb[i - 1].tolist()
 
 
 def test_an_unwritable_file_is_named(tmp_path, tiny_scene, record):

@@ -1,16 +1,13 @@
-"""Objects that deform, in the viewer: their modes, and what the page shows of them, as recorded and edited."""
+"""Objects that deform, in exports: their shapes at the times that were asked for, and their modes in the viewer."""
 
 import numpy as np
 import pytest
 import torch
-from helpers.chromium import chromium, in_a_browser
+from helpers.chromium import in_a_browser
 from helpers.hand_made import round_gaussians
-from helpers.hand_made_traffic import TURNING, with_turning_track
-from helpers.samples import sampled_with
+from helpers.hand_made_traffic import TURNING
+from helpers.samples import sampled, sampled_with
 from helpers.viewer_pages import (
-    HEIGHT,
-    SHOWN_WITHOUT_WORDS,
-    WIDTH,
     a_model,
     a_sky,
     choose,
@@ -23,11 +20,20 @@ from helpers.viewer_pages import (
     splats,
 )
 from helpers.walkers import SIZE, walker, walking
+from pxr import Gf, Usd, UsdVol
 from scipy.spatial.transform import Rotation
 
 from drivesplat.export.modes import Gait, Modes, fitted_modes
 from drivesplat.export.sampled_motion import SampledMotion
-from drivesplat.export.trained_parts import SampledGroup, sampled_shapes, trained_groups
+from drivesplat.export.thinning import thinned_groups
+from drivesplat.export.trained_parts import (
+    SampledGroup,
+    sampled_shapes,
+    shown_timestamp,
+    trained_gaussians,
+    trained_groups,
+)
+from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_scene import ViewerContent, modes_array
 from drivesplat.kernels.placement import LocalGaussians
@@ -36,8 +42,10 @@ from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import TimeState
+from drivesplat.settings.train import GaussianSettings
 from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit
 
+NO_TIMES = np.array([], dtype=np.int64)
 EDITED = {"walked": 0.7, "scale": 1.25, "phase": 0.3}
 
 
@@ -52,8 +60,8 @@ def model(people) -> SplatModel:
 
 
 @pytest.fixture(scope="module")
-def group(model, tiny_scene) -> SampledGroup:
-    return trained_groups(model, with_turning_track(tiny_scene), np.array([], dtype=np.int64), 1.0)[TURNING]
+def group(model, scene) -> SampledGroup:
+    return trained_groups(model, scene, NO_TIMES, 1.0)[TURNING]
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +82,7 @@ def turned_by(quats: torch.Tensor, turns: np.ndarray, others: torch.Tensor) -> n
     return (found.inv() * Rotation.from_quat(others.detach().numpy(), scalar_first=True)).magnitude()
 
 
-@pytest.mark.parametrize("changes", [{}, EDITED])
-@pytest.mark.parametrize("second", [0.3, 1.0, 2.7])
+@pytest.mark.parametrize(("second", "changes"), [(0.3, {}), (1.0, {}), (1.0, EDITED), (2.7, EDITED)])
 def test_modes_give_the_shapes_of_the_model(people, group, modes, second, changes):
     """Also those of gaits that were not recorded; orientations to a degree or two, since turns are not quite linear."""
     gait = Gait(np.array([second]), np.array([0.7]), 1.25, 0.3) if changes else Gait(np.array([second]))
@@ -87,11 +94,7 @@ def test_modes_give_the_shapes_of_the_model(people, group, modes, second, change
     angles = turned_by(group.gaussians.quats, np.einsum("m,mnj->nj", weights, modes.turns), expected.quats)
     assert np.degrees(angles).mean() < 2.0 and np.degrees(angles).max() < 8.0
     assert far > 0.05 or second == 1.0, "the group shows the shape of second 1"
-
-
-def test_weights_are_of_similar_size(modes, group):
-    """So that modes that are stored coarsely add little error."""
-    weights = modes.weights(Gait(group.shapes.seconds))
+    weights = modes.weights(Gait(group.shapes.seconds))  # of similar size: coarsely stored modes add little error
     np.testing.assert_allclose(np.mean(weights**2, axis=0), 1.0, rtol=1e-4)
 
 
@@ -120,7 +123,7 @@ def ahead_of_the_camera() -> tuple[Deformable, SplatModel]:
 
 
 @in_a_browser
-def test_people_walk_as_recorded_and_as_edited(tmp_path):
+def test_people_walk_as_recorded_and_as_edited(opened):
     street, sky, frame = splats(60, sh_degree=1), a_sky(), oblique_frame()
     people, model = ahead_of_the_camera()
     motion = people.timeline.tracks[0].motion
@@ -136,8 +139,6 @@ def test_people_walk_as_recorded_and_as_edited(tmp_path):
         groups, sky, False, path_from(frame), [SampledEdit("slowed", (slowed,), None)],
         modes=fitted_modes(model, groups),
     )  # fmt: skip
-    file = tmp_path / "viewer.html"
-    file.write_text(viewer_page(content, "test", {}), encoding="utf-8")
 
     def expected(second: float, shape: dict[str, float] | None = None, place: float | None = None) -> np.ndarray:
         pose = motion.poses(np.array([second if place is None else place]))[0]
@@ -146,9 +147,7 @@ def test_people_walk_as_recorded_and_as_edited(tmp_path):
             person = sampled_with(people, second, [placement])
         return rendered(a_model(concatenate([street, person]), sky), frame.camera_to_world)
 
-    with chromium(tmp_path / "profile") as tab:
-        tab.open(file, WIDTH, HEIGHT)
-        tab.run(SHOWN_WITHOUT_WORDS)
+    with opened(viewer_page(content, "test", {})) as tab:
         for second in (0.4, 1.3):
             tab.run(set_second(second))
             walked = float(motion.walked(np.array([second]))[0])
@@ -157,4 +156,65 @@ def test_people_walk_as_recorded_and_as_edited(tmp_path):
         tab.run(f"{set_second(1.5)}; {choose('edit', 0)}")
         assert psnr(settled(tab), expected(1.5, {"walked": 0.6, "phase": 0.5}, 1.0)) > 36.0
         assert psnr(settled(tab), expected(1.5, {"walked": 0.6}, 1.0)) < 32.0
-        assert tab.complaints == []
+
+
+def means_in_box(people: Deformable, second: float) -> np.ndarray:
+    return in_box(people, second).means.detach().numpy()
+
+
+@pytest.fixture(scope="module")
+def groups(model, scene) -> dict[str, SampledGroup]:
+    return trained_groups(model, scene, NO_TIMES)
+
+
+def test_shapes_are_those_of_the_model_and_others_at_other_times(model, people, groups):
+    shapes = groups[TURNING].shapes
+    assert groups["background"].shapes is None, "what is rigid has none"
+    assert all(part.shapes("nobody", [0.0]) is None for part in model.parts)
+    assert shapes is not None and shapes.means.shape == (len(shapes.seconds), 30, 3)
+    for second, means in zip(shapes.seconds, shapes.means, strict=True):
+        np.testing.assert_allclose(means, means_in_box(people, float(second)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(shapes.quats, axis=-1), 1.0, atol=1e-6)
+    assert np.abs(shapes.means - shapes.means[0]).max() > 0.05
+
+
+def test_thinned_or_dropped_gaussians_leave_the_others_their_own_shapes(people, scene, groups):
+    kept, whole = thinned_groups(groups, 12)[TURNING], groups[TURNING]
+    rows = [int((whole.gaussians.means == mean).all(dim=1).nonzero()) for mean in kept.gaussians.means]
+    assert 0 < len(rows) < 30
+    np.testing.assert_array_equal(kept.shapes.means, whole.shapes.means[:, rows])
+    np.testing.assert_array_equal(kept.shapes.quats, whole.shapes.quats[:, rows])
+    params = {name: value.detach().clone() for name, value in people.params.items()}
+    broken = Deformable(params, people.timeline.tracks, people._settings, GaussianSettings())
+    with torch.no_grad():
+        broken.params["opacities"][4] = torch.nan
+    finite = trained_groups(SplatModel([broken], None), scene, NO_TIMES)[TURNING]
+    assert len(finite.gaussians) == 29 and finite.shapes.means.shape[1] == 29
+
+
+def test_usd_plays_positions_orientations_and_extents(people, scene, groups, tmp_path):
+    write_usdz(tmp_path / "a.usdz", splat_stage(groups, [(0.0, Gf.Camera())], {}))
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
+    splat = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"/World/actors/_{TURNING}"))
+    shapes = groups[TURNING].shapes
+    for i in range(0, len(shapes.seconds), 7):
+        code = Usd.TimeCode(float(shapes.seconds[i]) * 30.0)
+        positions = np.array(splat.GetPositionsAttr().Get(code))
+        np.testing.assert_allclose(positions, means_in_box(people, float(shapes.seconds[i])), atol=1e-5)
+        real = np.array([quat.GetReal() for quat in splat.GetOrientationsAttr().Get(code)])
+        np.testing.assert_allclose(real, shapes.quats[i, :, 0], atol=1e-5)
+        low, high = np.array(splat.GetExtentAttr().Get(code))
+        assert (low < positions).all() and (positions < high).all()
+    shown = scene.seconds(shown_timestamp(scene, None))
+    np.testing.assert_allclose(np.array(splat.GetPositionsAttr().Get()), means_in_box(people, shown), atol=1e-5)
+    still = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/background"))
+    assert still.GetPositionsAttr().GetNumTimeSamples() == 0
+
+
+def test_a_ply_shows_the_time_that_was_asked_for(model, people, scene):
+    for second in (0.25, 1.0):
+        own = trained_groups(model, scene, NO_TIMES, second)[TURNING].gaussians
+        np.testing.assert_allclose(own.means.numpy(), means_in_box(people, second), atol=1e-6)
+        together = trained_gaussians(model, scene, second)
+        expected = sampled(people, second).means.detach()
+        np.testing.assert_allclose(together.means[-30:].detach().numpy(), expected.numpy(), atol=1e-5)

@@ -7,16 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import BLACK, recording_of, round_gaussians
-from helpers.hand_made_traffic import (
-    FADING,
-    GONE_AT_TIMES,
-    TRAJECTORIES,
-    TURNING,
-    Traffic,
-    own_gaussians,
-    placed,
-    with_turning_track,
-)
+from helpers.hand_made_traffic import FADING, GONE_AT_TIMES, TRAJECTORIES, TURNING, Traffic, own_gaussians, placed
 from helpers.records import EMPTY_CHECKPOINT
 
 from drivesplat.export import splat_asset
@@ -42,16 +33,10 @@ def street() -> SplatModel:
 def export_all(folder, model, scene, monkeypatch):
     """What the stage writes into `folder` for a model; returns parts.json's content."""
     monkeypatch.setattr(splat_asset, "trained_model", lambda _: model)
-    files = SplatFiles(
-        *(folder / name for name in ("splat.ply", "cameras.json", "parts/parts.json", "transforms.json"))
-    )
+    names = ("splat.ply", "cameras.json", "parts/parts.json", "transforms.json")
+    files = SplatFiles(*(folder / name for name in names))
     export_splat(files, EMPTY_CHECKPOINT, recording_of(scene).record, scene, SplatJob(), PROVENANCE)
     return json.loads((folder / "parts/parts.json").read_text())
-
-
-@pytest.fixture(scope="module")
-def scene(tiny_scene):
-    return with_turning_track(tiny_scene)
 
 
 @pytest.fixture(scope="module")
@@ -63,13 +48,8 @@ def folder(tmp_path_factory, scene):
 
 
 @pytest.fixture(scope="module")
-def record(folder):
-    return json.loads((folder / "parts/parts.json").read_text())
-
-
-@pytest.fixture(scope="module")
-def parts(record):
-    return {part["name"]: part for part in record["parts"]}
+def parts(folder):
+    return {part["name"]: part for part in json.loads((folder / "parts/parts.json").read_text())["parts"]}
 
 
 def unit(quats: torch.Tensor) -> torch.Tensor:
@@ -138,14 +118,13 @@ def test_splat_ply_holds_all_groups_present_at_the_middle_image(folder):
 
 
 def test_vanilla_is_one_group_equal_to_splat_ply(tmp_path, tiny_scene, monkeypatch):
-    record = export_all(tmp_path, SplatModel([round_gaussians(STREET)], None), tiny_scene, monkeypatch)
-    assert [(part["file"], part["frame"], part["motion"]) for part in record["parts"]] == [
-        ("background.ply", "world", None)
-    ]
-    assert_same(read_splat_ply(tmp_path / "parts/background.ply"), read_splat_ply(tmp_path / "splat.ply"))
-
-
-def test_a_name_made_unique_does_not_collide_with_another():
+    """A transparent static Gaussian is no absent object."""
+    model = SplatModel([round_gaussians(STREET, opacities=[0.0, 0.5, 0.9])], None)
+    (part,) = export_all(tmp_path, model, tiny_scene, monkeypatch)["parts"]
+    assert (part["file"], part["frame"], part["motion"]) == ("background.ply", "world", None)
+    found = read_splat_ply(tmp_path / "splat.ply")
+    assert len(found) == 3
+    assert_same(read_splat_ply(tmp_path / "parts/background.ply"), found)
     assert unique_names(["a", "A", "a_2"], str) == {"a": "a", "A": "A_2", "a_2": "a_2_2"}
     assert unique_names(["camera", "b"], str, taken=["Camera"]) == {"camera": "camera_2", "b": "b"}
 
@@ -158,17 +137,10 @@ def test_gaussians_with_nan_are_dropped_in_every_export(tiny_scene, monkeypatch,
         return own
 
     monkeypatch.setattr("helpers.hand_made_traffic.own_gaussians", broken)
-    model = street()
     with caplog.at_level(logging.WARNING):
-        together = trained_gaussians(model, tiny_scene)
-        groups = trained_groups(model, tiny_scene, np.array([], dtype=np.int64))
+        together = trained_gaussians(street(), tiny_scene)
+        groups = trained_groups(street(), tiny_scene, np.array([], dtype=np.int64))
     assert len(together) == 3 + 10
-    assert {name: len(group.gaussians) for name, group in groups.items()} == {
-        "background": 3, TURNING: 10, GONE_AT_TIMES: 10,
-    }  # fmt: skip
+    counts = {name: len(group.gaussians) for name, group in groups.items()}
+    assert counts == {"background": 3, TURNING: 10, GONE_AT_TIMES: 10}
     assert f"{TURNING}: 2 of 12 Gaussians contain NaN or Inf and are dropped" in caplog.text
-
-
-def test_a_transparent_static_gaussian_is_not_an_absent_object(tiny_scene):
-    model = SplatModel([round_gaussians(STREET, opacities=[0.0, 0.5, 0.9])], None)
-    assert len(trained_gaussians(model, tiny_scene)) == 3

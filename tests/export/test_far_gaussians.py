@@ -6,6 +6,7 @@ import logging
 import numpy as np
 import pytest
 import torch
+from helpers import hand_made_street
 from helpers.hand_made import Own, looking_at, recording_of, round_gaussians
 from pxr import Usd, UsdGeom
 
@@ -21,7 +22,7 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.export import ExportJob, SplatJob
-from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train import TrainSettings
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {}, "inputs": {}}
@@ -50,20 +51,15 @@ def checkpoint_of(places, sizes, opacities, colors=RED) -> TrainedCheckpoint:
         np.concatenate([near_opacities, np.broadcast_to(opacities, len(places))]),
         np.concatenate([np.tile(BLUE, (len(near_places), 1)), np.broadcast_to(colors, places.shape)]),
     )
-    model = SplatModel([part], ConstantSky(torch.tensor(SKY), 1e-2))
-    job = TrainJob(parts=("background",), sky="mask", train=TrainSettings(), random_seed=0)
-    return TrainedCheckpoint.of(model, job, PROVENANCE)
+    return hand_made_street.checkpoint_of(SplatModel([part], ConstantSky(torch.tensor(SKY), 1e-2)), TrainSettings())
 
 
-def scattered(count: int = 40) -> np.ndarray:
-    """Places 1.2 to 90 km away in all directions."""
-    rng = np.random.default_rng(1)
-    directions = rng.normal(size=(count, 3))
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True) * np.geomspace(1.2e3, 9e4, count)[:, None]
-
-
-INVISIBLE = {"sizes": 0.5, "opacities": 0.5}
-"""Gaussians that are far smaller than a pixel, where they are: the filter of the projection leaves them faint."""
+def disc_and_scattered() -> TrainedCheckpoint:
+    """A red disc of two degrees, 80 km ahead, and 40 faint Gaussians 1.2 to 90 km away in all directions."""
+    directions = np.random.default_rng(1).normal(size=(40, 3))
+    directions *= (np.geomspace(1.2e3, 9e4, 40) / np.linalg.norm(directions, axis=1))[:, None]
+    places = np.concatenate([[[8e4, 0.0, 1.0]], directions])
+    return checkpoint_of(places, sizes=[3e3] + 40 * [0.5], opacities=[0.9] + 40 * [0.003])
 
 
 def images(checkpoint: TrainedCheckpoint, seen: list[View]) -> torch.Tensor:
@@ -80,29 +76,18 @@ def found(checkpoint: TrainedCheckpoint, seen: list[View]):
     return find_far(trained_model(checkpoint), seen, LIMIT, PROVENANCE)
 
 
-def test_those_that_no_view_shows_are_left_out_and_all_others_stay():
-    checkpoint = checkpoint_of(scattered(), sizes=0.5, opacities=0.003)
+def test_those_that_no_view_shows_are_left_out_and_visible_ones_seen_in_the_same_place_from_within_the_limit():
+    """The disc covers sky: without it views would change by far more than 1/255. Cameras in a row towards it see it
+    without parallax."""
+    checkpoint = disc_and_scattered()
     far = found(checkpoint, views())
-    assert farthest(checkpoint) == pytest.approx(9e4, rel=1e-5)
-    assert far.removed.tolist() == list(range(60, 100)) and len(far.moved) == 0 and far.views == 5
-    bounded = within_reach(checkpoint, far)
-    assert farthest(bounded) < 50.0
-    for name, values in bounded.model.items():
-        assert torch.equal(values, checkpoint.model[name][:60] if name.startswith("parts") else checkpoint.model[name])
-    change = (images(bounded, views()) - images(checkpoint, views())).abs().max()
-    assert float(change) == pytest.approx(far.largest_change, abs=1e-6) and far.largest_change <= MAX_CHANGE
-
-
-def test_visible_ones_are_seen_in_the_same_place_from_within_the_limit():
-    """A red disc of two degrees, 80 km ahead, covers sky: without it views would change by far more than 1/255. Cameras
-    in a row towards it see it without parallax."""
-    checkpoint = checkpoint_of(
-        [[8e4, 0.0, 1.0], *scattered()], sizes=[3e3] + 40 * [0.5], opacities=[0.9] + 40 * [0.003]
-    )
-    far = found(checkpoint, views())
-    assert far.moved.tolist() == [60] and len(far.removed) == 40
+    assert farthest(checkpoint) == pytest.approx(9e4, rel=1e-5) and far.views == 5
+    assert far.moved.tolist() == [60] and far.removed.tolist() == list(range(61, 101))
     bounded = within_reach(checkpoint, far)
     assert 0.85 * LIMIT < farthest(bounded) <= LIMIT
+    for name, values in bounded.model.items():
+        kept = checkpoint.model[name]
+        assert torch.equal(values[:60], kept[:60]) and len(values) == (61 if name.startswith("parts") else len(kept))
     before, after = images(checkpoint, views()), images(bounded, views())
     assert float((before[..., 0] - before[..., 2]).max()) > 0.3, "the disc is in the picture"
     assert float((after - before).abs().max()) == pytest.approx(far.largest_change, abs=1e-6)
@@ -129,17 +114,13 @@ def test_a_long_drive_keeps_what_is_near_its_cameras():
     assert reach_of(apart, LIMIT) == pytest.approx(2500.0, abs=1e-3)
 
 
-def test_far_gaussians_of_objects_are_left_out():
+def test_far_gaussians_of_objects_are_left_out_and_those_that_are_not_finite_left_to_the_exports():
     """Positions of an object are those in its box: nothing of it is a kilometre away."""
-    still = round_gaussians(near()[0])
     astray = Own(round_gaussians([[5.0, 0.0, 0.0], [5e3, 0.0, 0.0]]), "car")
-    far = find_far(SplatModel([still, astray], None), views(), LIMIT, PROVENANCE)
+    far = find_far(SplatModel([round_gaussians(near()[0]), astray], None), views(), LIMIT, PROVENANCE)
     assert far.removed.tolist() == [61] and len(far.moved) == 0
-
-
-def test_positions_that_are_not_finite_are_left_to_the_exports():
-    checkpoint = checkpoint_of([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0]], **INVISIBLE)
-    far = found(checkpoint, views())
+    broken = checkpoint_of([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0]], sizes=0.5, opacities=0.5)
+    far = found(broken, views())
     assert len(far.removed) == len(far.moved) == 0
 
 
@@ -155,18 +136,13 @@ def test_the_record_is_read_back_and_a_damaged_one_refused(tmp_path):
 
 
 def test_no_export_holds_one_and_the_extent_follows(tmp_path, tiny_scene):
-    checkpoint = checkpoint_of(
-        [[8e4, 0.0, 1.0], *scattered()], sizes=[3e3] + 40 * [0.5], opacities=[0.9] + 40 * [0.003]
-    )
+    checkpoint, record = disc_and_scattered(), recording_of(tiny_scene).record
     bounded = within_reach(checkpoint, found(checkpoint, views()))
-    record = recording_of(tiny_scene).record
-    files = SplatFiles(
-        *(tmp_path / name for name in ("splat.ply", "cameras.json", "parts/parts.json", "transforms.json"))
-    )
+    names = ("splat.ply", "cameras.json", "parts/parts.json", "transforms.json")
+    files = SplatFiles(*(tmp_path / name for name in names))
     export_splat(files, bounded, record, tiny_scene, SplatJob(), PROVENANCE)
-    export_usd(
-        tmp_path / "scene.usdz", bounded, tiny_scene, ExportJob(eval_camera="CAM_FRONT", gaussians=99), PROVENANCE
-    )
+    job = ExportJob(eval_camera="CAM_FRONT", gaussians=99)
+    export_usd(tmp_path / "scene.usdz", bounded, tiny_scene, job, PROVENANCE)
     for path in (files.splat, files.parts.with_name("background.ply")):
         distances = read_splat_ply(path).means.norm(dim=1)
         assert len(distances) == 61 and float(distances.max()) <= LIMIT

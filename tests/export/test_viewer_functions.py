@@ -110,30 +110,25 @@ def test_an_address_brings_back_view_time_and_edit_and_ignores_nonsense():
     view = {"heading": 0.25, "pitch": -0.125, "roll": 0.5, "position": [1.5, -2.25, 1e3]}
     edits = [{"name": "a & b"}, {"name": "other"}]
     state = {"view": view, "second": 1.25, "following": True}
-    back = by_node(
-        "link", state=state, edits=edits, expression="stateIn(fragmentOf({ ...state, edit: edits[0] }), edits)"
-    )
-    assert back == {**state, "edit": edits[0]}
-    for fragment in ("", "#", "#second=x&view=1,2&edit=gone", "#view=1,2,3,4,5,NaN"):
-        assert by_node("link", fragment=fragment, expression="stateIn(fragment, [])") == {}
+    nonsense = ["", "#", "#second=x&view=1,2&edit=gone", "#view=1,2,3,4,5,NaN"]
+    expression = """[fragmentOf({ ...state, edit: edits[0] }), ...nonsense].map((part) => stateIn(part, edits))"""
+    back = by_node("link", state=state, edits=edits, nonsense=nonsense, expression=expression)
+    assert back == [{**state, "edit": edits[0]}, {}, {}, {}, {}]
 
 
-@pytest.mark.parametrize(
-    ("path", "expected"),
-    [
-        ("/home/results/0061/street/viewer.html", "../gsplat%20d/viewer.html"),
-        ("/C:/results/0061/street/viewer.html", "../gsplat%20d/viewer.html"),
-        ("/report/data/raw/0a1b/viewer.html", None),
-        ("/downloads/viewer.html", None),
-    ],
-)
-def test_pages_beside_are_those_in_the_folders_of_methods(path, expected):
-    assert by_node("link", path=path, expression='pageBeside(path, "street", "gsplat d")') == expected
+def test_pages_beside_are_those_in_the_folders_of_methods():
+    beside = {
+        "/home/results/0061/street/viewer.html": "../gsplat%20d/viewer.html",
+        "/C:/results/0061/street/viewer.html": "../gsplat%20d/viewer.html",
+        "/report/data/raw/0a1b/viewer.html": None,
+        "/downloads/viewer.html": None,
+    }
+    expression = 'paths.map((path) => pageBeside(path, "street", "gsplat d"))'
+    assert by_node("link", paths=list(beside), expression=expression) == list(beside.values())
 
 
-@pytest.mark.parametrize(
-    ("state", "expected"),
-    [
+def test_an_image_is_shown_at_its_key_frame_on_the_path_of_the_camera():
+    images, cases = [{"second": 0.0}, {"second": 0.5}, {"second": 1.0}], [
         ({"second": 0.5, "image": "over"}, 0.5),
         ({"second": 0.505, "image": "over"}, 0.5),
         ({"second": 0.6, "image": "over"}, None),
@@ -141,34 +136,27 @@ def test_pages_beside_are_those_in_the_folders_of_methods(path, expected):
         ({"second": 0.5, "image": "over", "following": False}, None),
         ({"second": 0.9, "image": "beside", "playing": True}, 0.5),
         ({"second": 0.5, "image": "none"}, None),
-    ],
-)
-def test_an_image_is_shown_at_its_key_frame_on_the_path_of_the_camera(state, expected):
-    images = [{"second": 0.0}, {"second": 0.5}, {"second": 1.0}]
-    shown = by_node(
-        "images", images=images, state={"playing": False, "following": True, **state},
-        expression="imageAt(images, state)",
-    )  # fmt: skip
-    assert (shown and shown["second"]) == expected
+    ]  # fmt: skip
+    states = [{"playing": False, "following": True, **state} for state, _ in cases]
+    expression = "states.map((state) => (imageAt(images, state) || { second: null }).second)"
+    assert by_node("images", images=images, states=states, expression=expression) == [second for _, second in cases]
 
 
-def test_ids_are_shortened_as_far_as_they_stay_unique():
-    ids = ["0a8dee9e8b4b", "0a8dee9e8b4c", "f00dee9e8b4b", "twin"]
-    shortened = by_node("drives", ids=ids, expression="ids.map((id) => shortId(id, ids))")
-    assert shortened == ["0a8dee9e8b4b", "0a8dee9e8b4c", "f00dee9e", "twin"]
-
-
-def test_an_edit_keeps_what_is_static_and_replaces_what_moves():
+def test_an_edit_keeps_what_is_static_and_replaces_what_moves_and_ids_are_shortened_while_unique():
     groups = [
         {"name": "background", "gaussians": 5, "samples": None, "present": None, "modes": None},
         {"name": "car", "gaussians": 3, "samples": [0, 4], "present": [[0, 1]], "category": "vehicle.car"},
     ]
     edit = {"instances": [{"id": "car", "group": 1}, {"id": "twin", "group": 1, "scale": 2, "samples": [4, 9]}]}
-    instances = by_node("drives", groups=groups, edit=edit, expression="instancesOf(groups, edit)")
+    ids = ["0a8dee9e8b4b", "0a8dee9e8b4c", "f00dee9e8b4b", "twin"]
+    instances, ranges, gone, shortened = by_node(
+        "drives", groups=groups, edit=edit, ids=ids,
+        expression="""Promise.all([instancesOf(groups, edit), rowRanges(groups, instancesOf(groups, edit)),
+          instancesOf(groups, { instances: [] }), ids.map((id) => shortId(id, ids))])""",
+    )  # fmt: skip
     assert [(one["id"], one["scale"], one["samples"]) for one in instances] == [
         ("background", 1, None), ("car", 1, [0, 4]), ("twin", 2, [4, 9]),
     ]  # fmt: skip
-    ranges = by_node("drives", groups=groups, edit=edit, expression="rowRanges(groups, instancesOf(groups, edit))")
     assert [(one["begin"], one["end"], one["row"]) for one in ranges] == [(0, 5, 0), (5, 8, 5), (5, 8, 8)]
-    gone = by_node("drives", groups=groups, expression="instancesOf(groups, { instances: [] })")
     assert [one["id"] for one in gone] == ["background"]
+    assert shortened == ["0a8dee9e8b4b", "0a8dee9e8b4c", "f00dee9e", "twin"]

@@ -6,7 +6,6 @@ import resource
 import shutil
 import socket
 import stat
-import subprocess
 import tarfile
 from collections import namedtuple
 from collections.abc import Callable
@@ -15,7 +14,8 @@ from pathlib import Path
 import pytest
 from helpers.archive_server import Site, packed, served
 from helpers.drives import World, write_world
-from helpers.workflow_copy import WorkflowCopy, complaints
+from helpers.killed_runs import only_complaint
+from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.nuscenes.download import fetch as fetching
@@ -57,12 +57,12 @@ def nothing_kept(job: DownloadJob) -> bool:
 @pytest.mark.parametrize(
     ("site", "changed", "words"),
     [
-        pytest.param({}, {"sha256": "0" * 64}, ["SHA-256", "has been removed"], id="wrong checksum"),
-        pytest.param({}, {"size_bytes": 10}, ["bytes, nuscenes_mini.size_bytes says 10;"], id="larger"),
-        pytest.param({}, {"size_bytes": 10**6}, ["nuscenes_mini.size_bytes says 1,000,000"], id="smaller"),
-        pytest.param({"length": -1}, {"size_bytes": 10}, ["has more than 10 bytes"], id="larger, unannounced"),
-        pytest.param({"status": 404}, {}, ["HTTP 404 Not Found"], id="404"),
-        pytest.param({"status": 403}, {}, ["HTTP 403"], id="403"),
+        ({}, {"sha256": "0" * 64}, ["SHA-256", "has been removed"]),
+        ({}, {"size_bytes": 10}, ["bytes, nuscenes_mini.size_bytes says 10;"]),
+        ({}, {"size_bytes": 10**6}, ["nuscenes_mini.size_bytes says 1,000,000"]),
+        ({"length": -1}, {"size_bytes": 10}, ["has more than 10 bytes"]),
+        ({"status": 404}, {}, ["HTTP 404 Not Found"]),
+        ({"status": 403}, {}, ["HTTP 403"]),
     ],
 )
 def test_a_wrong_answer_is_a_line_and_nothing_is_kept(archive, tmp_path, site, changed, words):
@@ -90,20 +90,21 @@ def test_a_file_that_ends_early_is_kept_for_the_next_run(archive, tmp_path, leng
     assert (tmp_path / "mini/v1.0-mini/scene.json").is_file()
 
 
-def test_a_server_that_trickles_is_left(archive, tmp_path):
+@pytest.mark.parametrize(
+    ("headers", "words"),
+    [
+        (False, ["slower than nuscenes_mini.min_kb_per_s, 5 kB/s", "are kept: run again"]),
+        (True, ["no complete answer within 0.5 s"]),
+    ],
+)
+def test_a_server_that_trickles_is_left(archive, tmp_path, headers, words):
     """A byte at a time never is silence; what has come is kept."""
-    with served(Site(archive, trickle_s=0.05)) as site:
+    with served(Site(archive, trickle_s=0.05, headers_trickle=headers)) as site:
         message = refused(site.job(tmp_path / "mini", attempts=1, timeout_s=0.5))
-        assert "slower than nuscenes_mini.min_kb_per_s, 5 kB/s" in message and "are kept: run again" in message
-        site.trickle_s = None
+        assert all(word in message for word in words), message
+        site.trickle_s, site.headers_trickle = None, False
         download(site.job(tmp_path / "mini"))
     assert (tmp_path / "mini/v1.0-mini/scene.json").is_file()
-
-
-def test_a_server_whose_headers_trickle_is_left(archive, tmp_path):
-    with served(Site(archive, trickle_s=0.05, headers_trickle=True)) as site:
-        message = refused(site.job(tmp_path / "mini", attempts=1, timeout_s=0.5))
-    assert "no complete answer within 0.5 s" in message
 
 
 def test_no_server_is_a_line(tmp_path):
@@ -164,13 +165,22 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "", size: int =
     return add
 
 
+def members(*added: Member) -> Member:
+    """Adds one after another."""
+
+    def add(tar: tarfile.TarFile, outside: Path) -> None:
+        for one in added:
+            one(tar, outside)
+
+    return add
+
+
 def absolute(tar: tarfile.TarFile, outside: Path) -> None:
     member(f"{outside}/evil")(tar, outside)
 
 
 def through_a_link(tar: tarfile.TarFile, outside: Path) -> None:
-    member("samples/out", tarfile.SYMTYPE, str(outside))(tar, outside)
-    member("samples/out/evil")(tar, outside)
+    members(member("samples/out", tarfile.SYMTYPE, str(outside)), member("samples/out/evil"))(tar, outside)
 
 
 def with_headers(name: str, **headers: str) -> Member:
@@ -184,26 +194,6 @@ def with_headers(name: str, **headers: str) -> Member:
     return add
 
 
-def below_a_file(tar: tarfile.TarFile, outside: Path) -> None:
-    member("samples/evil")(tar, outside)
-    member("samples/evil/file")(tar, outside)
-
-
-def a_file_called_like_a_folder(tar: tarfile.TarFile, outside: Path) -> None:
-    member("samples/evil/file")(tar, outside)
-    member("samples/evil")(tar, outside)
-
-
-def many(tar: tarfile.TarFile, outside: Path) -> None:
-    for number in range(300):
-        member(f"samples/{number}")(tar, outside)
-
-
-def the_same_folder_many_times(tar: tarfile.TarFile, outside: Path) -> None:
-    for _ in range(300):
-        member("samples", tarfile.DIRTYPE)(tar, outside)
-
-
 def declared(name: str, kind: bytes, size: int) -> Member:
     """Adds a header that announces more than follows."""
 
@@ -215,18 +205,13 @@ def declared(name: str, kind: bytes, size: int) -> Member:
     return add
 
 
-def sparse(tar: tarfile.TarFile, outside: Path) -> None:
-    info = tarfile.TarInfo("samples/sparse")
-    info.pax_headers = {"GNU.sparse.map": "0,1", "GNU.sparse.size": str(10**12)}
-    tar.addfile(info)
+def raw(content: bytes) -> Member:
+    """Adds bytes as they are."""
+    return lambda tar, _: tar.fileobj.write(content)
 
 
-def broken_header(tar: tarfile.TarFile, _: Path) -> None:
-    tar.fileobj.write(b"\xff" * 2048)
-
-
-def endless(tar: tarfile.TarFile, _: Path) -> None:
-    tar.fileobj.write(bytes(3 << 20))
+BELOW_A_FILE = [member("samples/evil"), member("samples/evil/file")]
+SPARSE = {"GNU.sparse.map": "0,1", "GNU.sparse.size": str(10**12)}
 
 
 def repacked(archive: bytes, add: Member, outside: Path) -> bytes:
@@ -243,39 +228,35 @@ def repacked(archive: bytes, add: Member, outside: Path) -> bytes:
     return content.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("add", "why"),
-    [
-        pytest.param(member("../evil"), "is no safe path", id="parent"),
-        pytest.param(member("samples/../../evil"), "is no safe path", id="parent further in"),
-        pytest.param(absolute, "is no safe path", id="absolute"),
-        pytest.param(member("\\\\host\\evil"), "is no safe path", id="network drive"),
-        pytest.param(member("samples\\evil"), "is no safe path", id="backslash"),
-        pytest.param(member("samples/\x1b[2Jevil\n"), "is no safe path", id="control characters"),
-        pytest.param(through_a_link, "neither a file nor a folder", id="through a link"),
-        pytest.param(member("samples/in", tarfile.SYMTYPE, "maps"), "neither a file nor a folder", id="link inside"),
-        pytest.param(member("evil", tarfile.LNKTYPE, "/etc/passwd"), "neither a file nor a folder", id="hard link"),
-        pytest.param(member("evil", tarfile.CHRTYPE), "neither a file nor a folder", id="device"),
-        pytest.param(member("evil", tarfile.FIFOTYPE), "neither a file nor a folder", id="fifo"),
-        pytest.param(sparse, "neither a file nor a folder", id="sparse"),
-        pytest.param(member("v1.0-mini/scene.json"), "is in it twice", id="twice"),
-        pytest.param(below_a_file, "is both a file and a folder", id="below a file"),
-        pytest.param(a_file_called_like_a_folder, "is both a file and a folder", id="a file called like a folder"),
-        pytest.param(member("d/" * 2500 + "evil"), "has a path of absurd length", id="deep"),
-        pytest.param(member("d" * 2000 + "/evil"), "has a path of absurd length", id="long"),
-        pytest.param(with_headers("evil", size="-5"), "impossible size or time", id="negative size"),
-        pytest.param(with_headers("evil", mtime="nan"), "impossible size or time", id="time that is no number"),
-        pytest.param(with_headers("evil", mtime="1e300"), "impossible size or time", id="absurd time"),
-        pytest.param(declared("evil", tarfile.REGTYPE, 10**12), "more than 0.1 GB", id="absurd size"),
-        pytest.param(member("evil", size=100_000_000), "more than 0.1 GB", id="zeros"),
-        pytest.param(declared("evil", tarfile.XHDTYPE, 10**10), "absurd size", id="absurd header"),
-        pytest.param(declared("evil", tarfile.GNUTYPE_LONGNAME, 10**10), "absurd size", id="absurd name"),
-        pytest.param(many, "more than 200 files", id="too many files"),
-        pytest.param(the_same_folder_many_times, "more than 200 files", id="one folder without end"),
-        pytest.param(broken_header, "is damaged (a broken header)", id="broken header"),
-        pytest.param(endless, "is damaged (there is no end to it)", id="endless padding"),
-    ],
-)
+UNTRUSTED = [
+    ("is no safe path", [
+        member("../evil"), member("samples/../../evil"), absolute, member("\\\\host\\evil"), member("samples\\evil"),
+        member("samples/\x1b[2Jevil\n"),
+    ]),
+    ("neither a file nor a folder", [
+        through_a_link, member("samples/in", tarfile.SYMTYPE, "maps"), member("evil", tarfile.LNKTYPE, "/etc/passwd"),
+        member("evil", tarfile.CHRTYPE), member("evil", tarfile.FIFOTYPE), with_headers("samples/sparse", **SPARSE),
+    ]),
+    ("is in it twice", [member("v1.0-mini/scene.json")]),
+    ("is both a file and a folder", [members(*BELOW_A_FILE), members(*reversed(BELOW_A_FILE))]),
+    ("has a path of absurd length", [member("d/" * 2500 + "evil"), member("d" * 2000 + "/evil")]),
+    ("impossible size or time", [
+        with_headers("evil", size="-5"), with_headers("evil", mtime="nan"), with_headers("evil", mtime="1e300"),
+    ]),
+    ("more than 0.1 GB", [declared("evil", tarfile.REGTYPE, 10**12), member("evil", size=100_000_000)]),
+    ("absurd size", [
+        declared("evil", tarfile.XHDTYPE, 10**10), declared("evil", tarfile.GNUTYPE_LONGNAME, 10**10)
+    ]),
+    ("more than 200 files", [
+        members(*(member(f"samples/{number}") for number in range(300))),
+        members(*[member("samples", tarfile.DIRTYPE)] * 300),
+    ]),
+    ("is damaged (a broken header)", [raw(b"\xff" * 2048)]),
+    ("is damaged (there is no end to it)", [raw(bytes(3 << 20))]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("why", "add"), [(why, add) for why, added in UNTRUSTED for add in added])
 def test_an_archive_that_is_not_to_be_trusted_is_refused_before_anything_is_written(archive, tmp_path, add, why):
     """Even where its checksum is right."""
     with served(Site(repacked(archive, add, tmp_path))) as site:
@@ -287,24 +268,17 @@ def test_an_archive_that_is_not_to_be_trusted_is_refused_before_anything_is_writ
 
 
 def damaged(archive: bytes, kind: str) -> bytes:
-    match kind:
-        case "a web page":
-            return b"<html>log in first</html>"
-        case "empty":
-            return gzip.compress(b"")
-        case "truncated":
-            return archive[: len(archive) // 2]
-        case "end missing":
-            return archive[:-4]
-        case "a flipped bit":
-            place = len(archive) // 2
-            return archive[:place] + bytes([archive[place] ^ 1]) + archive[place + 1 :]
-        case "other data":
-            content = io.BytesIO()
-            with tarfile.open(fileobj=content, mode="w:gz") as tar:
-                member("v1.0-mini/scene.json", size=10)(tar, Path())
-            return content.getvalue()
-    raise ValueError(kind)
+    place, content = len(archive) // 2, io.BytesIO()
+    with tarfile.open(fileobj=content, mode="w:gz") as tar:
+        member("v1.0-mini/scene.json", size=10)(tar, Path())
+    return {
+        "a web page": b"<html>log in first</html>",
+        "empty": gzip.compress(b""),
+        "truncated": archive[:place],
+        "end missing": archive[:-4],
+        "a flipped bit": archive[:place] + bytes([archive[place] ^ 1]) + archive[place + 1 :],
+        "other data": content.getvalue(),
+    }[kind]
 
 
 @pytest.mark.parametrize("kind", ["a web page", "empty", "truncated", "end missing", "a flipped bit", "other data"])
@@ -320,14 +294,6 @@ def test_no_file_of_an_archive_may_run_as_another_user(archive, tmp_path):
     with served(Site(repacked(archive, member("samples/tool"), tmp_path))) as site:
         download(site.job(tmp_path / "mini"))
     assert not (tmp_path / "mini/samples/tool").stat().st_mode & (stat.S_ISUID | stat.S_ISGID | stat.S_IWOTH)
-
-
-def only_complaint(done: subprocess.CompletedProcess) -> str:
-    """The one line that a failed run says, checked to be one line and no traceback."""
-    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    lines = complaints(done.stdout)
-    assert len(lines) == 1, done.stdout
-    return lines.pop()
 
 
 @pytest.mark.slow

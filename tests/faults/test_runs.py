@@ -1,23 +1,22 @@
-"""What goes wrong, and what the user may count on: each fault through Snakemake itself, in one line."""
+"""What goes wrong, and what the user may count on, each fault in one line: through Snakemake, or by its plan alone."""
 
 import fcntl
 import itertools
-import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from typing import Any
+from contextlib import ExitStack, chdir, contextmanager
 
 import pytest
 from helpers.drives import World
-from helpers.killed_runs import only_complaint, training_process
-from helpers.patience import PATIENCE_S, wait_until
+from helpers.killed_runs import only_complaint
 from helpers.shared_runs import EDITS, TWO_METHODS, VANILLA
 from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
+
+from drivesplat.errors import DriveSplatError
+from drivesplat.workflow.plan import Plan
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
 
@@ -40,6 +39,17 @@ def with_edits(copy: WorkflowCopy, text: str) -> WorkflowCopy:
     copy.write_config()
     (copy.folder / "edits.yaml").write_text(text)
     return copy
+
+
+def planning(copy: WorkflowCopy, *targets: str) -> str:
+    """The sentence with which the plan refuses a run, asked as the Snakefile asks it, in the folder of the copy."""
+    with chdir(copy.folder), pytest.raises(DriveSplatError) as refused:
+        plan = Plan(copy.config, str(REPOSITORY))
+        plan.edits()
+        plan.refuse_unknown([*targets])
+        plan.refuse_absent_data([*targets])
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
 
 
 MISTYPED = {
@@ -67,35 +77,56 @@ def test_an_unknown_scene_stops_before_any_job_and_lists_those_there_are(copy):
     assert not (copy.folder / "results").exists()
 
 
-def test_an_unquoted_scene_number_is_refused_with_advice_to_quote_it(copy):
-    copy.write_config("datasets: {nuscenes: {dataroot: data, scenes: [0061]}}\n")
-    line = only_complaint(copy.run())
-    assert "a number to YAML (which reads 0061 as octal 49): write it in quotes" in line
-    assert not (copy.folder / "results").exists()
-
-
-def test_an_unknown_method_lists_those_there_are(copy):
-    line = only_complaint(copy.run("results/0001/vanila/train.json"))
-    assert "vanila" in line and "vanilla" in line
-
-
-def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy):
-    line = only_complaint(copy.run("results/0001/vanilla/nowhere.mp4"))
-    assert "'nowhere'" in line and "original, lateral_2m" in line and "render.trajectories" in line
-    assert not (copy.folder / "results/0001").exists()
-
-
 @pytest.mark.parametrize(
     ("target", "words"),
     [
+        ("vanila/train.json", ["vanila", "vanilla"]),
+        ("vanilla/nowhere.mp4", ["'nowhere'", "original, lateral_2m", "render.trajectories"]),
         ("vanilla/edits/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
         ("street/edits/halt.mp4", ["no edit called 'halt'", "there are: gone, stop", "datasets.<name>.edits"]),
     ],
 )
-def test_an_edit_that_there_is_none_of_stops_before_any_job(copy, target, words):
-    line = only_complaint(with_edits(copy, EDITS).run(f"results/0001/{target}"))
+def test_an_unknown_target_is_refused_with_those_there_are(copy, target, words):
+    line = planning(with_edits(copy, EDITS), f"results/0001/{target}")
     assert all(word in line for word in words), line
-    assert not (copy.folder / "results/0001").exists()
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        (EDITS.replace("at: 2", "at: soon"), ["edit 'stop', step 2 (stop)", "'at' is 'soon'"]),
+        (EDITS.replace("- remove", "- vanish"), ["edit 'gone', step 1", "no step 'vanish'"]),
+        (EDITS.replace("edits:", "edits"), ["not YAML"]),
+        (None, ["cannot be read"]),
+    ],
+    ids=["a value", "a step", "no YAML", "no file"],
+)
+def test_a_broken_edits_file_stops_before_any_job(copy, broken, words):
+    with_edits(copy, broken or "")
+    if broken is None:
+        (copy.folder / "edits.yaml").unlink()
+    line = planning(copy)
+    assert all(word in line for word in ["edits.yaml", *words]), line
+
+
+@pytest.mark.parametrize(
+    ("dataset", "words"),
+    [
+        ({"dataroot": "elsewhere"}, ["v1.0-mini", "elsewhere", "nuscenes.org", "dataroot"]),
+        ({"dataroot": "empty"}, ["v1.0-mini", "empty", "nuscenes.org"]),
+        ({"dataroot": "data", "version": "v1.0-trainval"}, ["v1.0-trainval", "data", "v1.0-mini", "version"]),
+    ],
+)
+def test_a_missing_dataset_is_reported_in_one_message(copy, dataset, words):
+    (copy.folder / "empty").mkdir()
+    copy.config["datasets"] = {"nuscenes": {"scenes": ["0001"], **dataset}}
+    line = planning(copy, "results/0001/metrics.json")
+    assert all(word in line for word in words), line
+
+
+def test_missing_tables_are_named(copy):
+    (copy.folder / "data/v1.0-mini/ego_pose.json").unlink()
+    assert "ego_pose.json" in only_complaint(copy.run("results/0001/scene.json"))
 
 
 GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
@@ -115,68 +146,10 @@ GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
 )  # fmt: skip
 def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, target, words, extracted):
     copy.config["subjects"] = {"0001": {"track": subject}}
-    done = with_edits(copy, edits).run(f"results/0001/street/{target}")
-    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    (line,) = complaints(done.stdout)
+    line = only_complaint(with_edits(copy, edits).run(f"results/0001/street/{target}"))
     assert all(word in line for word in words), line
     assert (copy.folder / "results/0001/scene.json").exists() == extracted
     assert not (copy.folder / "results/0001/street").exists()
-
-
-@pytest.mark.parametrize(
-    ("broken", "target", "words"),
-    [
-        (EDITS.replace("at: 2", "at: soon"), (), ["edit 'stop', step 2 (stop)", "'at' is 'soon'"]),
-        (EDITS.replace("- remove", "- vanish"), ("edits/stop.mp4",), ["edit 'gone', step 1", "no step 'vanish'"]),
-        (EDITS.replace("edits:", "edits"), ("train.json",), ["not YAML"]),
-        (None, ("edits/stop.mp4",), ["cannot be read"]),
-    ],
-    ids=["a value", "a step", "no YAML", "no file"],
-)
-def test_a_broken_edits_file_stops_before_any_job(copy, broken, target, words):
-    with_edits(copy, broken or "")
-    if broken is None:
-        (copy.folder / "edits.yaml").unlink()
-    line = only_complaint(copy.run(*(f"results/0001/street/{name}" for name in target)))
-    assert all(word in line for word in ["edits.yaml", *words]), line
-    assert not (copy.folder / "results/0001").exists()
-
-
-@pytest.mark.parametrize(
-    ("dataset", "words"),
-    [
-        ({"dataroot": "elsewhere"}, ["v1.0-mini", "elsewhere", "nuscenes.org", "dataroot"]),
-        ({"dataroot": "empty"}, ["v1.0-mini", "empty", "nuscenes.org"]),
-        ({"dataroot": "data", "version": "v1.0-trainval"}, ["v1.0-trainval", "data", "v1.0-mini", "version"]),
-    ],
-)
-def test_a_missing_dataset_is_reported_in_one_message(copy, dataset, words):
-    (copy.folder / "empty").mkdir()
-    copy.config["datasets"] = {"nuscenes": {"scenes": ["0001"], **dataset}}
-    copy.write_config()
-    line = only_complaint(copy.run("results/0001/metrics.json"))
-    assert all(word in line for word in words), line
-
-
-def test_missing_tables_are_named(copy):
-    (copy.folder / "data/v1.0-mini/ego_pose.json").unlink()
-    assert "ego_pose.json" in only_complaint(copy.run("results/0001/scene.json"))
-
-
-def edit_table(copy: WorkflowCopy, table: str, change) -> None:
-    path = copy.folder / f"data/v1.0-mini/{table}.json"
-    rows = json.loads(path.read_text())
-    change(rows)
-    path.write_text(json.dumps(rows))
-
-
-@pytest.mark.slow
-def test_malformed_tables_are_rejected_with_the_token(copy):
-    edit_table(copy, "ego_pose", lambda rows: rows[3].update(translation=[float("nan"), 0, 0]))
-    copy.config["sweeps"] = True
-    copy.write_config()
-    assert "0001 CAM_FRONT 3" in only_complaint(copy.run("results/0001/scene.json"))
-    assert not (copy.folder / "results/0001/scene.json").exists()
 
 
 @pytest.mark.slow
@@ -186,18 +159,6 @@ def test_a_bad_image_is_named_with_its_sample(copy):
     line = only_complaint(copy.run("results/0001/scene.json"))
     assert "0001__0004.jpg" in line and "0001 CAM_FRONT 4" in line
     assert not (copy.folder / "results/0001/scene.json").exists()
-
-
-@pytest.mark.slow
-def test_missing_lidar_stops_and_is_named_or_is_counted_with_on_missing_warn(copy):
-    (copy.folder / "data/samples/LIDAR_TOP/0001__0002.pcd.bin").unlink()
-    line = only_complaint(copy.run("results/0001/parser.pkl"))
-    assert "0001__0002.pcd.bin" in line and "lidar_seed.on_missing: warn" in line
-    copy.config["lidar_seed"] = {**copy.config["lidar_seed"], "on_missing": "warn"}
-    copy.write_config()
-    done = copy.run("results/0001/metrics.json")
-    assert done.returncode == 0, done.stdout
-    assert copy.read("results/0001/metrics.json")["protocol"]["lidar_missing"] == 1
 
 
 @pytest.mark.slow
@@ -248,7 +209,8 @@ def trained(finished_run, tmp_path_factory) -> WorkflowCopy:
         for path in (copy.folder / "results/0001" / method / ".digests").iterdir():
             if path.stem not in ("train.json", "checkpoint.npz"):
                 path.unlink()
-    assert copy.planned(*(f"results/0001/{method}/train.json" for method in TWO_METHODS)) == {}
+    trained = [f"results/0001/{method}/train.json" for method in TWO_METHODS]
+    assert copy.planned(*trained) == {}, "and the plan has written its tables for the copied data"
     return copy
 
 
@@ -280,18 +242,6 @@ def altered(copy: WorkflowCopy, script: str, change: Callable[[str], str]) -> It
         yield
     finally:
         path.write_text(whole)
-
-
-@contextmanager
-def set_to(copy: WorkflowCopy, **config: Any) -> Iterator[None]:
-    """Another config for a while."""
-    before, copy.config = copy.config, {**copy.config, **config}
-    copy.write_config()
-    try:
-        yield
-    finally:
-        copy.config = before
-        copy.write_config()
 
 
 LOOK_SCRIPTS = {
@@ -370,7 +320,7 @@ Trainer.training_step = training_step
 
 def test_a_training_out_of_gpu_memory_says_what_lowers_the_need_and_is_not_tried_again(trained):
     """The peak is that of the GPU itself in tests/test_gpu.py."""
-    changed = set_to(trained, methods={"large": {}})
+    changed = trained.set_to(methods={"large": {}})
     with changed, altered(trained, "train", lambda whole: OUT_OF_MEMORY + whole):
         done = trained.run("results/0001/large/train.json")
     line = only_complaint(done)
@@ -388,7 +338,7 @@ def test_no_profile_tries_failed_jobs_again(profile):
 
 def test_without_network_lpips_is_null_with_the_reason_and_nothing_else_is(trained):
     url = "http://127.0.0.1:9/alexnet.pth"
-    with set_to(trained, lpips={"enabled": True, "url": url}):
+    with trained.set_to(lpips={"enabled": True, "url": url}):
         done = trained.run("results/0001/vanilla/eval.json")
     assert done.returncode == 0, done.stdout
     assert f"LPIPS will be null: the AlexNet backbone could not be fetched from {url}" in done.stdout
@@ -419,7 +369,7 @@ def test_there_are_never_more_gpu_jobs_than_gpus_and_each_sees_its_own(trained, 
     names = [f"GPU-{os.getpid()}-{number}" for number in range(gpus)]
     methods = [f"on{gpus}gpus{number}" for number in range(gpus + 2)]
     targets = [f"results/0001/{method}/train.json" for method in methods]
-    changed = set_to(trained, methods={method: {} for method in methods}, device="any")
+    changed = trained.set_to(methods={method: {} for method in methods}, device="any")
     with changed, altered(trained, "train", lambda _: TRAINING_THAT_SLEEPS):
         done = trained.run(*targets, cores=100, gpus=",".join(names))
     assert done.returncode == 0 and "waits for a GPU" not in done.stdout, done.stdout
@@ -439,31 +389,3 @@ def test_a_second_run_in_one_folder_is_refused(copy):
         line = only_complaint(copy.run("results/0001/scene.json"))
     assert "another run" in line
     assert copy.run("results/0001/scene.json", under=("env",)).returncode == 0, "in new interpreters, as users run it"
-
-
-@pytest.mark.slow
-def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
-    training = TINY_TRAINING | {"iterations": 120, "checkpoint_every": 10}
-    whole = WorkflowCopy.make(tmp_path / "whole", methods=VANILLA, train=training)
-    assert whole.run("results/0001/parser.pkl", "results/0001/masks/masks.json").returncode == 0
-    killed = whole.again(tmp_path / "killed")
-    assert whole.run("results/0001/metrics.json").returncode == 0
-    state = killed.folder / "results/0001/vanilla/resume/state.npz"
-    running = subprocess.Popen(
-        killed.command("--cores", "2", "--", "results/0001/metrics.json"), cwd=killed.folder,
-        env={**os.environ, "CUDA_VISIBLE_DEVICES": ""}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    wait_until(state.exists)
-    trainer = training_process(killed)
-    assert trainer is not None
-    os.kill(trainer, signal.SIGKILL)
-    assert running.wait(timeout=PATIENCE_S) != 0
-    left = {path.name for path in (killed.folder / "results/0001/vanilla").iterdir()}
-    assert not {"checkpoint.npz", "train.json"} & left
-    done = killed.run("results/0001/metrics.json")
-    assert done.returncode == 0, done.stdout
-    summary = killed.read("results/0001/vanilla/train.json")
-    assert summary["iterations"] == 120 and len(summary["resumed_at"]) == 1 and summary["resumed_at"][0] >= 10
-    a, b = (c.read("results/0001/metrics.json")["methods"]["vanilla"]["extrapolation"] for c in (whole, killed))
-    for region in ("all", "static", "moving_vehicle"):
-        assert abs(a[region]["psnr"] - b[region]["psnr"]) < 0.1

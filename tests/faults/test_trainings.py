@@ -5,6 +5,7 @@ import logging
 import math
 import os
 import resource
+import shutil
 import signal
 import threading
 import time
@@ -73,21 +74,29 @@ def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(t
     assert summary.resumed_at == [20] and summary.iterations == 60
 
 
-@pytest.mark.parametrize("other", ["settings_sha256", "code_sha256", "inputs_sha256", None])
-def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
-    """The digests of a training's provenance are what tells its resume state from another's."""
-    files, inputs = files_in(tmp_path / "it"), inputs_in(tmp_path)
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory) -> Path:
+    """A folder with a training that has ended before it wrote its result."""
+    folder = tmp_path_factory.mktemp("interrupted")
 
     def ended(path: Path, checkpoint: TrainedCheckpoint) -> None:
         raise EndedError
 
     with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
         patched.setattr("drivesplat.training.stage.write_checkpoint", ended)
-        run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
+        run_training(inputs_in(folder), RESUMABLE, CPU, files_in(folder / "it"), PROVENANCE, "train")
+    return folder
+
+
+@pytest.mark.parametrize("other", ["settings_sha256", "code_sha256", "inputs_sha256", None])
+def test_only_the_same_settings_code_and_inputs_resume(interrupted, tmp_path, caplog, other):
+    """The digests of a training's provenance are what tells its resume state from another's."""
+    shutil.copytree(interrupted / "it", tmp_path / "it")
+    files = files_in(tmp_path / "it")
     assert checkpoint_file.load(files.resume / "state.npz", "train")["step"] == 10
     provenance = {**PROVENANCE, **({other: "other"} if other else {})}
     with caplog.at_level(logging.INFO):
-        run_training(inputs, RESUMABLE, CPU, files, provenance, "train")
+        run_training(inputs_in(interrupted), RESUMABLE, CPU, files, provenance, "train")
     ignored = f"{files.resume / 'state.npz'} belongs to other settings, code or inputs: training starts at 0"
     assert (ignored in caplog.text) == (other is not None)
     assert ("resuming at iteration 10 of 20" in caplog.text) == (other is None)
@@ -112,6 +121,7 @@ def train_and_kill_the_parent(folder: str) -> None:
     run_training(inputs_in(Path(folder)), RESUMABLE, CPU, files_in(Path(folder) / "it"), PROVENANCE, "train")
 
 
+@pytest.mark.slow
 def test_a_training_whose_end_snakemake_missed_resumes_from_its_last_checkpoint(tmp_path, caplog):
     process, files = in_subprocess(train_and_kill_the_parent, str(tmp_path)), files_in(tmp_path / "it")
     _, errors = process.communicate(timeout=PATIENCE_S)  # as long as any of both is there

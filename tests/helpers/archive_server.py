@@ -108,12 +108,9 @@ class Site:
 
     def job(self, dataroot: Path, **changed) -> DownloadJob:
         return DownloadJob(
-            accept_nuscenes_terms=True,
-            dataset="nuscenes",
-            dataroot=str(dataroot),
-            version="v1.0-mini",
+            accept_nuscenes_terms=True, dataset="nuscenes", dataroot=str(dataroot), version="v1.0-mini",
             nuscenes_mini=self.settings(**changed),
-        )
+        )  # fmt: skip
 
 
 @contextmanager

@@ -35,23 +35,18 @@ def a_view() -> View:
 
 def settings_of(strategy: str, **changes: Any) -> TrainSettings:
     """Densification at every second iteration of a thousand."""
-    common = {"iterations": 1000, "strategy": strategy, "refine_start": 0.0, "refine_stop": 1.0}
-    return TrainSettings(**{
-        **common,
+    common = {
+        "iterations": 1000, "strategy": strategy, "refine_start": 0.0, "refine_stop": 1.0,
         "mcmc": McmcSettings(refine_every=2, noise_lr=0.0),
         "default": DefaultSettings(refine_every=2, prune_opacity=1e-3),
-        **changes,
-    })  # fmt: skip
+    }  # fmt: skip
+    return TrainSettings(**{**common, **changes})
 
 
 def train_step(
-    model: SplatModel,
-    densifier: Densifier,
-    step: int,
-    optimizers: Optimizers,
-    coarse: bool = False,
+    model: SplatModel, densifier: Densifier, step: int, optimizers: Optimizers, coarse: bool = False,
     learns_size: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """An iteration towards a random image, and towards less opacity and size, as the trainer makes it."""
     target = torch.from_numpy(np.random.default_rng(1).uniform(0, 1, (24, 32, 3))).float()
     picture = model.render(a_view(), 1)

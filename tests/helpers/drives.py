@@ -267,12 +267,17 @@ def cast(world: World, origin: np.ndarray, rays: np.ndarray, seconds: float) -> 
 def _cast_box(thing: Thing, origin: np.ndarray, rays: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     rotation = Rotation.from_euler("z", thing.heading).as_matrix()
     start, direction = (origin - thing.at(seconds)) @ rotation, rays @ rotation
-    half = np.array(thing.size) / 2
+    t = to_box(np.array(thing.size) / 2, start, direction)
+    return t, start + np.where(np.isfinite(t), t, 0.0)[:, None] * direction
+
+
+def to_box(half: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """The distance (...), in units of each ray's length, to a box of half sizes `half` about the origin of the frame in
+    which rays start and go on (..., 3); infinite where they miss it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         near, far = (-half - start) / direction, (half - start) / direction
-    enter, leave = np.fmin(near, far).max(axis=1), np.fmax(near, far).min(axis=1)
-    t = np.where((enter < leave) & (enter > 0), enter, np.inf)
-    return t, start + np.where(np.isfinite(t), t, 0.0)[:, None] * direction
+    enter, leave = np.fmin(near, far).max(axis=-1), np.fmax(near, far).min(axis=-1)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf)
 
 
 def _ground_color(at: np.ndarray) -> np.ndarray:
@@ -310,49 +315,33 @@ _TABLES = (
 
 
 def _static_tables(tables: dict[str, list[dict]], world: World) -> None:
-    tables["log"].append(
-        {"token": "log", "logfile": "tiny", "vehicle": "n000", "date_captured": "", "location": "tiny"}
-    )
-    tables["map"].append(
-        {"token": "map", "category": "semantic_prior", "filename": "maps/map.png", "log_tokens": ["log"]}
-    )
+    plain = {"token": "log", "logfile": "tiny", "vehicle": "n000", "date_captured": "", "location": "tiny"}
+    tables["log"].append(plain)
+    one_map = {"token": "map", "category": "semantic_prior", "filename": "maps/map.png", "log_tokens": ["log"]}
+    tables["map"].append(one_map)
     levels = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
     tables["visibility"] += [{"token": token, "level": level, "description": ""} for token, level in levels.items()]
     for category in dict.fromkeys(thing.category for thing in world.things):
         tables["category"].append({"token": f"category {category}", "name": category, "description": ""})
-    tables["sensor"] += [
-        {"token": "CAM_FRONT", "channel": "CAM_FRONT", "modality": "camera"},
-        {"token": "LIDAR_TOP", "channel": "LIDAR_TOP", "modality": "lidar"},
-    ]
-    camera = Rotation.from_matrix(CAMERA_TO_EGO).as_quat()
-    tables["calibrated_sensor"] += [
-        _calibrated("CAM_FRONT", CAMERA_AT, camera, world.intrinsics.tolist()),
-        _calibrated("LIDAR_TOP", LIDAR_AT, np.array([0.0, 0.0, 0.0, 1.0]), []),
-    ]
-
-
-def _calibrated(sensor: str, translation: np.ndarray, xyzw: np.ndarray, intrinsic: list) -> dict:
-    return {
-        "token": f"calibrated {sensor}",
-        "sensor_token": sensor,
-        "translation": translation.tolist(),
-        "rotation": [xyzw[3], *xyzw[:3]],
-        "camera_intrinsic": intrinsic,
-    }
+    camera = Rotation.from_matrix(CAMERA_TO_EGO).as_quat(scalar_first=True).tolist()
+    for sensor, modality, place, rotation, intrinsic in (
+        ("CAM_FRONT", "camera", CAMERA_AT, camera, world.intrinsics.tolist()),
+        ("LIDAR_TOP", "lidar", LIDAR_AT, [1.0, 0.0, 0.0, 0.0], []),
+    ):
+        tables["sensor"].append({"token": sensor, "channel": sensor, "modality": modality})
+        at = {"translation": place.tolist(), "rotation": rotation, "camera_intrinsic": intrinsic}
+        tables["calibrated_sensor"].append({"token": f"calibrated {sensor}", "sensor_token": sensor, **at})
 
 
 def _write_scene(root: Path, tables: dict[str, list[dict]], world: World, scene: str) -> None:
     samples = [f"{scene} sample {i}" for i in range(world.key_frames)]
-    tables["scene"].append(
-        {
-            "token": f"scene {scene}", "log_token": "log", "nbr_samples": world.key_frames, "name": f"scene-{scene}",
-            "first_sample_token": samples[0], "last_sample_token": samples[-1], "description": "tiny",
-        }
-    )  # fmt: skip
+    tables["scene"].append({
+        "token": f"scene {scene}", "log_token": "log", "nbr_samples": world.key_frames, "name": f"scene-{scene}",
+        "first_sample_token": samples[0], "last_sample_token": samples[-1], "description": "tiny",
+    })  # fmt: skip
     for i in range(len(samples)):
-        tables["sample"].append(
-            {**_linked(samples, i), "timestamp": START_US + i * KEY_FRAME_US, "scene_token": f"scene {scene}"}
-        )
+        at = {"timestamp": START_US + i * KEY_FRAME_US, "scene_token": f"scene {scene}"}
+        tables["sample"].append({**_linked(samples, i), **at})
     _write_sensor(root, tables, world, scene, "CAM_FRONT", CAMERA_DELAY_US, world.sweeps_between)
     _write_sensor(root, tables, world, scene, "LIDAR_TOP", 0, world.lidar_between)
     for number, thing in enumerate(world.things):
@@ -360,11 +349,7 @@ def _write_scene(root: Path, tables: dict[str, list[dict]], world: World, scene:
 
 
 def _linked(tokens: list[str], i: int) -> dict:
-    return {
-        "token": tokens[i],
-        "prev": tokens[i - 1] if i else "",
-        "next": tokens[i + 1] if i + 1 < len(tokens) else "",
-    }
+    return {"token": tokens[i], "prev": tokens[i - 1] if i else "", "next": [*tokens, ""][i + 1]}
 
 
 def _write_sensor(root: Path, tables: dict, world: World, scene: str, channel: str, delay: int, between: int) -> None:
@@ -382,23 +367,17 @@ def _write_sensor(root: Path, tables: dict, world: World, scene: str, channel: s
         else:
             filename = f"{folder}/{scene}__{i:04}.pcd.bin"
             cast_lidar(world, seconds).tofile(root / filename)
-        tables["ego_pose"].append(
-            {
-                "token": token,
-                "timestamp": START_US + offset_us,
-                "rotation": [1.0, 0.0, 0.0, 0.0],
-                "translation": (ORIGIN + world.ego_at(seconds)).tolist(),
-            }
-        )
-        tables["sample_data"].append(
-            {
-                **_linked(tokens, i), "sample_token": f"{scene} sample {index}", "ego_pose_token": token,
-                "calibrated_sensor_token": f"calibrated {channel}", "timestamp": START_US + offset_us,
-                "fileformat": filename.rsplit(".")[-1],
-                "is_key_frame": key, "height": world.height if channel == "CAM_FRONT" else 0,
-                "width": world.width if channel == "CAM_FRONT" else 0, "filename": filename,
-            }
-        )  # fmt: skip
+        place, size = (ORIGIN + world.ego_at(seconds)).tolist(), (world.width, world.height)
+        tables["ego_pose"].append({
+            "token": token, "timestamp": START_US + offset_us, "rotation": [1.0, 0.0, 0.0, 0.0], "translation": place,
+        })  # fmt: skip
+        width, height = size if channel == "CAM_FRONT" else (0, 0)
+        tables["sample_data"].append({
+            **_linked(tokens, i), "sample_token": f"{scene} sample {index}", "ego_pose_token": token,
+            "calibrated_sensor_token": f"calibrated {channel}", "timestamp": START_US + offset_us,
+            "fileformat": filename.rsplit(".")[-1], "is_key_frame": key, "height": height, "width": width,
+            "filename": filename,
+        })  # fmt: skip
 
 
 def _annotate(tables: dict, world: World, scene: str, thing: Thing, number: int) -> None:
@@ -406,20 +385,15 @@ def _annotate(tables: dict, world: World, scene: str, thing: Thing, number: int)
     if not shown:
         return
     instance, tokens = f"{scene} instance {number}", [f"{scene} annotation {number} {i}" for i in shown]
-    tables["instance"].append(
-        {
-            "token": instance, "category_token": f"category {thing.category}", "nbr_annotations": len(shown),
-            "first_annotation_token": tokens[0], "last_annotation_token": tokens[-1],
-        }
-    )  # fmt: skip
+    tables["instance"].append({
+        "token": instance, "category_token": f"category {thing.category}", "nbr_annotations": len(shown),
+        "first_annotation_token": tokens[0], "last_annotation_token": tokens[-1],
+    })  # fmt: skip
     length, width, height = thing.size
     for position, i in enumerate(shown):
-        tables["sample_annotation"].append(
-            {
-                **_linked(tokens, position), "sample_token": f"{scene} sample {i}", "instance_token": instance,
-                "visibility_token": thing.visibility, "attribute_tokens": [], "size": [width, length, height],
-                "translation": (ORIGIN + thing.at(i * KEY_FRAME_US * 1e-6)).tolist(),
-                "num_lidar_pts": 10, "num_radar_pts": 0,
-                "rotation": [np.cos(thing.heading / 2), 0.0, 0.0, np.sin(thing.heading / 2)],
-            }
-        )  # fmt: skip
+        tables["sample_annotation"].append({
+            **_linked(tokens, position), "sample_token": f"{scene} sample {i}", "instance_token": instance,
+            "visibility_token": thing.visibility, "attribute_tokens": [], "size": [width, length, height],
+            "translation": (ORIGIN + thing.at(i * KEY_FRAME_US * 1e-6)).tolist(), "num_lidar_pts": 10,
+            "num_radar_pts": 0, "rotation": [np.cos(thing.heading / 2), 0.0, 0.0, np.sin(thing.heading / 2)],
+        })  # fmt: skip

@@ -112,16 +112,12 @@ def actors_of(
 def actor_record(track: ActorTrack, count: int = 10, seed: int = 0, pixels: int = 1000) -> ActorRecord:
     """What actors.npz would hold of an actor that starts from `count` points in its box, which shows so many pixels."""
     rng = np.random.default_rng(seed)
+    points = (rng.uniform(-0.5, 0.5, (count, 3)) * track.size).astype(np.float32)
+    colors = rng.integers(0, 256, (count, 3)).astype(np.uint8)
     return ActorRecord(
-        id=track.id,
-        category="vehicle.car",
-        size=track.size,
-        motion=track.motion,
-        points=(rng.uniform(-0.5, 0.5, (count, 3)) * track.size).astype(np.float32),
-        points_rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        lidar_points=count,
-        pixels=pixels,
-    )
+        id=track.id, category="vehicle.car", size=track.size, motion=track.motion, points=points, points_rgb=colors,
+        lidar_points=count, pixels=pixels,
+    )  # fmt: skip
 
 
 def looking_at(target: Any, place: Any, time: float = 0.0, width: int = 48, height: int = 32) -> View:

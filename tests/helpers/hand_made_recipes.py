@@ -1,6 +1,7 @@
 """Hand-made results of recipes: eval.json files with given figures, and logs of failed jobs."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +10,11 @@ import yaml
 from benchmarks.quality.recipes import RecipeFile, plan_runs, read_recipes
 from benchmarks.snakemake_run import SnakemakeRun
 from drivesplat.settings.method import with_seed
-from helpers import REPOSITORY
+from helpers import REPOSITORY, reports
 
-PROTOCOL = {
-    "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "eval_camera": "CAM_FRONT", "width": 640, "height": 360,
-    "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4},
-    "held_out_frames": {"interpolation": [4, 12, 20, 28], "extrapolation": [35, 36, 37, 38]}, "train_images": 31,
-    "poses": "nuscenes", "regions": "boxes", "extra_points": None, "lidar_missing": 38, "images_missing": 0,
-    "key_frame_range": None, "own_car": None,
+PROTOCOL = reports.PROTOCOL | {
+    "held_out_frames": {"interpolation": [4, 12, 20, 28], "extrapolation": [35, 36, 37, 38]}, "lidar_missing": 38,
+    "images_missing": 0, "key_frame_range": None, "own_car": None,
 }  # fmt: skip
 
 
@@ -66,3 +64,9 @@ def write_failure(path: Path, job: str, reason: str, level: str = "ERROR") -> Pa
         f"2026-11-21 20:31:20,123 {level} drivesplat.workflow.job: {job}: {reason}\n"
     )
     return path
+
+
+def table_cells(page: str) -> list[list[list[str]]]:
+    """The Markdown tables of a page: lines of cells."""
+    blocks = [block.splitlines() for block in page.split("\n\n") if block.startswith("|")]
+    return [[[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in block] for block in blocks]

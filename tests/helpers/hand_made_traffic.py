@@ -81,11 +81,7 @@ def placed(own: Gaussians, pose: np.ndarray) -> Gaussians:
     quats, rotation = turned.as_quat(scalar_first=True), torch.from_numpy(pose[:3, :3].copy())
     sh = rotated(own.sh.double(), rotation).float()
     return replace(
-        own,
-        means=torch.from_numpy(means).float(),
-        quats=torch.from_numpy(quats).float(),
-        sh0=sh[:, :1],
-        shN=sh[:, 1:],
+        own, means=torch.from_numpy(means).float(), quats=torch.from_numpy(quats).float(), sh0=sh[:, :1], shN=sh[:, 1:]
     )
 
 

@@ -54,10 +54,10 @@ def recorded(pose: np.ndarray, error: np.ndarray) -> np.ndarray:
     return result
 
 
-def street_points(count: int, ahead: float = 110.0, seed: int = 0) -> np.ndarray:
+def street_points(count: int) -> np.ndarray:
     """Points (n, 3) of houses on both sides of the way, and of the ground."""
-    rng = np.random.default_rng(seed)
-    along = rng.uniform(-40.0, ahead, count)
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-40.0, 110.0, count)
     side = np.where(rng.uniform(size=count) < 0.5, -1.0, 1.0) * rng.uniform(6.0, 20.0, count)
     height = np.where(rng.uniform(size=count) < 0.25, 0.0, rng.uniform(0.0, 9.0, count))
     return np.stack([along, side + 0.08 * (along / 8.0) ** 2, height], axis=1)
@@ -72,13 +72,9 @@ class Drive:
 
 
 def drive_of(
-    key_frames: int = 12,
-    cameras: Sequence[str] = FRONT,
-    ego_path=ego_at,
-    error=error_at,
-    size: tuple[int, int] = SIZE,
-    **fields,
-) -> Drive:
+    key_frames: int = 12, cameras: Sequence[str] = FRONT, ego_path=ego_at, error=error_at,
+    size: tuple[int, int] = SIZE, **fields,
+) -> Drive:  # fmt: skip
     """A drive of nuScenes' rig; `way` and `error` give poses at seconds, `fields` what else the scene holds."""
     frames, truth = [], []
     for index in range(key_frames):
@@ -133,10 +129,10 @@ def views(
 
 
 def write_database(
-    path: Path, images: RigImages, seen: Sequence[Seen], job: RefinePosesJob, wrong: float = 0.0, seed: int = 2
+    path: Path, images: RigImages, seen: Sequence[Seen], job: RefinePosesJob, wrong: float = 0.0
 ) -> pycolmap.Reconstruction:
     """A database of features and matches as the stage's own; `wrong` of the matches join what is not the same."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(2)
     keypoints = [np.column_stack([s.pixels, np.ones(len(s.pixels)), np.zeros(len(s.pixels))]) for s in seen]
     none = np.zeros((0, 128), dtype=np.uint8)
     reconstruction = write_images(images, ((k.astype(np.float32), none) for k in keypoints), path)

@@ -24,10 +24,7 @@ def training_process(copy: WorkflowCopy) -> int | None:
                 where = str((entry / "cwd").readlink())
             except OSError:
                 continue
-            if (
-                where == str(copy.folder)
-                and any(a.endswith(b".train.py") for a in arguments)
-                and b"python" in arguments[0]
-            ):
+            scripted = b"python" in arguments[0] and any(a.endswith(b".train.py") for a in arguments)
+            if scripted and where == str(copy.folder):
                 return int(entry.name)
     return None

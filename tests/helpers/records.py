@@ -8,6 +8,8 @@ import numpy as np
 from drivesplat.io.array_file import write_arrays
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.scene.masks import MasksRecord
+from drivesplat.scene.scan import Scan
+from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
 from drivesplat.settings.train import TrainJob, TrainSettings
 
@@ -33,6 +35,21 @@ def training_record_of(images: int, **fields: Any) -> TrainingRecord:
         "held_out_frames": {}, "scene": SceneInfo("0001", "tiny", "v1.0-mini", "nuscenes"), "seed": SeedInfo(),
     }  # fmt: skip
     return TrainingRecord(**{**defaults, **fields})
+
+
+def recorded_scan(
+    scan: Scan, sensor_to_world: np.ndarray, timestamp: int = 0, sample_index: int = 0, **fields: Any
+) -> RecordedScan:
+    """A revolution of a standing sensor at a key frame, for training, that measures on every ray and meets no object;
+    `fields` replace that."""
+    shape, none = scan.returned.shape, np.zeros(3)
+    defaults = {
+        "lidar": "TOP", "seconds": timestamp * 1e-6, "is_key_frame": True, "group": "train", "linear": none,
+        "angular": none, "measured": np.ones(shape, dtype=bool), "objects": np.full(shape, NO_OBJECT, dtype=np.int16),
+        "blocked": np.zeros(shape, dtype=bool),
+    }  # fmt: skip
+    at = {"sensor_to_world": sensor_to_world, "timestamp": timestamp, "sample_index": sample_index}
+    return RecordedScan(scan=scan, **at, **{**defaults, **fields})
 
 
 def write_invalid(path: Path, content: Any) -> None:

@@ -75,15 +75,9 @@ def _view_colors(means: Tensor, colors: Tensor, viewmat: Tensor, sh_degree: int 
 
 
 def _composite(
-    means2d: Tensor,
-    conics: Tensor,
-    depths: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    values: Tensor,
-    width: int,
+    means2d: Tensor, conics: Tensor, depths: Tensor, radii: Tensor, opacities: Tensor, values: Tensor, width: int,
     height: int,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """The image (h, w, channels) and alpha (h, w, 1) of one camera, tile by tile, Gaussians front to back."""
     order = torch.argsort(depths.detach())
     order = order[(radii[order] > 0).all(dim=-1)]
@@ -93,12 +87,9 @@ def _composite(
         row = []
         for x in range(0, width, TILE):
             tile_w, tile_h = min(TILE, width - x), min(TILE, height - y)
-            overlaps = (low[order] < torch.tensor([x + tile_w, y + tile_h]).to(low)) & (
-                high[order] > torch.tensor([x, y]).to(low)
-            )
-            row.append(
-                _composite_tile(means2d, conics, opacities, values, order[overlaps.all(dim=-1)], (x, y, tile_w, tile_h))
-            )
+            first, last = torch.tensor([x, y]).to(low), torch.tensor([x + tile_w, y + tile_h]).to(low)
+            members = order[((low[order] < last) & (high[order] > first)).all(dim=-1)]
+            row.append(_composite_tile(means2d, conics, opacities, values, members, (x, y, tile_w, tile_h)))
         rows.append(torch.cat(row, dim=1))
     image = torch.cat(rows, dim=0)
     return image[..., :-1], image[..., -1:]

@@ -12,10 +12,8 @@ from torch import Tensor
 
 from drivesplat.kernels.scanned_gaussians import ScannedGaussians
 from drivesplat.rasterization import RayGrid, ScanMotion, ScanRendering
+from helpers.reference_rasterizer import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
-MAX_ALPHA = 0.999
-MIN_ALPHA = 1.0 / 255.0
-MIN_TRANSMITTANCE = 1e-4
 MIN_RANGE = 0.2
 MAX_ELEVATION = math.radians(80.0)
 

@@ -15,12 +15,10 @@ PROTOCOL = {
 }  # fmt: skip
 
 
-def stages(methods=("vanilla",), width=640, iterations=30000, code="c") -> dict[str, Any]:
+def stages(methods=("vanilla",), iterations=30000, code="c") -> dict[str, Any]:
     """The stages behind a result, as provenance holds them."""
-    made = {
-        "extract": {"settings": {"sweeps": False}, "code": "e"},
-        "parser": {"settings": {"images": {"width": width}}, "code": "p"},
-    }
+    made = {"extract": {"settings": {"sweeps": False}, "code": "e"}}
+    made["parser"] = {"settings": {"images": {"width": 640}}, "code": "p"}
     for method in methods:
         made[f"{method}/train"] = {"settings": {"train": {"iterations": iterations}}, "code": code}
     return made
@@ -74,8 +72,8 @@ def expecting(*scenes: str, methods=("vanilla",)) -> ReportJob:
     return report_job({scene: stages(methods) for scene in scenes})
 
 
-def report_job(expected: dict[str, Any], reference: str | None = "vanilla") -> ReportJob:
-    return ReportJob(expected=expected, reference=reference, random_seed=0)
+def report_job(expected: dict[str, Any]) -> ReportJob:
+    return ReportJob(expected=expected, reference="vanilla", random_seed=0)
 
 
 def report_of(folder: Path, *records: dict[str, Any], methods: tuple[str, ...]) -> dict[str, Any]:

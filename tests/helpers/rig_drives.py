@@ -32,20 +32,9 @@ def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = KEY_FRAMES
         frames += [_frame(folder, recorder, RIG[camera], index) for camera in cameras]
         sweeps.append(_sweep(folder, recorder, index))
     times = START_US + KEY_FRAME_US * np.arange(key_frames)
-    zero = np.zeros(3)
     return Scene(
-        "rig",
-        "demo",
-        "v1.0-mini",
-        "",
-        zero,
-        times,
-        tuple(frames),
-        tuple(sweeps),
-        (),
-        poses="nuscenes",
-        key_frame_hz=2.0,
-    )
+        "rig", "demo", "v1.0-mini", "", np.zeros(3), times, tuple(frames), tuple(sweeps), (), "nuscenes", 2.0
+    )  # fmt: skip
 
 
 def _frame(folder: Path, recorder: Recorder, sensor: RigSensor, index: int) -> Frame:
@@ -63,9 +52,8 @@ def _sweep(folder: Path, recorder: Recorder, index: int) -> Sweep:
     sensor, path = RIG["LIDAR_TOP"], folder / f"{index:02}.pcd.bin"
     recorder.sweep(sensor, index * KEY_FRAME_US).tofile(path)
     sensor_to_world = recorder.ego_pose(index * KEY_FRAME_US * 1e-6) @ sensor.sensor_to_ego
-    return Sweep(
-        str(path), START_US + index * KEY_FRAME_US, sensor_to_world, True, index, path.stem, "LIDAR_TOP", "nuscenes"
-    )
+    time = START_US + index * KEY_FRAME_US
+    return Sweep(str(path), time, sensor_to_world, True, index, path.stem, "LIDAR_TOP", "nuscenes")
 
 
 @functools.cache

@@ -9,10 +9,11 @@ import numpy as np
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scan import Scan, ScanRays
-from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
+from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.scene import Scene, Sweep, Track
 from drivesplat.scene.sensors import Lidar, Spin
 from drivesplat.settings.scans import ScansJob
+from helpers.records import recorded_scan
 
 BEAMS = np.radians([-20.0, -10.0, 0.0, 10.0])
 STEPS = 144
@@ -95,8 +96,6 @@ def recorded(
     rays = ScanRays(around.astype(np.float32), up.astype(np.float32), np.zeros(shape, dtype=np.float32))
     shades = None if intensity is None else np.where(returned, intensity, 0.0).astype(np.float32)
     scan = Scan(rays, returned, np.where(returned, ranges, 0.0).astype(np.float32), shades)
-    return RecordedScan(
-        "top", timestamp, timestamp * 1e-6, round(timestamp / KEY_FRAME_US), True, group, at(place), np.zeros(3),
-        np.zeros(3), scan, np.ones(shape, dtype=bool) if measured is None else measured,
-        np.full(shape, NO_OBJECT, dtype=np.int16) if objects is None else objects, np.zeros(shape, dtype=bool),
-    )  # fmt: skip
+    given = {"lidar": "top", "group": group, "measured": measured, "objects": objects}
+    fields = {name: value for name, value in given.items() if value is not None}
+    return recorded_scan(scan, at(place), timestamp, round(timestamp / KEY_FRAME_US), **fields)

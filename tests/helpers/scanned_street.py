@@ -7,10 +7,11 @@ from torch import nn
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.scan import Scan, ScanRays
-from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan, ScanRecords
+from drivesplat.scene.scan_record import ScanRecords
 from drivesplat.scene.scene import Scene
 from helpers.hand_made import actors_of, round_gaussians
 from helpers.hand_made_street import DRIVERS, SETTINGS
+from helpers.records import recorded_scan
 
 WALL_AT = 80.0
 """Metres along the world's x axis."""
@@ -57,12 +58,11 @@ def scan_records(scene: Scene) -> ScanRecords:
     empty, measured = np.zeros((BEAMS, FIRINGS), dtype=np.float32), np.ones((BEAMS, FIRINGS), dtype=bool)
     measured[:, UNMEASURED] = False
     scan = Scan(ScanRays(around, up, offsets), empty > 0, empty, empty)
-    nothing = np.full((BEAMS, FIRINGS), NO_OBJECT, dtype=np.int16)
-    linear = np.array([SPEED, 0.0, 0.0])
+    fields = {"linear": np.array([SPEED, 0.0, 0.0]), "measured": measured}
     scans = [
-        RecordedScan(
-            sweep.lidar, sweep.timestamp, scene.seconds(sweep.timestamp), sweep.sample_index, True, "train",
-            sweep.sensor_to_world, linear, np.zeros(3), scan, measured, nothing, ~measured & False,
+        recorded_scan(
+            scan, sweep.sensor_to_world, sweep.timestamp, sweep.sample_index, lidar=sweep.lidar,
+            seconds=scene.seconds(sweep.timestamp), **fields,
         )
         for sweep in scene.sweeps
     ]  # fmt: skip

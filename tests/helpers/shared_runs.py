@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from helpers.workflow_copy import WorkflowCopy
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 VANILLA = {"vanilla": {}}
 TWO_METHODS = {**VANILLA, "street": {"parts": ["background", "actors"]}}
@@ -50,6 +50,7 @@ def two_edits(folder: Path) -> WorkflowCopy:
         datasets={"nuscenes": {"dataroot": "data", "scenes": ["0001"], "edits": {"0001": "edits.yaml"}}},
         methods={**VANILLA, "street": {**TWO_METHODS["street"], "overrides": STREET}},
         actors={"random_points": 200},
+        train={**TINY_TRAINING, "iterations": 20},
     )
     (copy.folder / "edits.yaml").write_text(EDITS)
     return copy

@@ -30,12 +30,12 @@ from drivesplat.settings.train import TrainJob
 from drivesplat.training.stage import TrainingFiles, TrainingInputs, run_training
 from drivesplat.visuals.rendered_view import ModelWithRecording, open_model_with_recording
 from drivesplat.workflow.stages import stage_settings
+from helpers.trainings import PROVENANCE
 from helpers.workflow_copy import TINY_TRAINING
 
 S = TypeVar("S", bound=Settings)
 SCENE = "0001"
 CPU = DeviceSettings(kind="cpu")
-PROVENANCE = {"settings_sha256": "a", "code_sha256": "b", "inputs_sha256": "c", "stages": {}, "inputs": {}}
 HELD_TO_SKY_AND_DEPTH = {"train": {"sky_bce_weight": 0.05, "depth_weight": 0.01}}
 BASE = {
     "datasets": {"nuscenes": {"scenes": [SCENE]}},

@@ -7,6 +7,8 @@ import numpy as np
 
 from drivesplat.scene.scan import Scan, ScanRays
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
+from helpers.drives import to_box
+from helpers.records import recorded_scan
 
 HEIGHT, REVOLUTION_S, MAX_RANGE = 1.8, 0.1, 70.0
 ELEVATIONS = np.radians(np.linspace(-18.0, 4.0, 24))
@@ -72,10 +74,9 @@ def _scan(
     scan = Scan(rays, returned.reshape(shape), noisy.reshape(shape).astype(np.float32))
     pose = np.eye(4)
     pose[:3, 3] = speed * at, 0.0, HEIGHT
-    return RecordedScan(
-        "TOP", round(at * 1e6), at, sample, is_key_frame, "train", pose, np.array([speed, 0.0, 0.0]), np.zeros(3), scan,
-        np.ones(shape, dtype=bool), np.where(returned, met, NO_OBJECT).reshape(shape).astype(np.int16),
-        np.zeros(shape, dtype=bool),
+    return recorded_scan(
+        scan, pose, round(at * 1e6), sample, seconds=at, is_key_frame=is_key_frame, linear=np.array([speed, 0.0, 0.0]),
+        objects=np.where(returned, met, NO_OBJECT).reshape(shape).astype(np.int16),
     )  # fmt: skip
 
 
@@ -85,7 +86,4 @@ def _to_box(box: Mover, origins: np.ndarray, ways: np.ndarray, times: np.ndarray
     turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     centers = np.column_stack([box.at(times), np.full(len(times), 0.5 * box.size[2])])
     start, along = (origins - centers) @ turn.T, ways @ turn.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.stack([(sign * 0.5 * np.array(box.size) - start) / along for sign in (-1.0, 1.0)])
-    enter, leave = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
-    return np.where((enter < leave) & (enter > 0.0), enter, np.inf)
+    return to_box(0.5 * np.array(box.size), start, along)

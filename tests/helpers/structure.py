@@ -14,7 +14,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 from helpers import REPOSITORY
-from helpers.syntax_trees import source_of, tree_of
+from helpers.syntax_trees import source_of, statements, tree_of
 
 LIBRARY = "drivesplat"
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
@@ -47,7 +47,7 @@ def packages(*folders: str) -> dict[str, Path]:
 def imported(tree: ast.AST, known: Iterable[str]) -> set[str]:
     """Modules of `known` that a syntax tree imports anywhere, also inside functions."""
     names: set[str] = set()
-    for node in ast.walk(tree):
+    for node in statements(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -115,7 +115,7 @@ def longest_chain(graph: Graph) -> list[str]:
 def classes() -> Iterator[tuple[str, ast.ClassDef]]:
     """Every class of the library, with its module."""
     for module, path in modules().items():
-        yield from ((module, node) for node in ast.walk(tree_of(path)) if isinstance(node, ast.ClassDef))
+        yield from ((module, node) for node in statements(tree_of(path)) if isinstance(node, ast.ClassDef))
 
 
 def code_lines(source: str) -> int:
@@ -150,7 +150,9 @@ def figures() -> dict[str, float]:
         for folder, pattern in (("tests", "*.py"), ("docs", "*.md"))
     }
     code = sum(map(code_lines, library))
-    functions = [node for path in modules().values() for node in ast.walk(tree_of(path)) if isinstance(node, FUNCTIONS)]
+    functions = [
+        node for path in modules().values() for node in statements(tree_of(path)) if isinstance(node, FUNCTIONS)
+    ]
     members = {node.name: sum(isinstance(item, FUNCTIONS) for item in node.body) for _, node in classes()}
     graph = module_graph()
     return {

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -14,3 +15,12 @@ def source_of(path: Path) -> str:
 def tree_of(path: Path) -> ast.Module:
     """The syntax tree of a file; not to be changed."""
     return ast.parse(source_of(path))
+
+
+def statements(tree: ast.AST) -> Iterator[ast.AST]:
+    """A tree and all statements in it, at any depth."""
+    waiting = [tree]
+    while waiting:
+        yield (node := waiting.pop())
+        for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+            waiting += getattr(node, name, ())

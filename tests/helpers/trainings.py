@@ -40,25 +40,16 @@ from drivesplat.settings.train import (
 )
 from drivesplat.settings.train_geometry import FloaterSettings
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
-from drivesplat.training.stage import (
-    TrainingFiles,
-    TrainingInputs,
-)
+from drivesplat.training.stage import TrainingFiles, TrainingInputs
 from drivesplat.training.views import LidarDepth, TrainingView
 from helpers import REPOSITORY
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
-from helpers.records import training_record_of
+from helpers.records import recorded_scan, training_record_of
 from helpers.reference_rasterizer import rasterize_reference
 
 CPU = torch.device("cpu")
-
-
 WIDTH, HEIGHT = 32, 24
-
-
 WALL_AT = 6.0
-
-
 ITERATIONS, CHECKPOINT_AT, ENDED_AT = 60, 30, 43
 
 
@@ -97,9 +88,7 @@ def scan_of_a_wall(x: float = 0.0, intensity: float = 0.3) -> RecordedScan:
     pose[0, 3] = x
     values = np.full(ranges.shape, intensity, dtype=np.float32)
     scan = Scan(ScanRays(azimuths, elevations, np.zeros_like(ranges)), returned, ranges * returned, values * returned)
-    no_object, measured, blocked = np.full(ranges.shape, -1, np.int16), np.ones_like(returned), np.zeros_like(returned)
-    still = np.zeros(3), np.zeros(3)
-    return RecordedScan("TOP", 0, 0.0, 0, True, "train", pose, *still, scan, measured, no_object, blocked)
+    return recorded_scan(scan, pose)
 
 
 def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
@@ -164,13 +153,9 @@ def without_sky_masks(views: list[TrainingView]) -> list[TrainingView]:
 
 
 ALL_TERMS = {
-    "sky_bce_weight": 0.05,
-    "horizon_weight": 0.05,
-    "depth_weight": 0.01,
-    "smoothness_weight": 0.1,
-    "entropy_weight": 0.1,
-    "dynamic_weight": 0.1,
-}
+    "sky_bce_weight": 0.05, "horizon_weight": 0.05, "depth_weight": 0.01, "smoothness_weight": 0.1,
+    "entropy_weight": 0.1, "dynamic_weight": 0.1,
+}  # fmt: skip
 
 
 def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:

@@ -83,9 +83,8 @@ def page_of(gaussians: Gaussians, sky: Sky | None, antialiased: bool = False, ti
 def a_sky() -> CubemapSky:
     sky = CubemapSky(8, torch.tensor([0.4, 0.6, 0.8]), 0.01)
     with torch.no_grad():
-        sky.params["texels"].add_(
-            0.5 * torch.randn(sky.params["texels"].shape, generator=torch.Generator().manual_seed(1))
-        )
+        texels = sky.params["texels"]
+        texels.add_(0.5 * torch.randn(texels.shape, generator=torch.Generator().manual_seed(1)))
     return sky
 
 

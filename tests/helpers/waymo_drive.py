@@ -15,6 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from helpers.drives import CAMERA_AT, LIDAR_AT, World, cast, scene_at, seconds_of
 
@@ -30,13 +31,7 @@ SWEEP_S = 0.1
 READOUT_S, SHUTTER_S = 0.04, 0.004
 
 
-def transform(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, place
-    return matrix
-
-
-GLOBAL = transform(Rotation.from_euler("z", 0.7).as_matrix(), np.array([-25_211.25, 42_391.125, -160.5]))
+GLOBAL = rigid(Rotation.from_euler("z", 0.7).as_matrix(), np.array([-25_211.25, 42_391.125, -160.5]))
 """The scene's world in that of the segment."""
 
 
@@ -125,46 +120,33 @@ class Drive:
 
 
 def tiny_drive(
-    root: Path,
-    world: World | None = None,
-    lasers: tuple[int, ...] = (1, 2, 5),
-    scan: LaserRecording | None = None,
+    root: Path, world: World | None = None, lasers: tuple[int, ...] = (1, 2, 5), scan: LaserRecording | None = None,
     place: np.ndarray = GLOBAL,
-) -> tuple[Drive, Scene]:
+) -> tuple[Drive, Scene]:  # fmt: skip
     """The tiny drive in `root` as Waymo records it, and the scene that nuScenes' tables give. With `scan`, that is its
     only laser. `place` (4, 4): the scene's world in that of the segment."""
     scene, world = scene_at(root, sweeps=False), world or World()
-    poses = {time: place @ transform(np.eye(3), world.ego_at(seconds_of(time))) for time in scene.key_frame_timestamps}
+    poses = {time: place @ rigid(np.eye(3), world.ego_at(seconds_of(time))) for time in scene.key_frame_timestamps}
     recorded = [scan] if scan else [laser for laser in _lasers() if laser.number in lasers]
-    return Drive(
-        NAME,
-        {int(time): pose for time, pose in poses.items()},
-        _cameras(scene),
-        recorded,
-        _images(scene, place),
-        [_sweep(world, laser, int(time), place) for time in poses for laser in recorded],
-        _boxes(scene, poses, place),
-    ), scene
+    sweeps = [_sweep(world, laser, int(time), place) for time in poses for laser in recorded]
+    frames, boxes = {int(time): pose for time, pose in poses.items()}, _boxes(scene, poses, place)
+    return Drive(NAME, frames, _cameras(scene), recorded, _images(scene, place), sweeps, boxes), scene
 
 
 def tables_scan() -> LaserRecording:
     """The beams and steps of the LiDAR in nuScenes' tables, all at one time: a laser without poses of pixels."""
     inclinations = np.radians(np.linspace(-28, 10, 24))
-    return LaserRecording(2, transform(np.eye(3), LIDAR_AT), 24, 240, inclinations, inclinations[0], inclinations[-1])
+    return LaserRecording(2, rigid(np.eye(3), LIDAR_AT), 24, 240, inclinations, inclinations[0], inclinations[-1])
 
 
 def _lasers() -> list[LaserRecording]:
     """A TOP laser that is mounted backwards and tilted, and four around the vehicle that look down, too."""
     inclinations = np.concatenate([np.linspace(-0.306, -0.05, 34), np.linspace(-0.046, 0.0437, 30)])
-    top = transform(Rotation.from_euler("zyx", [-2.58, 0.004, -0.006]).as_matrix(), LIDAR_AT)
+    top = rigid(Rotation.from_euler("zyx", [-2.58, 0.004, -0.006]).as_matrix(), LIDAR_AT)
     found = [LaserRecording(1, top, 64, COLUMNS, inclinations, -0.31, 0.045)]
-    for number, (turn, x, y) in {
-        2: (0.0, 4.0, 0.0),
-        3: (1.57, 3.2, 1.0),
-        4: (-1.6, 3.2, -1.0),
-        5: (3.1, -1.1, 0),
-    }.items():
-        mount = transform(Rotation.from_euler("zyx", [turn, 0.02, -0.01]).as_matrix(), np.array([x, y, 0.7]))
+    around = [(0.0, 4.0, 0.0), (1.57, 3.2, 1.0), (-1.6, 3.2, -1.0), (3.1, -1.1, 0)]
+    for number, (turn, x, y) in enumerate(around, start=2):
+        mount = rigid(Rotation.from_euler("zyx", [turn, 0.02, -0.01]).as_matrix(), np.array([x, y, 0.7]))
         found.append(LaserRecording(number, mount, 20, 60, None, -np.pi / 2, np.pi / 6))
     return found
 
@@ -173,9 +155,9 @@ def _cameras(scene: Scene) -> list[CameraRecording]:
     """The scene's camera as FRONT, and SIDE_LEFT with smaller images."""
     k, (width, height) = scene.cameras[0].intrinsics, (scene.cameras[0].width, scene.cameras[0].height)
     intrinsic = [k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
-    left = transform(Rotation.from_euler("z", np.pi / 2).as_matrix(), np.array([1.4, 0.1, 1.5]))
+    left = rigid(Rotation.from_euler("z", np.pi / 2).as_matrix(), np.array([1.4, 0.1, 1.5]))
     return [
-        CameraRecording(1, transform(np.eye(3), CAMERA_AT), intrinsic, width, height),
+        CameraRecording(1, rigid(np.eye(3), CAMERA_AT), intrinsic, width, height),
         CameraRecording(4, left, intrinsic, width, height - 16, direction=1),
     ]
 
@@ -204,7 +186,7 @@ def _sweep(world: World, laser: LaserRecording, time: int, place: np.ndarray) ->
     for first in range(0, columns, block):
         part = slice(first, first + block)
         seconds = seconds_of(time) + (SWEEP_S * (first / columns - 0.5) if laser.number == 1 else 0.0)
-        vehicle = transform(np.eye(3), world.ego_at(seconds))
+        vehicle = rigid(np.eye(3), world.ego_at(seconds))
         sensor = vehicle @ laser.extrinsic
         turned = rays[:, part].reshape(-1, 3) @ sensor[:3, :3].T
         distance, _ = cast(world, sensor[:3, 3], turned, seconds)
@@ -232,8 +214,8 @@ def _boxes(scene: Scene, poses: dict[int, np.ndarray], place: np.ndarray) -> lis
     return found
 
 
-def panoptic(frame: int, camera: int, classes: np.ndarray, divisor: int = 1000) -> LabelRecording:
+def panoptic(frame: int, camera: int, classes: np.ndarray) -> LabelRecording:
     """The panoptic label of an image with these classes, all of instance 7."""
     png = BytesIO()
-    Image.fromarray((classes.astype(np.uint16) * divisor + 7).astype(np.uint16)).save(png, "PNG")
-    return LabelRecording(frame, camera, png.getvalue(), divisor)
+    Image.fromarray((classes.astype(np.uint16) * 1000 + 7).astype(np.uint16)).save(png, "PNG")
+    return LabelRecording(frame, camera, png.getvalue(), 1000)

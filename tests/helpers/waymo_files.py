@@ -159,17 +159,11 @@ def _schema(component: str, single: bool, text_keys: bool) -> pa.Schema:
 
 
 def _columns(component: str) -> list[str]:
-    """The columns of a component besides its keys."""
-    example = Drive("x", {0: np.eye(4)}, [], [], [], [])
-    rows = {
-        "vehicle_pose": components(example)["vehicle_pose"][0],
-        "camera_calibration": _camera_row({}, _Blank()), "lidar_calibration": _laser_row({}, _Blank()),
-        "camera_image": _image_row({}, ImageRecording(0, 1, np.eye(4), 0.0, b"")),
-        "lidar": _matrix("LiDARComponent", np.zeros((1, 1, 4))),
-        "lidar_pose": _matrix("LiDARPoseComponent", np.zeros((1, 1, 6))), "lidar_box": _box_row({}, _Blank()),
-        "camera_segmentation": _label_row({}, LabelRecording(0, 1, b"", 1)),
-    }  # fmt: skip
-    return [name for name in rows[component] if name.startswith("[")]
+    """The columns of a component besides its keys, by a drive with one record of each kind."""
+    blank, image, label = [_Blank()], ImageRecording(0, 1, np.eye(4), 0.0, b""), LabelRecording(0, 1, b"", 1)
+    sweep = RangeRecording(0, 1, np.zeros((1, 1, 4)), np.zeros((1, 1, 6)), np.zeros((1, 1, 3)))
+    example = Drive("x", {0: np.eye(4)}, blank, blank, [image], [sweep], blank, [label])
+    return [name for name in components(example)[component][0] if name.startswith("[")]
 
 
 class _Blank:
@@ -238,17 +232,9 @@ def _context(drive: Drive) -> bytes:
 def _image(image: ImageRecording, labels: Iterable[LabelRecording]) -> bytes:
     shutter, trigger, done = _times(image)
     times = real(5, image.seconds) + real(6, shutter) + real(7, trigger) + real(8, done)
-    return (
-        number(1, image.camera)
-        + block(2, image.content)
-        + pose(3, image.pose)
-        + times
-        + b"".join(
-            block(10, number(1, label.divisor) + block(2, label.content))
-            for label in labels
-            if (label.frame, label.camera) == (image.frame, image.camera)
-        )
-    )
+    own = (label for label in labels if (label.frame, label.camera) == (image.frame, image.camera))
+    shown = b"".join(block(10, number(1, label.divisor) + block(2, label.content)) for label in own)
+    return number(1, image.camera) + block(2, image.content) + pose(3, image.pose) + times + shown
 
 
 def _laser(sweep: RangeRecording) -> bytes:

@@ -7,9 +7,11 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,30 +22,13 @@ from helpers.drives import World, write_world
 from helpers.forked_snakemake import run_snakemake
 
 PARTS = (
-    "Snakefile",
-    "benchmarks",
-    "config.yaml",
-    "config.schema.json",
-    "docs",
-    "drivesplat",
-    "envs",
-    "presets",
-    "profiles",
-    "report",
-    "rules",
-    "workflow_scripts",
-)
+    "Snakefile", "benchmarks", "config.yaml", "config.schema.json", "docs", "drivesplat", "envs", "presets", "profiles",
+    "report", "rules", "workflow_scripts",
+)  # fmt: skip
 TINY_TRAINING = {
-    "iterations": 60,
-    "log_every": 10,
-    "checkpoint_every": 20,
-    "min_checkpoint_interval_s": 0.0,
-    "image_every": 30,
-    "gaussians": {"sh_degree": 1},
-    "sky_resolution": 8,
-}
-
-
+    "iterations": 60, "log_every": 10, "checkpoint_every": 20, "min_checkpoint_interval_s": 0.0, "image_every": 30,
+    "gaussians": {"sh_degree": 1}, "sky_resolution": 8,
+}  # fmt: skip
 _COSTS = re.compile(r"drivesplat: (\d+ jobs?, |(\d+ % of the work, )?\d+ of \d+ jobs, |report of finished )")
 
 
@@ -67,11 +52,9 @@ class WorkflowCopy:
         folder.mkdir(parents=True, exist_ok=True)
         _compiled()
         for part in PARTS:
-            source = REPOSITORY / part
-            ignore = shutil.ignore_patterns("kernels-*", "*.opt-jaxtyping*.pyc")
-            shutil.copytree(source, folder / part, ignore=ignore) if source.is_dir() else shutil.copy2(
-                source, folder / part
-            )
+            source, ignore = REPOSITORY / part, shutil.ignore_patterns("kernels-*", "*.opt-jaxtyping*.pyc")
+            copy_part = partial(shutil.copytree, ignore=ignore) if source.is_dir() else shutil.copy2
+            copy_part(source, folder / part)
         if "methods" in config:
             _drop(folder / "config.yaml", "methods")  # what is laid over that file can only add to them
         world = world or World()
@@ -96,6 +79,17 @@ class WorkflowCopy:
     def write_config(self, text: str | None = None) -> None:
         (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))
 
+    @contextmanager
+    def set_to(self, **config: Any) -> Iterator[None]:
+        """Other values of the config for a while."""
+        before, self.config = self.config, {**self.config, **config}
+        self.write_config()
+        try:
+            yield
+        finally:
+            self.config = before
+            self.write_config()
+
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "snakemake", *self._arguments(*arguments)]
 
@@ -104,29 +98,18 @@ class WorkflowCopy:
         return ["--configfile", "mine.yaml", *arguments]
 
     def run(
-        self,
-        *targets: str,
-        cores: int = 2,
-        flags: tuple[str, ...] = (),
-        gpus: str = "",
-        under: tuple[str, ...] = (),
+        self, *targets: str, cores: int = 2, flags: tuple[str, ...] = (), gpus: str = "", under: tuple[str, ...] = (),
         timeout: float = 600,
-    ) -> subprocess.CompletedProcess:
+    ) -> subprocess.CompletedProcess:  # fmt: skip
         """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `gpus`, by the program
         `under` where one is given; the result holds its output (both streams) as `stdout`."""
         arguments = ("--cores", str(cores), *flags, "--", *targets)
         environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": gpus}
         if not under:
             return run_snakemake(self._arguments(*arguments), self.folder, environment, timeout)
-        return subprocess.run(
-            [*under, *self.command(*arguments)],
-            cwd=self.folder,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=timeout,
-        )
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        command = [*under, *self.command(*arguments)]
+        return subprocess.run(command, cwd=self.folder, env=environment, timeout=timeout, **streams)
 
     def dry_run(self, *targets: str) -> str:
         """What `snakemake -n` prints; raises where planning fails."""

@@ -21,14 +21,14 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
 
 @pytest.mark.parametrize(
-    ("program", "channels"),
+    ("program", "channels", "capability"),
     [
-        *((compiled.IMAGES, count) for count in (1, 3, 4, chunks.MAX_VALUES)),
-        *((compiled.IMAGES_WITH_OBJECTS, count) for count in (3, 4)),
-        *((compiled.SCANS, count) for count in (0, 2, 4, scans.MAX_VALUES)),
+        *((compiled.IMAGES, count, "90") for count in (1, 4, chunks.MAX_VALUES)),
+        *((compiled.SCANS, count, "80") for count in (0, scans.MAX_VALUES)),
+        *((compiled.IMAGES_WITH_OBJECTS, 3, capability) for capability in ("75", "120")),
+        *((compiled.SCANS, 2, capability) for capability in ("75", "120")),
     ],
 )
-@pytest.mark.parametrize("capability", ["75", "80", "90", "120"])
 def test_they_compile_for_each_number_of_values_and_kind_of_gpu(program, channels, capability):
     try:
         binary = compiled.compiled(program, channels, compiled.LENGTH, capability)
@@ -110,8 +110,40 @@ def test_chunks_and_their_gradients_equal_those_of_torch(cameras, channels, leng
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
 
 
-def check_alpha_of_objects(channels: int, compared: slice, length: int) -> None:
-    """Images, alpha, alpha of objects alone, and the gradients of the `compared` ones of these equal those of torch."""
+@pytest.fixture(scope="module")
+def kernels_of_a_processor(tmp_path_factory):
+    """The source compiled for a processor, each program once."""
+    folder = tmp_path_factory.mktemp("kernels")
+    return cache(lambda program, channels, length, device: kernels_on_cpu(program, channels, length, folder))
+
+
+@pytest.fixture
+def on_the_processor(kernels_of_a_processor, monkeypatch):
+    """The source compiled for a processor in place of the kernels."""
+    if torch.cuda.is_available():
+        pytest.skip("on a GPU the kernels themselves are compared")
+    if COMPILER is None:
+        pytest.skip("no C++ compiler")
+    monkeypatch.setattr(compositing, "kernels", kernels_of_a_processor)
+
+
+@pytest.fixture(params=["processor", pytest.param("GPU", marks=[gpu, needs_gpu])])
+def anywhere(request):
+    """The kernels on a GPU, and without one their source compiled for a processor."""
+    if request.param == "processor":
+        request.getfixturevalue("on_the_processor")
+
+
+WITH_IMAGE, ALONE = slice(0, 3), slice(2, 3)
+
+
+@pytest.mark.usefixtures("anywhere")
+@pytest.mark.parametrize(
+    ("channels", "compared", "length"),
+    [(3, WITH_IMAGE, 4), (3, ALONE, 4), pytest.param(4, WITH_IMAGE, 256, marks=[gpu, needs_gpu])],
+)
+def test_the_alpha_of_objects_alone_and_its_gradient_equal_those_of_torch(channels, compared, length):
+    """Images, alpha, alpha of objects alone, and the gradients of the `compared` ones of these."""
     given, lists, (image, alpha) = lists_of_all_lengths(1, channels, 1.0 / 255.0)
     objects = slice(8, 21)
     *others, opacities = given
@@ -128,17 +160,6 @@ def check_alpha_of_objects(channels: int, compared: slice, length: int) -> None:
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
     for theirs, mine in zip(*gradients(given, expected[compared], found[compared]), strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
-
-
-WITH_IMAGE, ALONE = slice(0, 3), slice(2, 3)
-
-
-@gpu
-@needs_gpu
-@pytest.mark.parametrize(("channels", "compared"), [(3, WITH_IMAGE), (4, WITH_IMAGE), (3, ALONE)])
-@pytest.mark.parametrize("length", [4, 256])
-def test_the_alpha_of_objects_alone_and_its_gradient_equal_those_of_torch(channels, compared, length):
-    check_alpha_of_objects(channels, compared, length)
 
 
 def one_after_the_other(given: list[torch.Tensor], objects: slice) -> tuple[torch.Tensor, ...]:
@@ -191,7 +212,9 @@ def before_one_tile(generator: torch.Generator) -> tuple[list[torch.Tensor], Til
     return [values.to(DEVICE).requires_grad_() for values in given], TileLists(ids.int(), ids, ends, (1, 1, 1))
 
 
-def check_ends_of_rays(length: int) -> None:
+@pytest.mark.usefixtures("anywhere")
+@pytest.mark.parametrize("length", [256, 48])
+def test_rays_end_before_the_last_gaussian(length):
     """In two batches of a block, or in chunks."""
     generator, objects = torch.Generator().manual_seed(0), slice(60, 150)
     given, lists = before_one_tile(generator)
@@ -214,35 +237,8 @@ def check_ends_of_rays(length: int) -> None:
             torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
 
 
-@gpu
-@needs_gpu
-@pytest.mark.parametrize("length", [256, 48])
-def test_rays_end_before_the_last_gaussian(length):
-    check_ends_of_rays(length)
-
-
-@pytest.fixture
-def on_the_processor(monkeypatch, tmp_path):
-    """The source compiled for a processor in place of the kernels."""
-    if torch.cuda.is_available():
-        pytest.skip("on a GPU the kernels themselves are compared")
-    if COMPILER is None:
-        pytest.skip("no C++ compiler")
-    compile_once = cache(lambda program, channels, length, device: kernels_on_cpu(program, channels, length, tmp_path))
-    monkeypatch.setattr(compositing, "kernels", compile_once)
-
-
-@pytest.mark.parametrize("compared", [WITH_IMAGE, ALONE])
-def test_the_alpha_of_objects_by_the_source_compiled_for_a_processor(compared, on_the_processor):
-    check_alpha_of_objects(3, compared, 4)
-
-
-@pytest.mark.parametrize("length", [256, 48])
-def test_ends_of_rays_by_the_source_compiled_for_a_processor(length, on_the_processor):
-    check_ends_of_rays(length)
-
-
-def check_chunks_behind_the_end() -> None:
+@pytest.mark.usefixtures("anywhere")
+def test_chunks_behind_the_end_of_a_ray_have_no_gradient():
     """Chunks are composited by themselves: a ray ends at most 1e-4 later than where Gaussians follow one another, and
     nothing in the chunks behind has a gradient."""
     given, lists = before_one_tile(torch.Generator().manual_seed(0))
@@ -257,17 +253,7 @@ def check_chunks_behind_the_end() -> None:
     assert all(gradient[:, :length].any() and not gradient[:, early:].any() for gradient in behind)
 
 
-@gpu
-@needs_gpu
-def test_chunks_behind_the_end_of_a_ray_have_no_gradient():
-    check_chunks_behind_the_end()
-
-
-def test_chunks_behind_the_end_by_the_source_compiled_for_a_processor(on_the_processor):
-    check_chunks_behind_the_end()
-
-
-@pytest.mark.parametrize("place", range(1, 6))
+@pytest.mark.parametrize("place", [1, 2, 5])
 def test_pixels_whose_rays_have_ended_are_left_out_of_later_chunks(place, on_the_processor):
     """A processor composites chunks one after the other. The first one ends the rays on the left of a tile: values that
     are no numbers in another chunk do not reach the image there. On the right those of the second chunk do."""

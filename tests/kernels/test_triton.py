@@ -77,6 +77,13 @@ def assert_same_gradients(results: list[Any], inputs: list[torch.Tensor], atol: 
         torch.testing.assert_close(ours, theirs, atol=atol, rtol=rtol)
 
 
+def a_pose() -> torch.Tensor:
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=0).as_matrix())
+    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
+    return pose
+
+
 def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(seed).uniform(size=(height, width)) < share).to(DEVICE)
 
@@ -85,8 +92,7 @@ def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tens
     ("height", "width", "hidden", "moving"),
     [
         pytest.param(10, 45, True, True, id="wider than a block, and no multiple of it"),
-        pytest.param(10, 45, False, False, id="no masks"),
-        pytest.param(3, 4, False, True, id="smaller than a window"),
+        pytest.param(3, 4, False, False, id="smaller than a window, without masks"),
     ],
 )
 def test_color_differences_and_their_gradients_agree_with_torch(height, width, hidden, moving):
@@ -116,8 +122,8 @@ def test_an_empty_moving_mask_gives_no_difference_and_no_gradient():
     assert float(moving.detach()) == 0.0 and not image.grad.any()
 
 
-@pytest.mark.parametrize("count", [1, 130])
-def test_the_first_iterations_of_values_that_are_not_finite_agree_with_torch(count):
+def test_the_first_iterations_of_values_that_are_not_finite_agree_with_torch():
+    count = 130
     values = torch.linspace(-3.0, 3e38, count, device=DEVICE)
     values[::3], values[1::5], values[2::7] = torch.nan, torch.inf, -torch.inf
     found = []
@@ -135,12 +141,12 @@ def test_adam_steps_agree_with_torch():
     from drivesplat.kernels.triton.adam import adam_step as fused_step
 
     torch.manual_seed(0)
-    theirs = torch.randn(700, 3, device=DEVICE)
+    theirs = torch.randn(400, 3, device=DEVICE)
     mine, rate = theirs.clone(), torch.tensor(0.02, device=DEVICE)
     states = {"exp_avg": torch.zeros_like(mine), "exp_avg_sq": torch.zeros_like(mine), "step": rate.new_zeros(())}
     broken = rate.new_zeros(())
     adam = torch.optim.Adam([theirs], lr=0.02, eps=1e-15, fused=True)
-    for step in range(25):
+    for step in range(8):
         theirs.grad = torch.randn_like(theirs) * 10.0 ** -(step % 7)
         rate.fill_(0.02 * 0.9**step)
         adam.param_groups[0]["lr"] = 0.02 * 0.9**step
@@ -151,7 +157,7 @@ def test_adam_steps_agree_with_torch():
     assert broken == 0.0
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1e25])
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf, 1e25])
 @pytest.mark.parametrize("used", [True, False])
 def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
     """Or its square. Triton's kernel does so for good: a later gradient may be finite again."""
@@ -166,7 +172,7 @@ def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
     assert found == [True, False, not used]
 
 
-@pytest.mark.parametrize(("objects", "annotations"), [(1, 1), (3, 20), (40, 700)])
+@pytest.mark.parametrize(("objects", "annotations"), [(3, 20), (40, 300)])
 def test_corrected_poses_and_their_gradients_agree_with_torch(objects, annotations):
     torch.manual_seed(0)
     quats = F.normalize(torch.randn(objects, 4, device=DEVICE), dim=1)
@@ -178,7 +184,7 @@ def test_corrected_poses_and_their_gradients_agree_with_torch(objects, annotatio
     assert_same_gradients([expected, found], [yaw, shifts], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("coefficients", [1, 4, 9])
+@pytest.mark.parametrize("coefficients", [1, 4])
 def test_rotations_of_harmonics_by_quaternions_agree_with_torch(coefficients):
     torch.manual_seed(0)
     quats = F.normalize(torch.randn(40, 4, device=DEVICE), dim=1)
@@ -187,7 +193,7 @@ def test_rotations_of_harmonics_by_quaternions_agree_with_torch(coefficients):
     torch.testing.assert_close(found, rotation_of_harmonics(rotation_matrix(quats), coefficients), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("annotations", [0, 1, 3, 700])
+@pytest.mark.parametrize("annotations", [0, 3, 400])
 def test_penalties_of_tracks_and_their_gradients_agree_with_torch(annotations):
     """Of two tracks with a gap between them."""
     torch.manual_seed(0)
@@ -199,18 +205,14 @@ def test_penalties_of_tracks_and_their_gradients_agree_with_torch(annotations):
     assert_same_gradients(results, [yaw, shifts], atol=1e-3, rtol=1e-4)
 
 
-@pytest.mark.parametrize("degree", [0, 1])
-@pytest.mark.parametrize("coefficients", [1, 4, 9])
-@pytest.mark.parametrize("wider", [False, True])
+@pytest.mark.parametrize(
+    ("degree", "coefficients", "wider"), [(0, 1, False), (1, 4, True), (0, 9, True), (1, 9, False)]
+)
 def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients, wider):
     """Also where the colours are columns of a `wider` tensor."""
-    if degree == 1 and coefficients == 1:
-        pytest.skip("there are none of that degree")
     torch.manual_seed(0)
-    pose = torch.eye(4)
-    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=0).as_matrix())
-    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
-    sizes = ((700, 3), (700, 1, 3), (700, coefficients - 1, 3))
+    pose = a_pose()
+    sizes = ((300, 3), (300, 1, 3), (300, coefficients - 1, 3))
     inputs = [torch.randn(size, device=DEVICE).requires_grad_() for size in sizes]
     basis = sh_basis(coefficients, F.normalize(inputs[0] - pose[:3, 3].to(DEVICE), dim=1))
     used = (degree + 1) ** 2
@@ -219,7 +221,7 @@ def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients, wider)
     with triton(True):
         found = fused_view_colors(*inputs, pose.to(DEVICE), degree)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    beside = torch.ones(700, 1, device=DEVICE)
+    beside = torch.ones(300, 1, device=DEVICE)
     results = [[torch.cat([colors, beside], dim=1) if wider else colors] for colors in (expected, found)]
     assert_same_gradients(results, inputs, atol=1e-4, rtol=1e-4)
 
@@ -234,13 +236,11 @@ def test_no_fused_view_colors_without_triton_or_for_a_learned_camera_or_a_high_d
         assert fused_view_colors(*values, pose, 1) is None
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 2])
 def test_colors_of_all_gaussians_have_all_coefficients(degree):
     """Also of those behind the camera and beside its view."""
     torch.manual_seed(0)
-    pose = torch.eye(4)
-    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
-    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
+    pose = a_pose()
     means, sh = torch.randn(300, 3, device=DEVICE), torch.randn(300, (degree + 1) ** 2, 3, device=DEVICE)
     basis = sh_basis((degree + 1) ** 2, F.normalize(means - pose[:3, 3].to(DEVICE), dim=1))
     expected = ((basis[..., None] * sh).sum(dim=1) + 0.5).clamp(min=0.0)
@@ -263,7 +263,7 @@ def test_colors_of_several_sets_equal_those_of_one():
     torch.testing.assert_close(found[0], found[1])
 
 
-@pytest.mark.parametrize("counts", [(1500,), (1500, 0, 2100), (1, 1)])
+@pytest.mark.parametrize("counts", [(1, 1), (1100, 0, 300)])
 def test_regularized_means_over_sets_and_their_gradients_agree_with_torch(counts):
     torch.manual_seed(0)
     sets = []
@@ -280,8 +280,8 @@ def test_regularized_means_over_sets_and_their_gradients_agree_with_torch(counts
     assert_same_gradients([expected, found], [values for own in sets for values in own], atol=1e-9, rtol=1e-5)
 
 
-@pytest.mark.parametrize("count", [1, 1500])
-def test_the_mean_thickness_and_its_gradient_agree_with_torch(count):
+def test_the_mean_thickness_and_its_gradient_agree_with_torch():
+    count = 1100
     torch.manual_seed(count)
     scales = torch.rand(count, 3, device=DEVICE).requires_grad_()
     expected, found = both_ways(lambda: [mean_thickness(scales)])
@@ -293,8 +293,7 @@ def test_the_mean_thickness_and_its_gradient_agree_with_torch(count):
         assert mean_thickness(broken).isnan()
 
 
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("width", [1, 77])
+@pytest.mark.parametrize(("masked", "width"), [(False, 77), (True, 1), (True, 77)])
 def test_the_entropy_of_alpha_and_its_gradient_agree_with_torch(masked, width):
     torch.manual_seed(width)
     alpha = (1.2 * torch.rand(23, width, device=DEVICE) - 0.1).clamp(0.0, 1.0).requires_grad_()
@@ -312,7 +311,7 @@ def test_the_entropy_of_alpha_and_its_gradient_agree_with_torch(masked, width):
         assert mean_entropy(broken).isnan() and mean_cross_entropy(broken, empty).isnan()
 
 
-@pytest.mark.parametrize(("count", "room"), [(1, 1), (19, 19), (0, 40), (20, 40), (2500, 2500), (1700, 2100)])
+@pytest.mark.parametrize(("count", "room"), [(19, 19), (0, 40), (2500, 2500), (1700, 2100)])
 def test_errors_of_depth_and_their_gradient_agree_with_torch(count, room):
     torch.manual_seed(room)
     depth = (1.0 + 8.0 * torch.rand(60, 50, device=DEVICE)).requires_grad_()
@@ -338,7 +337,7 @@ def test_of_equal_errors_of_depth_those_that_count_share_their_weight():
     torch.testing.assert_close(gradient, torch.full_like(depth, -1.0 / 40.0))
 
 
-@pytest.mark.parametrize("count", [0, 1, 700])
+@pytest.mark.parametrize("count", [0, 300])
 def test_the_response_to_a_lidar_and_its_gradients_agree_with_torch(count):
     torch.manual_seed(count)
     means, sensor = 20.0 * torch.randn(count, 3, device=DEVICE), torch.tensor([1.0, -2.0, 1.8], device=DEVICE)
@@ -350,7 +349,7 @@ def test_the_response_to_a_lidar_and_its_gradients_agree_with_torch(count):
     assert expected[0].shape == (count, 2)
 
 
-@pytest.mark.parametrize("listed", [1, 37, 64])
+@pytest.mark.parametrize("listed", [1, 37])
 def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed, monkeypatch):
     """Triton, and without it numba on the CPU. A road of one cell, with gaps, and of all cells; Gaussians out of reach,
     outside and of opacity 0 among them; more blocks than the sum of all reads at a time."""
@@ -360,10 +359,10 @@ def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed, monk
     normals = F.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.1 * torch.randn(listed, 3), dim=1)
     cells = SparseGrid(torch.tensor([-4.0, -4.0]), 1.0, (8, 8), keys)
     road = Road(cells, normals, 0.1 * torch.randn(listed), torch.rand(listed), 0.4).to(DEVICE)
-    means = torch.rand(1500, 3, device=DEVICE) * torch.tensor([10.0, 10.0, 1.0], device=DEVICE) - 0.5
+    means = torch.rand(800, 3, device=DEVICE) * torch.tensor([10.0, 10.0, 1.0], device=DEVICE) - 0.5
     means[:, :2] -= 4.5
-    scales, quats = 0.3 * torch.rand(1500, 3, device=DEVICE), 2.0 * torch.randn(1500, 4, device=DEVICE)
-    opacities = torch.rand(1500, device=DEVICE)
+    scales, quats = 0.3 * torch.rand(800, 3, device=DEVICE), 2.0 * torch.randn(800, 4, device=DEVICE)
+    opacities = torch.rand(800, device=DEVICE)
     opacities[::3] = 0.0
     inputs = [values.requires_grad_() for values in (means, quats, scales)]
     expected = [by_torch(*inputs, opacities, road)]
@@ -373,10 +372,10 @@ def test_distances_from_a_road_and_their_gradients_agree_with_torch(listed, monk
         assert_same_gradients([[by_torch(*inputs, opacities, road)], found], inputs, atol=1e-7, rtol=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 3])
 def test_an_image_over_a_cube_map_and_its_gradients_agree_with_torch(seed):
-    """For cameras that see edges and corners of the cube, with long focal lengths, which see few texels, and with a
-    rolling shutter."""
+    """For cameras that see edges and corners of the cube, and few texels by a long focal length with a rolling
+    shutter."""
     torch.manual_seed(seed)
     sky = CubemapSky(9, torch.tensor([0.3, 0.5, 0.7]), 1e-2).to(DEVICE)
     texels = sky.params["texels"]
@@ -455,7 +454,7 @@ def test_placed_gaussians_and_their_gradients_agree_with_torch():
     assert_same_gradients(results, [*local, objects.quats, objects.translations], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), (3, 2), (2, 1)])
+@pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), (3, 2)])
 def test_time_varying_colors_and_their_gradients_agree_with_torch(degree, terms):
     torch.manual_seed(1)
     objects, owner, owns = some_objects(requires_grad=False)
@@ -534,7 +533,6 @@ NUMBERS |= dict.fromkeys(("first_count", "last_count", "room", "blocks"), "i32")
 NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range", "per_metre", "per_radian"), "fp32")
 IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
-SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.COLUMNS}
 
 RAYS = {"numbers": "*i32", "values": FLOATS}
 DEPTHS = {"pixels": "*i64", "count": "*i64", "bins": "*i32", "finer": "*i32", "last": FLOATS}
@@ -554,6 +552,9 @@ SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
 
 def compiled(kernel, **constants):
+    # constants that are not given are those of its module
+    own = {p.name: kernel.fn.__globals__.get(p.name) for p in kernel.params if p.is_constexpr}
+    constants = own | constants
     kinds = {name: "constexpr" if name in constants else {**IN, **NUMBERS}.get(name, FLOATS)
              for name in kernel.arg_names}
     if kernel in (cube_map._blend, cube_map._gradients):
@@ -565,74 +566,50 @@ def compiled(kernel, **constants):
     source = ASTSource(fn=kernel, signature=kinds, constexprs=places)
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
 
-compiled(probe._increment)
-for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
-    compiled(view_colors._colors, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
-    compiled(view_colors._colors_backward, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
-for k, degree, depth in ((1, 0, True), (4, 1, True), (4, 0, False), (9, 1, False)):
+for module, names in (
+    (probe, "_increment"), (road_distance, "_distances_backward"), (adam, "_step"), (tiles, "_count_tiles _list"),
+    (lidar_response, "_values _values_backward"), (finite, "_record"), (placement, "_place _place_backward"),
+    (regularizers, "_sums _means _spread _thinnest _spread_to_thinnest"), (depth_error, "_errors _gradients"),
+    (scan_tiles, "_count_tiles _compact _list"), (scan_sums, "_pass"), (scan_compositing, "_arrive"),
+    (exploration, "_move"), (cube_map, "_blend _gradients"), (object_poses, "_correct _correct_backward"),
+    (track_penalties, "_sums _gradients"), (chunks, "count_chunks"),
+):
+    for name in names.split():
+        compiled(getattr(module, name))
+for k, degree in ((1, 0), (9, 1)):
+    for kernel in (view_colors._colors, view_colors._colors_backward):
+        compiled(kernel, OTHERS=k - 1, DEGREE=degree)
+for k, degree, depth in ((1, 0, True), (9, 1, False)):
     for kernel in (colored_projection._project, colored_projection._project_backward):
-        compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth, BLOCK=colored_projection.BLOCK)
-compiled(road_distance._distances, STEPS=17, BLOCK=road_distance.BLOCK)
+        compiled(kernel, OTHERS=k - 1, DEGREE=degree, DEPTH=depth)
+compiled(road_distance._distances, STEPS=17)
 compiled(road_distance._mean, BLOCK=road_distance.SUMS)
-compiled(road_distance._distances_backward, BLOCK=road_distance.BLOCK)
-compiled(adam._step, BLOCK=adam.BLOCK)
-compiled(lidar_response._values, BLOCK=lidar_response.BLOCK)
-compiled(lidar_response._values_backward, BLOCK=lidar_response.BLOCK)
-compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
-compiled(regularizers._means, BLOCK=regularizers.BLOCK)
-compiled(regularizers._spread, BLOCK=regularizers.BLOCK)
-compiled(regularizers._thinnest, BLOCK=regularizers.BLOCK)
-compiled(regularizers._spread_to_thinnest, BLOCK=regularizers.BLOCK)
-for masked in (False, True):
-    compiled(alpha_entropy._sums, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
-    compiled(alpha_entropy._gradients, MASKED=masked, BLOCK=alpha_entropy.BLOCK)
-for kernel in (depth_error._errors, depth_error._gradients):
-    compiled(kernel, BLOCK=depth_error.BLOCK)
+for kernel in (alpha_entropy._sums, alpha_entropy._gradients):
+    compiled(kernel, MASKED=True)
 for kernel in (depth_error._refine, depth_error._sum):
-    compiled(kernel, kept_percent=95, BLOCK=depth_error.BLOCK)
-compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
-compiled(tiles._list, BLOCK=tiles.BLOCK)
-compiled(chunks.count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
+    compiled(kernel, kept_percent=95)
 for kernel in (chunks._split, chunks._sum_copies):
-    compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
+    compiled(kernel, CHANNELS=3)
 for kernel in (joined_chunks._composite, joined_chunks._composite_backward):
-    compiled(kernel, CHANNELS=3, WIDTH=4, DEPTH=False, OBJECTS=False)
     compiled(kernel, CHANNELS=4, WIDTH=4, DEPTH=True, OBJECTS=True)
-for motion, moving, parts in ((True, True, 2), (True, False, 2), (True, True, 1), (False, False, 1)):
-    options = {"WITH_MOTION": motion, "MOVING": moving, "PARTS": parts, "BLOCK": scan_projection.BLOCK}
+for motion, moving, parts in ((True, True, 2), (False, False, 1)):
+    options = {"WITH_MOTION": motion, "MOVING": moving, "PARTS": parts}
     compiled(scan_projection._project, STEPS=4, **options)
     compiled(scan_projection._project_backward, **options)
-compiled(scan_tiles._count_tiles, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
-compiled(scan_tiles._compact, BLOCK=scan_tiles.BLOCK)
-compiled(scan_tiles._list, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
-compiled(scan_chunks._copy, CHANNELS=2, BLOCK=scan_chunks.BLOCK)
-compiled(scan_sums._pass, GROUP=scan_sums.GROUP)
-compiled(scan_compositing._arrive, JOINED=scan_compositing.JOINED)
-compiled(scan_sums._composite, CHANNELS=2, WIDTH=2, GROUP=scan_sums.GROUP)
+compiled(scan_chunks._copy, CHANNELS=2)
+compiled(scan_sums._composite, CHANNELS=2, WIDTH=2)
 for kernel in (scan_compositing._join, scan_gradients.remain):
     compiled(kernel, CHANNELS=2, JOINED=scan_compositing.JOINED)
 compiled(scan_gradients.add_gradients, CHANNELS=2, GROUP=scan_sums.GROUP_BACKWARD)
-compiled(exploration._move, BLOCK=exploration.BLOCK)
-compiled(cube_map._blend, BLOCK=cube_map.BLOCK)
-compiled(cube_map._gradients, BLOCK=cube_map.BLOCK)
-for kernel in (object_poses._correct, object_poses._correct_backward):
-    compiled(kernel, BLOCK=object_poses.BLOCK)
-for k in (1, 4):
-    compiled(object_poses._rotate_harmonics, K=k, OBJECTS=object_poses.OBJECTS)
-for kernel in (track_penalties._sums, track_penalties._gradients):
-    compiled(kernel, BLOCK=track_penalties.BLOCK)
-compiled(finite._record, BLOCK=finite.BLOCK)
-compiled(placement._place, BLOCK=placement.BLOCK)
-compiled(placement._place_backward, BLOCK=placement.BLOCK)
+compiled(object_poses._rotate_harmonics, K=4)
 for kernel in (time_varying_colors._colors, time_varying_colors._colors_backward):
-    for k in (1, 4, 16):
+    for k in (1, 16):
         compiled(kernel, TERMS=5, K=k, PADDED=k, BLOCK=time_varying_colors.PRODUCTS // (4 * k**2))
-compiled(color_difference._window_along_rows, TAPS=11, BLOCK=color_difference.BLOCK)
-compiled(color_difference._means_along_rows, HIDDEN=True, TAPS=11, BLOCK=color_difference.BLOCK)
-compiled(color_difference._means_along_rows, HIDDEN=False, hidden=None, TAPS=11, BLOCK=color_difference.BLOCK)
+compiled(color_difference._window_along_rows, TAPS=11)
+compiled(color_difference._means_along_rows, HIDDEN=True, TAPS=11)
 for kernel in (color_difference._similarity, color_difference._gradient):
-    compiled(kernel, HIDDEN=True, MOVING=True, **SIZES)
-    compiled(kernel, HIDDEN=False, MOVING=False, hidden=None, moving=None, **SIZES)
+    compiled(kernel, HIDDEN=True, MOVING=True, TAPS=11)
+    compiled(kernel, HIDDEN=False, MOVING=False, hidden=None, moving=None, TAPS=11)
 """
 
 

@@ -79,7 +79,7 @@ def disagreements(scene: ScanScene, motion: ScanMotion | None = None) -> dict[st
     return wrong
 
 
-@pytest.mark.parametrize(("beams", "firings"), [(1, 1), (5, 7), (9, 70)])
+@pytest.mark.parametrize(("beams", "firings"), [(1, 1), (9, 40)])
 def test_every_size_of_scan_agrees(beams, firings):
     scene = random_scan(0, n=60, rays=even_rays(beams, firings))
     assert not disagreements(scene)
@@ -105,15 +105,13 @@ def test_moving_sensor_and_gaussians_agree(firings):
     """Also where the halves of a revolution have different numbers of firings, and where there is one half."""
     scene = random_scan(6, n=50, rays=uneven_rays(6, 4, firings))
     velocities = torch.randn(50, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) * 5.0
-    assert not disagreements(scene, MOTION)
-    assert not disagreements(scene, replace(MOTION, velocities=velocities))
+    assert not disagreements(scene, replace(MOTION, velocities=velocities) if firings > 1 else MOTION)
 
 
 @pytest.mark.parametrize(
     "order",
     [
-        pytest.param(torch.arange(79, -1, -1), id="clockwise"),
-        pytest.param(torch.arange(80).roll(37), id="beginning anywhere"),
+        pytest.param(torch.arange(79, -1, -1).roll(37), id="clockwise, beginning anywhere"),
         pytest.param(torch.arange(97) % 80, id="more than a turn"),
         pytest.param(torch.arange(20, 55), id="less than half a turn"),
     ],
@@ -124,7 +122,7 @@ def test_firings_in_any_order_agree(order):
     assert not disagreements(random_scan(4, n=50, rays=part))
 
 
-@pytest.mark.parametrize("channels", [0, 3, 8, 9])
+@pytest.mark.parametrize("channels", [0, 9])
 def test_any_number_of_channels_agrees(channels):
     scene = random_scan(7, n=30, rays=even_rays(3, 40))
     scene.values = torch.from_numpy(np.random.default_rng(channels).normal(size=(30, channels)))

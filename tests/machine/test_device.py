@@ -28,21 +28,9 @@ def a_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (10_000_000_000, 24_000_000_000))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "NVIDIA RTX 4090")
-    install_gsplat(monkeypatch, object())
-
-
-def install_gsplat(monkeypatch, compiled: object) -> None:
-    """Replaces the module that loads gsplat's kernels; an exception as `compiled` is raised by its import."""
     backend = ModuleType("gsplat.cuda._backend")
-
-    def missing(name: str) -> object:
-        raise compiled
-
-    if isinstance(compiled, Exception):
-        backend.__getattr__ = missing
-    else:
-        backend._C = compiled
-    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
+    backend._C = object()
+    monkeypatch.setitem(sys.modules, backend.__name__, backend)
 
 
 def refusal(kind: str = "auto", **settings: float) -> str:
@@ -53,26 +41,26 @@ def refusal(kind: str = "auto", **settings: float) -> str:
     return str(error.value)
 
 
-@pytest.mark.parametrize("kind", ["auto", "cuda"])
-def test_without_a_gpu_nothing_falls_back_to_the_cpu_silently(no_gpu, kind):
-    message = refusal(kind)
-    assert "no usable GPU" in message and "device: cpu" in message
-
-
 @pytest.mark.parametrize(
-    ("cuda", "hip", "expected"),
-    [(None, None, "built without GPU support"), ("13.0", None, "finds no GPU"), (None, "6.4", "finds no GPU")],
+    ("kind", "cuda", "hip", "expected"),
+    [
+        ("auto", None, None, "built without GPU support"),
+        ("cuda", "13.0", None, "finds no GPU"),
+        ("auto", None, "6.4", "finds no GPU"),
+    ],
 )
-def test_without_a_gpu_the_message_names_torch_or_the_driver_as_the_cause(no_gpu, monkeypatch, cuda, hip, expected):
+def test_without_a_gpu_torch_or_the_driver_is_named_and_the_cpu_not_used_silently(
+    no_gpu, monkeypatch, kind, cuda, hip, expected
+):
     monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setattr(torch.version, "hip", hip)
-    message = refusal()
-    assert expected in message and torch.__version__ in message
+    message = refusal(kind)
+    assert all(part in message for part in ("no usable GPU", "device: cpu", expected, torch.__version__))
 
 
 def test_device_cpu_selects_the_cpu(no_gpu):
-    assert choose_device(DeviceSettings(kind="cpu")) == torch.device("cpu")
     assert choose_device(DeviceSettings.model_validate("cpu")) == torch.device("cpu")
+    assert device_name(torch.device("cpu")).startswith("cpu ("), "with its architecture"
 
 
 def test_denormal_numbers_are_zero_once_they_are_flushed():
@@ -86,21 +74,13 @@ def test_denormal_numbers_are_zero_once_they_are_flushed():
         torch.set_flush_denormal(False)
 
 
-@pytest.mark.parametrize("kind", ["auto", "cuda"])
-def test_a_usable_gpu_is_selected(a_gpu, kind):
-    assert choose_device(DeviceSettings(kind=kind)) == torch.device("cuda")
-
-
-def test_too_little_free_memory_is_refused_with_both_numbers(a_gpu):
+def test_a_gpu_is_used_if_it_has_enough_free_memory(a_gpu, caplog):
+    for kind in ("auto", "cuda", "any"):
+        assert choose_device(DeviceSettings(kind=kind, min_free_gb=1.0)) == torch.device("cuda")
+    assert choose_device(DeviceSettings(min_free_gb=500), min_free_gb=0.0) == torch.device("cuda"), "less by a stage"
     message = refusal(min_free_gb=12.5)
-    assert "RTX 4090" in message
-    assert "10.0 GB" in message and "12.5" in message
-    assert "device.min_free_gb" in message and "train.cap_max" in message
-
-
-def test_device_any_falls_back_to_the_cpu_with_a_warning(a_gpu, caplog):
-    assert choose_device(DeviceSettings(kind="any", min_free_gb=1.0)) == torch.device("cuda")
-    assert not caplog.records
+    named = ("RTX 4090", "10.0 GB", "12.5", "device.min_free_gb", "train.cap_max")
+    assert all(part in message for part in named) and not caplog.records
     assert choose_device(DeviceSettings(kind="any", min_free_gb=12.5)) == torch.device("cpu")
     assert "using the CPU" in caplog.text and "12.5" in caplog.text
 
@@ -114,25 +94,19 @@ def test_the_memory_of_a_job_is_limited(a_gpu, monkeypatch, max_gb, fraction):
     assert limits == ([] if fraction is None else [fraction])
 
 
-def test_a_stage_can_lower_the_required_memory(a_gpu):
-    assert choose_device(DeviceSettings(min_free_gb=500), min_free_gb=0.0) == torch.device("cuda")
-
-
-def test_a_failing_import_of_gsplat_is_reported_with_what_to_do(a_gpu, monkeypatch):
+def test_gsplat_that_cannot_be_imported_or_compiled_is_reported_with_what_to_do(a_gpu, monkeypatch):
+    sys.modules["gsplat.cuda._backend"]._C = None
+    message = refusal()
+    assert "nvcc" in message and "toolkit" in message and "device: cpu" in message
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
     message = refusal()
     assert "gsplat cannot be loaded" in message and "reinstall" in message and "device: cpu" in message
 
 
-def test_cuda_without_nvcc_is_reported_with_what_to_do(a_gpu, monkeypatch):
-    install_gsplat(monkeypatch, None)
-    message = refusal()
-    assert "nvcc" in message and "toolkit" in message and "device: cpu" in message
-
-
 @pytest.fixture
 def gsplat_package(a_gpu, monkeypatch, tmp_path):
-    """The GPU of `a_gpu`, of compute capability 8.9, and a gsplat of sources that compiles when imported."""
+    """The GPU of `a_gpu`, of compute capability 8.9, and a gsplat of sources that compiles when imported: Python
+    modules replace its compiled ones."""
     for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(torch.version, "cuda", "13.0")
@@ -143,6 +117,14 @@ def gsplat_package(a_gpu, monkeypatch, tmp_path):
     for folder in (package, package / "cuda"):
         (folder / "__init__.py").touch()
     (package / "cuda/_backend.py").write_text("raise SystemExit('compiles for minutes')")
+    real = importlib.machinery.FileFinder.find_spec
+
+    def sources_first(self, name, target=None):
+        if name == "gsplat.csrc":
+            return importlib.util.spec_from_file_location(name, Path(self.path) / "csrc.py")
+        return real(self, name, target)
+
+    monkeypatch.setattr(importlib.machinery.FileFinder, "find_spec", sources_first)
     yield package
     for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
         del sys.modules[name]
@@ -157,50 +139,38 @@ def compiled_into(package: Path, archs: list[str] | None, code: str = "") -> Non
         (package / RECORD).write_text(json.dumps({"archs": archs, "versions": versions()}))
 
 
-@pytest.fixture
-def loadable(monkeypatch):
-    """Python modules replace compiled ones."""
-    real = importlib.machinery.FileFinder.find_spec
-
-    def sources_first(self, name, target=None):
-        if name == "gsplat.csrc":
-            return importlib.util.spec_from_file_location(name, Path(self.path) / "csrc.py")
-        return real(self, name, target)
-
-    monkeypatch.setattr(importlib.machinery.FileFinder, "find_spec", sources_first)
-
-
 def test_a_run_does_not_start_compiling_gsplat(gsplat_package):
     message = refusal()
     assert "not compiled" in message and "make setup" in message and "make doctor" in message
     assert f"{sys.executable} -m drivesplat.machine.gsplat_build" in message and "device: cpu" in message
 
 
-def test_gsplat_compiled_for_this_gpu_is_used(gsplat_package, loadable):
+def test_gsplat_compiled_for_this_gpu_is_used(gsplat_package):
     compiled_into(gsplat_package, ["7.5", "8.6"])
     assert choose_device(DeviceSettings()) == torch.device("cuda")
 
 
-def test_gsplat_compiled_for_another_gpu_names_both_and_the_command(gsplat_package, loadable):
-    compiled_into(gsplat_package, ["7.5"])
+@pytest.mark.parametrize(
+    ("archs", "code", "words"),
+    [
+        (["7.5"], "", ("RTX 4090", "8.9", 'GSPLAT_ARCHS="7.5;8.9" make setup')),
+        (
+            None,
+            "raise ImportError('undefined symbol: _ZN3c10')",
+            ("gsplat cannot be loaded", "undefined symbol", "make doctor"),
+        ),
+    ],
+)
+def test_gsplat_compiled_for_another_gpu_or_torch_is_refused_and_not_recompiled(gsplat_package, archs, code, words):
+    compiled_into(gsplat_package, archs, code)
     message = refusal()
-    assert "RTX 4090" in message and "8.9" in message and 'GSPLAT_ARCHS="7.5;8.9" make setup' in message
-
-
-def test_compiled_gsplat_that_does_not_load_is_not_recompiled(gsplat_package, loadable):
-    compiled_into(gsplat_package, None, "raise ImportError('undefined symbol: _ZN3c10')")
-    message = refusal()
-    assert "gsplat cannot be loaded" in message and "undefined symbol" in message and "make doctor" in message
+    assert all(word in message for word in words), message
 
 
 def test_on_amd_gsplat_loads_its_own_way(gsplat_package, monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", None)
     (gsplat_package / "cuda/_backend.py").write_text("_C = object()")
     assert choose_device(DeviceSettings()) == torch.device("cuda")
-
-
-def test_the_cpu_is_named_with_its_architecture():
-    assert device_name(torch.device("cpu")).startswith("cpu (")
 
 
 def test_out_of_memory_is_reported_with_what_to_do():

@@ -153,9 +153,7 @@ def test_machines_without_problems_have_none_and_no_findings_on_what_they_do_not
 
 
 def test_amd_is_recognised_from_torch_only():
-    torch = Torch(
-        "2.8.0+rocm6.4", hip="6.4", gpu="AMD Instinct MI300X", capability=(9, 4), free_gb=190.0, total_gb=192.0
-    )
+    torch = Torch("2.8.0+rocm6.4", hip="6.4", gpu="AMD MI300X", capability=(9, 4), free_gb=190.0, total_gb=192.0)
     facts = replace(WORKSTATION, gpus=(), torch=torch, gsplat=Gsplat("1.5.3b2"))
     assert levels(facts) == {"ok"} and of(facts, "CUDA toolkit") == []
     for topic, word in (("torch", "ROCm 6.4"), ("GPU", "MI300X"), ("gsplat", "AMD")):
@@ -166,14 +164,10 @@ def test_amd_is_recognised_from_torch_only():
 
 @pytest.mark.slow
 def test_modules_without_cached_bytecode_are_counted(tmp_path):
-    script = (
-        "import sys, json, http.server; from drivesplat.machine.doctor.facts import _uncached_modules as f; print(f())"
-    )
-    counts = []
-    for keeps in ({"PYTHONDONTWRITEBYTECODE": "1"}, {}, {"PYTHONDONTWRITEBYTECODE": "1"}):
-        clean = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
-        environment = {**clean, "PYTHONPYCACHEPREFIX": str(tmp_path), **keeps}
-        run = [sys.executable, "-c", script]
+    script = "import sys, http.server; from drivesplat.machine.doctor.facts import _uncached_modules as f; print(f())"
+    run, counts = [sys.executable, "-c", script], []
+    for value in ("1", "", "1"):
+        environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path), "PYTHONDONTWRITEBYTECODE": value}
         counts.append(int(subprocess.run(run, env=environment, cwd=REPOSITORY, capture_output=True, check=True).stdout))
     assert counts[0] > 100 and counts[1:] == [0, 0], "none cached; all written; all cached before"
 
@@ -190,17 +184,12 @@ def test_the_config_is_read_with_presets_merged(tmp_path):
     assert examine(found)
 
 
-def test_a_wrong_config_is_a_finding_not_a_crash(tmp_path):
+def test_a_wrong_config_is_a_finding_and_datasets_are_searched_in_its_folders(tiny_root, tmp_path):
     (tmp_path / "bad.yaml").write_text("trian: 1\n")
-    assert "trian" in facts_module._config([tmp_path / "bad.yaml"])[1]
-    assert "absent.yaml" in facts_module._config([tmp_path / "absent.yaml"])[1]
-
-
-def test_datasets_are_searched_in_the_folders_of_the_config(tiny_root, tmp_path):
-    config = load({"datasets": {
-        "tiny": {"dataroot": str(tiny_root), "scenes": ["0001"]}, "gone": {"dataroot": str(tmp_path / "no")}
-    }})  # fmt: skip
-    tiny, gone = facts_module._datasets(config)
+    for name, word in (("bad.yaml", "trian"), ("absent.yaml", "absent.yaml")):
+        assert word in facts_module._config([tmp_path / name])[1]
+    datasets = {"tiny": {"dataroot": str(tiny_root), "scenes": ["0001"]}, "gone": {"dataroot": str(tmp_path / "no")}}
+    tiny, gone = facts_module._datasets(load({"datasets": datasets}))
     assert tiny.root == str(tiny_root) and not tiny.generated
     assert gone.root is None and str(tmp_path / "no") in gone.problem
 
@@ -229,18 +218,19 @@ def test_a_venv_of_other_requirements_is_noticed(tmp_path, monkeypatch):
     assert facts_module._venv_outdated(tmp_path)
 
 
-@pytest.mark.parametrize(("facts", "status"), [(LAPTOP, 0), (replace(LAPTOP, ffmpeg=None), 1)])
-def test_the_exit_status_is_1_if_something_is_broken(monkeypatch, capsys, facts, status):
-    monkeypatch.setattr(facts_module, "gather", lambda *_: facts)
+def test_the_exit_status_is_1_if_something_is_broken(monkeypatch, capsys):
     monkeypatch.chdir(REPOSITORY)
-    assert main([]) == status
-    lines = capsys.readouterr().out.splitlines()
-    assert all(line.split()[0] in ("ok", "note", "fix") for line in lines[:-2])
+    for facts, status in ((LAPTOP, 0), (replace(LAPTOP, ffmpeg=None), 1)):
+        monkeypatch.setattr(facts_module, "gather", lambda *_, facts=facts: facts)
+        assert main([]) == status
+        lines = capsys.readouterr().out.splitlines()
+        assert all(line.split()[0] in ("ok", "note", "fix") for line in lines[:-2])
 
 
 def test_a_python_without_the_packages_says_what_to_do():
     doctor = "drivesplat.machine.doctor.__main__"
-    code = f"import sys; sys.modules['pydantic'] = None; import {doctor} as d; sys.exit(d.main([]))"
+    absent = "sys.modules |= dict.fromkeys(['numpy', 'pydantic', 'torch', 'yaml'])"
+    code = f"import sys; {absent}; import {doctor} as d; sys.exit(d.main([]))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stdout.startswith("fix") and "make setup" in done.stdout
 
@@ -260,17 +250,10 @@ def smi(answers: dict[str, tuple[int, str]]):
 
 def test_gpus_are_read_from_nvidia_smi():
     gpus, problem = read_gpus(smi({"new": (0, "NVIDIA RTX A2000, 580.65.06, 6138, [N/A], 8.6\n")}))
-    assert problem is None
-    assert gpus == [Gpu("NVIDIA RTX A2000", "580.65.06", (8, 6), 6138 * 1024**2 / 1e9, None)]
-
-
-def test_without_compute_capability_in_nvidia_smi_the_driver_is_still_read():
+    assert (gpus, problem) == ([Gpu("NVIDIA RTX A2000", "580.65.06", (8, 6), 6138 * 1024**2 / 1e9, None)], None)
     old = {"new": (2, 'Field "compute_cap" is not a valid field to query.'), "old": (0, "GTX 980, 470.1, 4096, 4000\n")}
     (gpu,), problem = read_gpus(smi(old))
-    assert problem is None and gpu.driver == "470.1" and gpu.capability is None
-
-
-def test_a_failing_or_empty_nvidia_smi_is_a_problem_and_a_missing_one_is_none():
+    assert (problem, gpu.driver, gpu.capability) == (None, "470.1", None), "known without compute capability"
     failing = (9, "NVIDIA-SMI has failed because it couldn't communicate with the NVIDIA driver.")
     assert "couldn't communicate" in read_gpus(smi({"new": failing, "old": failing}))[1]
     assert read_gpus(smi({"new": (0, "")})) == ([], "nvidia-smi reports no GPU")
@@ -281,33 +264,17 @@ def test_a_failing_or_empty_nvidia_smi_is_a_problem_and_a_missing_one_is_none():
     assert read_gpus(absent) == ([], None)
 
 
-@pytest.mark.parametrize(
-    ("capability", "driver", "build"),
-    [
-        ((8, 9), "580.65", "cu130"),
-        ((7, 5), "610.1", "cu130"),
-        ((12, 0), "580.65", "cu130"),
-        ((8, 6), "560.35", "cu126"),
-        ((7, 5), "525.60.13", "cu126"),
-        ((9, 0), "550.1", "cu128"),
-        ((12, 0), "570.1", "cu128"),
-        ((7, 0), "580.65", "cu126"),
-        ((8, 6), "470.1", None),
-        ((6, 1), "580.65", None),
-        ((5, 2), "580.65", None),
-        (None, "580.65", "cu130"),
-        (None, "550.1", "cu126"),
-    ],
-)
-def test_the_best_build_for_gpu_and_driver(capability, driver, build):
-    gpu = Gpu("gpu", driver, capability)
-    assert best_build(gpu) == build
-    if build is not None:
-        assert advice([gpu], build) is None
+def test_the_best_build_for_gpu_and_driver():
+    for capability, driver, build in (
+        ((8, 9), "580.65", "cu130"), ((12, 0), "610.1", "cu130"), ((7, 5), "525.60.13", "cu126"),
+        ((9, 0), "550.1", "cu128"), ((12, 0), "570.1", "cu128"), ((7, 0), "580.65", "cu126"), ((8, 6), "470.1", None),
+        ((6, 1), "580.65", None), (None, "580.65", "cu130"), (None, "550.1", "cu126"), ((8, 6), "560.35", "cu126"),
+    ):  # fmt: skip
+        gpu = Gpu("gpu", driver, capability)
+        assert best_build(gpu) == build, gpu
+        assert build is None or advice([gpu], build) is None
         if build != "cu130":
-            assert f"TORCH_CUDA={build} make setup" in advice([gpu], "cu130")
-    else:
-        assert "TORCH_CUDA=cpu make setup" in advice([gpu], "cu130")
+            assert f"TORCH_CUDA={build or 'cpu'} make setup" in advice([gpu], "cu130"), gpu
 
 
 def test_one_usable_gpu_among_others_suffices_and_a_build_may_be_too_old():

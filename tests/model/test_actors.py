@@ -13,7 +13,7 @@ from torch.nn.functional import one_hot
 from drivesplat.kernels.placement import ObjectPoses, colors_in_object
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix, turned
 from drivesplat.model.actor_placements import ActorPlacement
-from drivesplat.model.actors import Actors, track_penalties
+from drivesplat.model.actors import Actors
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import State
@@ -47,10 +47,6 @@ def car() -> ActorTrack:
     return track_of(motion_through(times, places, 0.4 * times**2, runs=((0, 2), (3, 5))), "car")
 
 
-def constant_colors(degree: int = 1) -> ActorSettings:
-    return ActorSettings(sh_degree=degree, fourier=1)
-
-
 def matrices(quats: torch.Tensor) -> np.ndarray:
     return Rotation.from_quat(quats.detach().double().numpy(), scalar_first=True).as_matrix()
 
@@ -72,15 +68,13 @@ def harmonics_at(actors: Actors, time: float) -> torch.Tensor:
 # ---- mirror images
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 2])
 def test_a_mirrored_vehicle_is_its_mirror_image(degree):
     """In the frame of its box: what is at y is at -y, in its shape and its colours. The other vehicle stays."""
     actors = actors_of(van(), car(), settings=ActorSettings(sh_degree=degree))
     actors.mirrored = torch.full((2,), 0.5)
     state = TimeState(*actors.state(2.7).now)
-    here, found = (
-        actors.sample(State(each)) for each in (state, state._replace(side=torch.tensor([-1.0, 1.0])))
-    )  # fmt: skip
+    here, found = (actors.sample(State(each)) for each in (state, state._replace(side=torch.tensor([-1.0, 1.0]))))
     pose, rows = actors.posed(state).poses, actors.of_track("van")
     turn, place = torch.from_numpy(matrices(pose.quats)[0]).float(), pose.translations[0].detach()
     reflected = turn @ torch.diag(torch.tensor([1.0, -1.0, 1.0])) @ turn.T
@@ -100,53 +94,30 @@ def test_a_mirrored_vehicle_is_its_mirror_image(degree):
 # ---- rotations
 
 
-def test_a_quaternions_left_factor_rotates_after_another():
-    a, b = Rotation.random(20, random_state=1), Rotation.random(20, random_state=2)
-    first, second = (torch.from_numpy(r.as_quat(scalar_first=True)) for r in (b, a))
-    product = (left_factor(second) @ first[..., None])[..., 0]
-    np.testing.assert_allclose(matrices(product), (a * b).as_matrix(), atol=1e-12)
-    torch.testing.assert_close(product.norm(dim=1), torch.ones(20, dtype=torch.float64))
-
-
-def test_a_quaternions_matrix_is_that_of_its_rotation():
-    rotations = Rotation.random(20, random_state=4)
-    found = rotation_matrix(torch.from_numpy(rotations.as_quat(scalar_first=True)))
-    np.testing.assert_allclose(found, rotations.as_matrix(), atol=1e-12)
-
-
-def test_vectors_rotated_back_equal_scipys_inverse():
-    rotations, rng = Rotation.random(20, random_state=3), np.random.default_rng(4)
-    vectors = rng.normal(size=(20, 3))
-    found = rotated_back(torch.from_numpy(rotations.as_quat(scalar_first=True)), torch.from_numpy(vectors))
-    np.testing.assert_allclose(found, rotations.inv().apply(vectors), atol=1e-12)
-
-
-def test_turned_quaternions_rotate_by_themselves_and_then_by_the_turn():
+def test_quaternions_rotate_as_scipys_do():
     """A turn is the axis times the tangent of half the angle: half the rotation vector where it is small."""
-    rotations, rng = Rotation.random(20, random_state=5), np.random.default_rng(6)
-    vectors = rng.normal(size=(20, 3))
+    first, second, vectors = (
+        Rotation.random(20, random_state=1), Rotation.random(20, random_state=2),
+        np.random.default_rng(4).normal(size=(20, 3)),
+    )  # fmt: skip
+    quats, others = (torch.from_numpy(r.as_quat(scalar_first=True)) for r in (first, second))
+    product = (left_factor(quats) @ others[..., None])[..., 0]
+    np.testing.assert_allclose(matrices(product), (first * second).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotation_matrix(quats), first.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotated_back(quats, torch.from_numpy(vectors)), first.inv().apply(vectors), atol=1e-12)
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
     turns = torch.from_numpy(np.tan(angles / 2.0) * vectors / angles)
-    quats = 1.7 * torch.from_numpy(rotations.as_quat(scalar_first=True))
-    expected = (Rotation.from_rotvec(vectors) * rotations).as_matrix()
-    np.testing.assert_allclose(matrices(turned(quats, turns)), expected, atol=1e-12)
-    assert torch.equal(turned(quats, torch.zeros_like(turns)), quats)
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.3, -2.0, np.pi])
-def test_turns_about_the_vertical_are_counterclockwise_from_above(angle):
-    quat = about_vertical(torch.tensor([angle], dtype=torch.float64))
-    np.testing.assert_allclose(matrices(quat)[0], about_z(angle), atol=1e-12)
+    expected = (Rotation.from_rotvec(vectors) * first).as_matrix()
+    np.testing.assert_allclose(matrices(turned(1.7 * quats, turns)), expected, atol=1e-12)
+    for angle in (0.3, -2.0, np.pi):
+        quat = about_vertical(torch.tensor([angle], dtype=torch.float64))
+        np.testing.assert_allclose(matrices(quat)[0], about_z(angle), atol=1e-12)
 
 
 # ---- where they are
 
 
-def linear(values: np.ndarray, slope: float, start: float) -> np.ndarray:
-    return start + slope * values
-
-
-@pytest.mark.parametrize("time", [0.8, 1.0, 1.37, 2.0, 2.9, 3.0, 3.2])
+@pytest.mark.parametrize("time", [0.8, 1.37, 3.0])
 def test_a_turning_actor_is_transformed_by_its_corrected_box(time):
     """Corrections along the world's axes and about the object's vertical, linear in time as its motion is, so that the
     closed form holds between annotations, too."""
@@ -164,23 +135,17 @@ def test_a_turning_actor_is_transformed_by_its_corrected_box(time):
     np.testing.assert_allclose(gaussians.opacities.detach(), 1.0 / (1.0 + np.exp(-p["opacities"])), rtol=1e-5)
 
 
-@pytest.mark.parametrize("index", [0, 2, 4])
-def test_the_correction_of_an_annotation_holds_at_its_time(index):
+@pytest.mark.parametrize("time", [1.0, 1.8, 3.0])
+def test_corrections_hold_at_their_annotations_and_are_weighted_between_them_as_positions_are(time):
     """Whatever those of its neighbours are; a box that is tilted, too, is turned about its own vertical."""
     actors = actors_of(tilted(van()))
-    p, gaussians = doubled(actors), sampled(actors, TIMES[index])
-    box = tilted(van()).motion.object_to_world[index, :3, :3] @ about_z(p["yaw"][index])
-    means = p["means"] @ box.T + TIMES[index] * VELOCITY + p["translation"][index]
+    weights = van().motion.weights(np.array([time]))[0]
+    p, gaussians = doubled(actors), sampled(actors, time)
+    tilt = Rotation.from_euler("y", 0.3).as_matrix()
+    box = about_z(RATE * time) @ tilt @ about_z(weights @ p["yaw"])
+    means = p["means"] @ box.T + time * VELOCITY + weights @ p["translation"]
     np.testing.assert_allclose(gaussians.means.detach(), means, atol=1e-5)
     np.testing.assert_allclose(matrices(gaussians.quats), box @ matrices(actors.params["quats"]), atol=1e-5)
-
-
-def test_between_annotations_corrections_are_weighted_as_positions_are():
-    actors = actors_of(van())
-    weights = van().motion.weights(np.array([1.8]))[0]
-    poses, p = poses_at(actors, 1.8), doubled(actors)
-    np.testing.assert_allclose(poses.translations[0].detach(), 1.8 * VELOCITY + weights @ p["translation"], atol=1e-5)
-    np.testing.assert_allclose(matrices(poses.quats)[0], about_z(RATE * 1.8 + weights @ p["yaw"]), atol=1e-5)
 
 
 def test_actors_can_be_placed_anywhere_and_enlarged():
@@ -203,7 +168,7 @@ def test_actors_can_be_placed_anywhere_and_enlarged():
 
 @pytest.mark.parametrize(
     ("time", "there"),
-    [(0.5, [False, True]), (0.9, [True, True]), (2.0, [True, False]), (3.4, [False, True]), (7.0, [False, False])],
+    [(0.9, [True, True]), (2.0, [True, False]), (7.0, [False, False])],
 )
 def test_absent_actors_keep_their_rows_and_have_no_opacity(time, there):
     actors = actors_of(van(), car(), count=7)
@@ -228,7 +193,7 @@ def alone(actors: Actors, index: int, settings: ActorSettings) -> Actors:
     return one
 
 
-@pytest.mark.parametrize("time", [0.9, 1.9, 3.1])
+@pytest.mark.parametrize("time", [0.9, 3.1])
 def test_several_actors_at_once_are_each_as_alone(time):
     settings = ActorSettings(sh_degree=2)
     actors = actors_of(van(), car(), van(), settings=settings, count=5)
@@ -245,19 +210,7 @@ def test_several_actors_at_once_are_each_as_alone(time):
 # ---- their colours
 
 
-def test_new_actors_have_their_points_colours_at_all_times():
-    rng = np.random.default_rng(3)
-    points, colors = rng.uniform(-1, 1, (9, 3)), rng.uniform(0, 1, (9, 3))
-    actors = Actors.from_points([van()], [points], [colors], ActorSettings(), GaussianSettings())
-    np.testing.assert_allclose(actors.params["means"].detach(), points, atol=1e-6)
-    for time in (1.0, 1.7, 3.0):
-        sh = sampled(actors, time).sh.detach()
-        assert sh.shape == (9, 4, 3)
-        np.testing.assert_allclose(0.5 + 0.28209479 * sh[:, 0], colors, atol=1e-5)
-        np.testing.assert_allclose(sh[:, 1:], 0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize(("time", "progress"), [(0.8, 0.0), (1.0, 0.0), (1.6, 0.3), (2.0, 0.5), (3.0, 1.0), (3.2, 1.0)])
+@pytest.mark.parametrize(("time", "progress"), [(0.8, 0.0), (1.6, 0.3), (3.2, 1.0)])
 def test_colours_are_a_series_of_cosines_over_the_annotations(time, progress):
     """Equation 5 of Street Gaussians, for every coefficient; beyond the annotations the ends' colours stay."""
     actors = actors_of(van(), settings=ActorSettings(fourier=4, sh_degree=1))
@@ -266,24 +219,6 @@ def test_colours_are_a_series_of_cosines_over_the_annotations(time, progress):
     assert f.shape == (6, 4, 4, 3)
     expected = sum(f[:, i] * np.cos(np.pi * i * progress) for i in range(4))
     np.testing.assert_allclose(harmonics_at(actors, time).detach(), expected, atol=1e-5)
-
-
-def test_with_the_constant_term_alone_colours_do_not_change():
-    actors = actors_of(van(), settings=ActorSettings(fourier=5))
-    with torch.no_grad():
-        actors.params["sh0"][:, 1:], actors.params["shN"][:, 1:] = 0.0, 0.0
-    first = harmonics_at(actors, 1.0)
-    assert first.std() > 0.1
-    for time in (1.4, 2.2, 3.0):
-        torch.testing.assert_close(harmonics_at(actors, time), first)
-
-
-def test_each_actors_series_runs_over_its_own_annotations():
-    actors = actors_of(van(), car(), settings=ActorSettings(fourier=2, sh_degree=0))
-    coefficients = actors.params["sh0"][:, :, 0].detach()
-    progress = torch.tensor([0.5, 2.0 / 3.5])[actors.params["owner"]]  # at 2 s, from 1 to 3 and from 0 to 3.5
-    expected = coefficients[:, 0] + coefficients[:, 1] * torch.cos(torch.pi * progress)[:, None]
-    torch.testing.assert_close(harmonics_at(actors, 2.0)[:, 0].detach(), expected)
 
 
 def first_degree(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -306,23 +241,6 @@ def test_an_actor_that_turns_keeps_its_colours_on_its_sides():
         seen.append(first_degree(sampled(actors, time).sh.detach().double().numpy(), directions))
         np.testing.assert_allclose(seen[-1], expected, atol=1e-5)
     assert np.abs(seen[0] - seen[1]).max() > 0.1, "turned far enough to tell"
-
-
-def test_a_passing_camera_sees_front_and_back():
-    """Through the renderer: an object red along its x axis and blue against it, before a camera that it faces and, half
-    a turn later, turns its back on."""
-    motion = motion_through([0.0, 1.0], [[0.0, 0.0, 0.0]] * 2, [0.0, np.pi])
-    actors = actors_of(track_of(motion), count=1, settings=constant_colors(), shaken=False)
-    with torch.no_grad():
-        actors.params["means"].zero_()
-        actors.params["scales"].fill_(np.log(0.5))
-        actors.params["sh0"].zero_()
-        actors.params["shN"][0, 0, 2] = torch.tensor([0.6, 0.0, -0.6])  # times -0.4886 x of the way it is looked along
-    model = SplatModel([actors], None)
-    for time, (red, blue) in ((0.0, (0.5 + 0.2932, 0.5 - 0.2932)), (1.0, (0.5 - 0.2932, 0.5 + 0.2932))):
-        picture = model.render(looking_at([0.0, 0.0, 0.0], [6.0, 0.0, 0.0], time))
-        color = (picture.image[16, 24] / picture.alpha[16, 24]).detach()
-        np.testing.assert_allclose(color, [red, 0.5, blue], atol=5e-3)
 
 
 # ---- what corrects their boxes
@@ -372,17 +290,15 @@ def test_an_image_corrects_positions_and_headings_by_its_gradient():
         torch.testing.assert_close(gradient, found, rtol=1e-5, atol=1e-6)
 
 
-def test_corrections_learn_at_their_own_rates():
+def test_corrections_learn_at_their_own_rates_and_positions_in_proportion_to_the_middling_size_of_the_boxes():
     tracks = TrackSettings(lr_translation=0.02, lr_yaw=0.03)
-    actors = actors_of(van(), settings=ActorSettings(tracks=tracks))
+    bus = track_of(van().motion, "bus", (12.0, 3.0, 4.0))
+    actors = actors_of(van(), car(), bus, settings=ActorSettings(tracks=tracks))
     rates = {name: o.param_groups[0]["lr"] for name, o in make_optimizers(SplatModel([actors], None)).shared[0].items()}
     assert rates == {"translation": 0.02, "yaw": 0.03}
-
-
-def test_positions_learn_in_proportion_to_the_middling_size_of_the_boxes():
-    actors = actors_of(van(), car(), track_of(van().motion, "bus", (12.0, 3.0, 4.0)))
     assert actors.extent == pytest.approx(np.linalg.norm([5.0, 2.0, 2.2]))
     assert actors.learning_rates()["means"] == pytest.approx(1.6e-4 * actors.extent)
+    assert all(value.requires_grad for value in actors.penalties().values())
 
 
 def test_tracks_that_are_not_to_be_corrected_stay_as_they_are():
@@ -402,10 +318,6 @@ def penalties_of(translation: np.ndarray, yaw: np.ndarray, *tracks: ActorTrack, 
     return {name: float(value.detach()) for name, value in actors.penalties().items()}
 
 
-def test_no_corrections_cost_nothing():
-    assert penalties_of(np.zeros((5, 3)), np.zeros(5), van()) == {"track_size": 0.0, "track_bend": 0.0}
-
-
 def test_penalties_are_mean_squares_in_units_of_the_annotation_error():
     rng = np.random.default_rng(7)
     translation, yaw = rng.normal(size=(5, 3)), rng.normal(size=5)
@@ -419,24 +331,13 @@ def test_penalties_are_mean_squares_in_units_of_the_annotation_error():
 
 
 def test_linear_corrections_have_no_bend_penalty():
-    """The van's, and those of the car's two runs: across its gap, and from track to track, they may leap."""
+    """The van's, and those of the car's two runs: across its gap, and from track to track, they may leap. There is none
+    of two annotations."""
     steady = np.concatenate([np.arange(5.0), 20.0 + 3.0 * np.arange(3), -7.0 - np.arange(3)])
     found = penalties_of(steady[:, None] * [0.1, -0.2, 0.3], 0.01 * steady, van(), car())
     assert found["track_bend"] == pytest.approx(0.0, abs=1e-9) and found["track_size"] > 1.0
-
-
-def test_without_three_consecutive_annotations_there_is_no_bend_penalty():
     pair = track_of(motion_through([0.0, 0.5], [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
     assert penalties_of(np.ones((2, 3)), np.ones(2), pair).keys() == {"track_size"}
-
-
-def test_penalties_pull_corrections_back():
-    actors = actors_of(van())
-    sum(actors.penalties().values()).backward()
-    stepped = {name: (value - 1e-3 * value.grad).detach() for name, value in actors.shared.items()}
-    settings = TrackSettings()
-    less = track_penalties(stepped["translation"], stepped["yaw"], actors.timeline.neighbours, settings)
-    assert all(float(less[name]) < float(value.detach()) for name, value in actors.penalties().items())
 
 
 # ---- what else they are asked
@@ -485,14 +386,8 @@ def test_gaussians_that_spread_beyond_their_own_box_shrink():
     torch.testing.assert_close(actors.params["scales"].detach(), again)
 
 
-def test_a_track_knows_its_rows():
-    actors = actors_of(van(), car(), count=3)
-    assert actors.of_track("car").tolist() == [False] * 3 + [True] * 3
-    assert actors.of_track("another") is None
-
-
 @pytest.mark.parametrize(("corrected", "tolerance"), [("steadily", 1e-4), ("anyhow", 0.05)])
-@pytest.mark.parametrize("time", [1.0, 1.6, 2.9])
+@pytest.mark.parametrize("time", [1.6, 2.9])
 def test_rigid_groups_place_actors_as_the_model_does(time, corrected, tolerance):
     """A piece's motion goes through the corrected annotations: as the model's does where corrections change steadily,
     and within centimetres where they leap by 0.1 rad from annotation to annotation."""
@@ -516,8 +411,3 @@ def test_rigid_groups_place_actors_as_the_model_does(time, corrected, tolerance)
         torch.testing.assert_close(piece.gaussians.scales, own.scales.detach())
         torch.testing.assert_close(piece.gaussians.opacities, own.opacities.detach())
         torch.testing.assert_close(piece.gaussians.sh, own.sh.detach())
-
-
-@pytest.mark.parametrize("cap_max", [10, 100])
-def test_densification_respects_the_cap_of_all_actors(cap_max):
-    assert actors_of(van(), count=30, settings=ActorSettings(cap_max=cap_max)).cap_max == cap_max

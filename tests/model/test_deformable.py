@@ -101,30 +101,20 @@ def test_points_outside_the_box_move_with_its_surface():
 def test_gradients_of_the_lattice_are_those_of_finite_differences():
     means, owner, owns, reach = points_and_owners(6)
     generator = torch.Generator().manual_seed(3)
-    inputs = [
-        torch.randn(2, 2, *NODES, 6, generator=generator).double(),
-        torch.randn(2, 2, generator=generator).double(),
-    ]
+    inputs = [torch.randn(2, 2, *size, generator=generator).double() for size in ((*NODES, 6), ())]
     inputs = [value.requires_grad_() for value in (*inputs, means)]
 
     def moved(coefficients, basis, points):
         return moved_by(coefficients, basis, Undeformed(points, owner, owns, reach))
 
-    assert torch.autograd.gradcheck(moved, inputs)
-
-
-def test_equal_nodes_are_smooth():
-    same = torch.ones(2, 3, *NODES, 6) * torch.arange(3.0)[:, None, None, None, None]
-    assert roughness(same) == 0.0
-    same[0, 1, 1, 1, 1, 0] += 1.0
-    assert roughness(same[:, [1]]) > 0.0 and roughness(same[:, [0, 2]]) == 0.0
+    assert torch.autograd.gradcheck(moved, inputs, fast_mode=True)
 
 
 def test_roughness_is_the_mean_squared_difference_between_neighbours_and_has_its_gradient():
     nodes = torch.randn(2, 3, *NODES, 6, generator=torch.Generator().manual_seed(5)).double().requires_grad_()
     expected = sum(nodes.diff(dim=axis).square().mean(dim=(0, 2, 3, 4, 5)).sum() for axis in (2, 3, 4))
     torch.testing.assert_close(roughness(nodes), expected)
-    assert torch.autograd.gradcheck(roughness, nodes)
+    assert torch.autograd.gradcheck(roughness, nodes, fast_mode=True)
 
 
 # ---- the part
@@ -173,14 +163,10 @@ def test_a_longer_stride_and_a_correction_change_the_phase():
     with torch.no_grad():
         part.shared["stride"].fill_(math.log(1.25))
         part.shared["phase"].copy_(0.1 * torch.arange(9))
-    assert float(part.cycles(time_state(part, 2.25)).detach()) == pytest.approx(
-        walked / (1.25 * STRIDE) + 0.45, abs=1e-4
-    )
-    far = ActorPlacement("walker", np.eye(4), walked=1000.0)
-    state = time_state(part, 2.0)._replace(walked=torch.tensor([far.walked]))
-    assert float(part.cycles(state).detach()) == pytest.approx(1000.0 / (1.25 * STRIDE) + 0.8, abs=1e-3), (
-        "the last holds"
-    )
+    recorded, far = time_state(part, 2.25), time_state(part, 2.0)._replace(walked=torch.tensor([1000.0]))
+    assert float(part.cycles(recorded).detach()) == pytest.approx(walked / (1.25 * STRIDE) + 0.45, abs=1e-4)
+    last = 1000.0 / (1.25 * STRIDE) + 0.8  # the last correction holds
+    assert float(part.cycles(far).detach()) == pytest.approx(last, abs=1e-3)
 
 
 def test_gaussians_turn_with_their_limb():
@@ -193,39 +179,32 @@ def test_gaussians_turn_with_their_limb():
     assert turned[:, 0, 2].mean() == pytest.approx(math.sin(0.3), abs=1e-5)
 
 
-def test_a_mirrored_person_is_the_mirror_image_of_half_a_cycle_later():
-    """Of two people, who walk along x, the first is mirrored."""
-    part = people_of(walker("first"), walker("second", 1.1))
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_mirrored_person_is_the_mirror_image_of_half_a_cycle_later(degree):
+    """Of two people, who walk along x, the first is mirrored: places, shapes and colours."""
+    part = people_of(walker("first"), walker("second", 1.1), sh_degree=degree)
     part.mirrored = torch.full((2,), 0.5)
+    with torch.no_grad():
+        part.params["shN"].normal_(generator=torch.Generator().manual_seed(6))
     state, half = time_state(part, 1.3), torch.tensor([0.5 * STRIDE, 0.0])
     later, sides = state._replace(walked=state.walked + half), state._replace(side=torch.tensor([-1.0, 1.0]))
     places = part.posed(state).poses.translations[part.params["owner"]]
     seen = [part.sample(State(each)) for each in (state, later, sides)]
     here, expected, found = (gaussians.means.detach() - places for gaussians in seen)
     _, covariances, mirrored = map(covariances_of, seen)
+    _, colors, shown = (gaussians.sh.detach() for gaussians in seen)
     mirror, first = torch.diag(torch.tensor([1.0, -1.0, 1.0])), part.of_track("first")
     torch.testing.assert_close(found[first], expected[first] @ mirror, atol=1e-5, rtol=0.0)
     torch.testing.assert_close(mirrored[first], mirror @ covariances[first] @ mirror, atol=1e-6, rtol=1e-4)
-    assert torch.equal(found[~first], here[~first]) and torch.equal(mirrored[~first], covariances[~first])
+    torch.testing.assert_close(shown[first], rotated(colors[first], mirror), atol=1e-5, rtol=0.0)
+    for ours, theirs in ((found, here), (mirrored, covariances), (shown, colors)):
+        assert torch.equal(ours[~first], theirs[~first])
     assert (found - here)[first].norm(dim=1).median() > 0.1
 
 
 def covariances_of(gaussians: Gaussians) -> torch.Tensor:
     axes = rotation_matrix(gaussians.quats) * gaussians.scales[:, None]
     return (axes @ axes.mT).detach()
-
-
-@pytest.mark.parametrize("degree", [0, 1])
-def test_colours_are_mirrored_too(degree):
-    part, time = people_of(walker(), sh_degree=degree), 1.3
-    part.mirrored = torch.full((1,), 0.5)
-    with torch.no_grad():
-        part.params["shN"].normal_(generator=torch.Generator().manual_seed(6))
-    state, mirror = time_state(part, time), np.diag([1.0, -1.0, 1.0])
-    half_later = state._replace(walked=state.walked + 0.5 * STRIDE)
-    here, shown = (part.sample(State(s)).sh.detach() for s in (half_later, state._replace(side=-state.side)))
-    expected = rotated(here, torch.from_numpy(mirror))
-    torch.testing.assert_close(shown, expected, atol=1e-5, rtol=0.0)
 
 
 @pytest.mark.parametrize(
@@ -252,26 +231,19 @@ def test_velocities_include_those_of_limbs():
 
 
 def test_edited_actors_move_their_limbs_by_the_distance_that_they_walk():
+    """Copies have their own phase, and scaled people take scaled steps."""
     part, pose = people_of(walker(), fourier=1), walker().motion.poses(np.array([1.0]))[0]
     recorded = sampled(part, 1.0).means.detach()
-    as_recorded = sampled_with(part, 1.0, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
-    torch.testing.assert_close(as_recorded, recorded, atol=1e-4, rtol=0.0)
-    later = sampled_with(part, 2.7, [ActorPlacement("walker", pose, walked=SPEED)]).means.detach()
-    torch.testing.assert_close(later, recorded, atol=1e-4, rtol=0.0)
-    stride_on = sampled_with(part, 2.7, [ActorPlacement("walker", pose, walked=SPEED + STRIDE)]).means.detach()
-    torch.testing.assert_close(stride_on, recorded, atol=1e-3, rtol=0.0)
-    half_on = sampled_with(part, 1.0, [ActorPlacement("walker", pose, walked=SPEED + 0.5 * STRIDE)]).means.detach()
-    assert (half_on - recorded).norm(dim=1).median() > 0.05
 
+    def at(time: float = 1.0, at_pose: np.ndarray = pose, **placement) -> torch.Tensor:
+        return sampled_with(part, time, [ActorPlacement("walker", at_pose, **placement)]).means.detach()
 
-def test_copies_have_their_own_phase_and_scaled_people_take_scaled_steps():
-    part, pose = people_of(walker(), fourier=1), np.eye(4)
-
-    def at(**placement) -> torch.Tensor:
-        return sampled_with(part, 1.0, [ActorPlacement("walker", pose, **placement)]).means.detach()
-
+    for found in (at(walked=SPEED), at(2.7, walked=SPEED), at(2.7, walked=SPEED + STRIDE)):
+        torch.testing.assert_close(found, recorded, atol=1e-3, rtol=0.0)
+    assert (at(walked=SPEED + 0.5 * STRIDE) - recorded).norm(dim=1).median() > 0.05
     torch.testing.assert_close(at(walked=1.0, phase=0.25), at(walked=1.0 + 0.25 * STRIDE), atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(at(walked=2.0, scale=2.0), 2.0 * at(walked=1.0), atol=1e-5, rtol=0.0)
+    enlarged = at(at_pose=np.eye(4), walked=2.0, scale=2.0)
+    torch.testing.assert_close(enlarged, 2.0 * at(at_pose=np.eye(4), walked=1.0), atol=1e-5, rtol=0.0)
     copies = [ActorPlacement("walker", pose, walked=1.0), ActorPlacement("walker", pose, walked=1.0, phase=0.5)]
     first, second = sampled_with(part, 1.0, copies).means.detach().split(40)
     torch.testing.assert_close(first, at(walked=1.0))
@@ -344,37 +316,10 @@ def test_lattices_are_penalised_by_object_and_less_the_more_images_there_are():
         assert penalty_of_lattices(1, 4, scans=40)[name] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name", "row"),
-    [("params", "means", 45), ("shared", "lattice", 1), ("shared", "stride", 1), ("shared", "phase", 12)],
-)
+@pytest.mark.parametrize(("owner", "name", "row"), [("params", "means", 45), ("shared", "phase", 12)])
 def test_tracks_with_a_value_that_is_not_finite_are_named(owner, name, row):
     part = people_of(walker("first"), walker("second"))
     assert part.broken_tracks() == []
     with torch.no_grad():
         getattr(part, owner)[name][row] = math.nan
     assert part.broken_tracks() == ["second"]
-
-
-def test_a_swinging_leg_is_learned():
-    """From where its points are at 40 times; between them it swings on."""
-    track, settings = walker(), DeformableSettings(lattice=LATTICE, fourier=1)
-    rng = np.random.default_rng(5)
-    points = rng.uniform([-0.05, 0.05, -0.9], [0.05, 0.15, 0.0], (60, 3))
-    part = Deformable.from_points([track], [points], [np.full((60, 3), 0.5)], settings, GaussianSettings())
-
-    def truth(time: float) -> torch.Tensor:
-        angle = 0.5 * math.sin(2.0 * math.pi * SPEED * time / STRIDE)
-        return torch.from_numpy(points + np.array([1.0, 0.0, 0.0]) * -angle * points[:, 2:]).float()
-
-    optimizer = torch.optim.Adam([part.shared["lattice"]], lr=0.01)
-    times = rng.uniform(0.0, 4.0, 40)
-    for step in range(400):
-        optimizer.zero_grad()
-        time = times[step % len(times)]
-        (part.local(time_state(part, time)).means - truth(time)).square().sum().backward()
-        optimizer.step()
-    for time in (0.33, 1.71, 3.2):
-        off = (in_box(part, time) - truth(time)).norm(dim=1)
-        moved = (torch.from_numpy(points).float() - truth(time)).norm(dim=1)
-        assert off.mean() < 0.1 * moved.mean() and moved.max() > 0.1

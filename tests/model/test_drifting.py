@@ -8,12 +8,10 @@ import pytest
 import torch
 from helpers.hand_made import looking_at
 from helpers.records import training_record_of
-from helpers.samples import EVERYTHING, sampled
+from helpers.samples import sampled
 
-from drivesplat.io.storage import no_provenance
 from drivesplat.model.background import Background
 from drivesplat.model.build import ModelInit, build_model
-from drivesplat.model.checkpoint import TrainedCheckpoint, read_checkpoint, trained_model, write_checkpoint
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import DriftingSeed, drifting_seed, ego_velocities
 from drivesplat.model.splat_model import SplatModel
@@ -22,7 +20,7 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.drifting import DriftingSeedSettings, DriftingSettings
-from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainJob, TrainSettings
+from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier
 from drivesplat.training.loop import Trainer
@@ -73,34 +71,25 @@ def expected_at(part: Drifting, time: float, min_span: float) -> tuple[np.ndarra
     return np.array(centres), np.array(opacities)
 
 
-@pytest.mark.parametrize("time", [-1.0, 0.5, 2.3, 4.0, 6.5, 8.0])
+@pytest.mark.parametrize("time", [-1.0, 2.3, 8.0])
 def test_a_gaussian_moves_at_its_velocity_and_is_most_opaque_at_its_life_peak(time):
+    """Beyond the training images it goes on, but neither appears nor fades."""
     part = drifting(DriftingSettings(min_span=0.4))
     found = sampled(part, time)
     centres, opacities = expected_at(part, time, 0.4)
     np.testing.assert_allclose(found.means.detach(), centres, atol=1e-5)
     np.testing.assert_allclose(found.opacities.detach(), opacities, atol=1e-6)
-
-
-def test_beyond_the_training_images_gaussians_go_on_but_neither_appear_nor_fade():
-    part = drifting()
-    last, later = sampled(part, SECONDS[1]), sampled(part, SECONDS[1] + 2.0)
-    assert torch.equal(last.opacities, later.opacities) and (last.opacities > 0.0).any()
-    torch.testing.assert_close(later.means - last.means, 2.0 * part.params["velocities"])
+    assert opacities.any()
 
 
 def test_a_gaussian_is_absent_long_before_and_after_its_life_peak():
     part = drifting(DriftingSettings(min_span=0.1), count=1)
+    part.params["spans"].data.fill_(-30.0)
+    torch.testing.assert_close(part.life_spans.detach(), torch.full((1,), 0.1))
     part.params["spans"].data.fill_(np.log(0.2))
     part.params["peaks"].data.fill_(3.0)
     shown = [float(sampled(part, 3.0 + age).opacities[0].detach()) for age in (-0.95, -0.85, 0.0, 0.85, 0.95)]
     assert shown[0] == shown[-1] == 0.0 and 0.0 < shown[1] < 0.02 * shown[2] and shown[3] > 0.0
-
-
-def test_no_life_span_is_below_the_minimum():
-    part = drifting(DriftingSettings(min_span=0.4))
-    part.params["spans"].data.fill_(-30.0)
-    torch.testing.assert_close(part.life_spans.detach(), torch.full((COUNT,), 0.4))
 
 
 def test_velocities_are_differences_of_positions():
@@ -112,8 +101,7 @@ def test_velocities_are_differences_of_positions():
     assert not velocities.requires_grad
 
 
-@pytest.mark.parametrize("name", ["means", "velocities", "peaks", "spans", "opacities"])
-def test_gradients_are_those_of_differences(name):
+def test_gradients_are_those_of_differences():
     part = drifting(count=4).double()
     weights = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
@@ -122,16 +110,16 @@ def test_gradients_are_those_of_differences(name):
         return (found.means * weights).sum() + found.opacities.square().sum()
 
     shown().backward()
-    value, step = part.params[name], 1e-6
-    assert value.grad is not None and value.grad.any()
-    with torch.no_grad():
+    for name in ("means", "velocities", "peaks", "spans", "opacities"):
+        value, step = part.params[name], 1e-6
+        assert value.grad is not None and value.grad.any(), name
         for index in np.ndindex(*value.shape):
-            value[index] += step
-            above = float(shown())
-            value[index] -= 2.0 * step
-            below = float(shown())
-            value[index] += step
-            assert (above - below) / (2.0 * step) == pytest.approx(float(value.grad[index]), abs=1e-5)
+            ends = []
+            for sign in (1.0, -1.0):
+                value.data[index] += sign * step
+                ends.append(float(shown().detach()))
+                value.data[index] -= sign * step
+            assert (ends[0] - ends[1]) / (2.0 * step) == pytest.approx(float(value.grad[index]), abs=1e-5), name
 
 
 def test_what_scans_may_not_change_freely_is_all_that_places_and_opacities_follow_from():
@@ -145,8 +133,7 @@ def test_what_scans_may_not_change_freely_is_all_that_places_and_opacities_follo
 
 
 def driven(speed: float = 8.0, images: int = 9) -> TrainingRecord:
-    """Images of a camera 1.5 m above the ground that looks along the world's x axis, in which it drives; the ground is
-    at -2 m."""
+    """Images of a camera 1.5 m above the ground, at -2 m, that looks along the world's x axis, in which it drives."""
     times = 0.5 * np.arange(images)
     ego = np.tile(np.eye(4), (images, 1, 1))
     ego[:, 0, 3], ego[:, 2, 3] = speed * times, -2.0
@@ -204,6 +191,10 @@ def test_the_number_of_drifting_gaussians_is_a_share_of_all_others():
     assert [part.name for part in model.parts] == ["background", "drifting"]
     assert len(model.parts[1]) == 100 and model.parts[1].cap_max == 200
     assert model.moving().sum() == 100 and model.of_track("drifting") is None
+    no_images = dataclasses.replace(driven(), splits={"train": np.array([], dtype=np.int64)})
+    init = ModelInit(no_images, [], np.full(3, 0.5))
+    without = build_model(init, ("background", "drifting"), "none", TrainSettings())
+    assert [part.name for part in without.parts] == ["background"]
 
 
 def test_drifting_gaussians_are_no_objects_whose_alpha_has_a_loss():
@@ -212,31 +203,6 @@ def test_drifting_gaussians_are_no_objects_whose_alpha_has_a_loss():
     with torch.no_grad():
         picture = model.render(view)
         assert model.objects_alpha(picture, view) is None
-
-
-def test_without_images_nothing_drifts():
-    record = dataclasses.replace(driven(), splits={"train": np.array([], dtype=np.int64)})
-    init = ModelInit(record, [], np.full(3, 0.5))
-    model = build_model(init, ("background", "drifting"), "none", TrainSettings())
-    assert [part.name for part in model.parts] == ["background"]
-
-
-@pytest.mark.parametrize("logits", [None, (0.3, 0.9)])
-def test_a_model_saved_and_rebuilt_is_the_same_to_the_bit(logits, tmp_path):
-    settings = TrainSettings(cap_max=100, drifting=DriftingSettings(min_span=0.7))
-    model = an_untrained_model(settings, lidar_logits=logits)
-    with torch.no_grad():
-        for value in (value for value in model.parameters() if value.requires_grad):
-            value += 0.2 * torch.randn_like(value)
-    job = TrainJob(parts=("background", "drifting"), sky="none", train=settings, random_seed=0)
-    write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, no_provenance()))
-    rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
-    for time in (-0.2, 0.5, 1.3, 3.5, 9.0):
-        ours, again = (it.at(time, EVERYTHING) for it in (model, rebuilt))
-        assert ours.tensors.keys() == again.tensors.keys() and ("lidar_logits" in ours.tensors) == (logits is not None)
-        assert all(torch.equal(values, again.tensors[name]) for name, values in ours.tensors.items())
-    part, again = model.parts[1], rebuilt.parts[1]
-    assert again.definition() == part.definition() and again.learning_rates() == part.learning_rates()
 
 
 def test_densification_copies_motion_and_life_with_each_gaussian(monkeypatch):

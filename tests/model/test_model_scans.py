@@ -39,20 +39,9 @@ def recorded(angle: float = 0.4, beams: int = 5, firings: int = 40, seconds: flo
     empty = np.zeros((beams, firings), dtype=np.float32)
     scan = Scan(ScanRays(azimuths, elevations, empty), empty > 0, empty)
     none = np.full((beams, firings), -1, dtype=np.int16)
+    still = np.zeros(3)
     return RecordedScan(
-        "TOP",
-        0,
-        seconds,
-        0,
-        True,
-        "train",
-        turned(angle),
-        np.zeros(3),
-        np.zeros(3),
-        scan,
-        empty == 0,
-        none,
-        empty > 0,
+        "TOP", 0, seconds, 0, True, "train", turned(angle), still, still, scan, empty == 0, none, empty > 0
     )
 
 

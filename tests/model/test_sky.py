@@ -1,12 +1,10 @@
 """Skies: a cube map without seams, and one colour."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.cube_map import face_coordinates, sampled
 from drivesplat.model.sky import ConstantSky, CubemapSky, shared_vertices
@@ -40,33 +38,16 @@ def surface_points(resolution: int) -> torch.Tensor:
     return points
 
 
-@pytest.mark.parametrize("resolution", [2, 3, 5, 16])
+@pytest.mark.parametrize("resolution", [2, 5])
 def test_texels_are_the_vertices_of_a_grid_on_the_cube(resolution):
+    """Faces share a texel exactly where they meet."""
     index, count = shared_vertices(resolution)
     assert count == 6 * resolution**2 - 12 * resolution + 8
     assert torch.equal(index.unique(), torch.arange(count))
-
-
-@pytest.mark.parametrize("resolution", [2, 3, 5])
-def test_faces_share_a_texel_exactly_where_they_meet(resolution):
-    index, _ = shared_vertices(resolution)
-    same_place = (
-        torch.cdist(surface_points(resolution).reshape(-1, 3), surface_points(resolution).reshape(-1, 3)) < 1e-6
-    )
-    same_texel = index.reshape(-1, 1) == index.reshape(1, -1)
+    points = surface_points(resolution).reshape(-1, 3)
+    same_place, same_texel = torch.cdist(points, points) < 1e-6, index.reshape(-1, 1) == index.reshape(1, -1)
     assert torch.equal(same_place, same_texel)
-
-
-@pytest.mark.parametrize("face", range(6))
-def test_a_ray_along_an_axis_meets_the_centre_of_its_face(face):
-    x, y, z = face_coordinates(torch.tensor(AXES[face], dtype=torch.float32).reshape(1, 1, 3))[0, 0]
-    assert (float(x), float(y)) == (0.0, 0.0)
-    assert (float(z) + 1.0) / 2.0 * 5.0 == pytest.approx(face, abs=1e-5)
-
-
-def test_the_length_of_a_ray_does_not_matter():
-    rays = random_rays(1, 200)
-    torch.testing.assert_close(face_coordinates(rays * 37.0), face_coordinates(rays))
+    assert torch.allclose(random_sky(resolution).directions()[index], surface_points(resolution), atol=1e-6)
 
 
 def test_directions_with_gradient_have_the_same_face_coordinates():
@@ -81,14 +62,14 @@ def test_directions_with_gradient_have_the_same_face_coordinates():
 
 @pytest.mark.parametrize("resolution", [2, 7])
 def test_colours_lie_where_the_layout_says(resolution):
-    """Bilinear interpolation is exact for a function that is linear on the cube's surface."""
+    """Bilinear interpolation is exact for a function that is linear on the cube's surface. Of rays of any length."""
     slope = torch.tensor([[0.9, -0.4, 0.2], [-0.7, 0.8, 0.1], [0.3, 0.5, -1.1]])
     sky = CubemapSky(resolution, torch.full((3,), 0.5), 1e-2)
     with torch.no_grad():
         sky.params["texels"][sky.index] = surface_points(resolution) @ slope
     rays = random_rays(2, 500)
     on_cube = rays / rays.abs().amax(dim=-1, keepdim=True)
-    torch.testing.assert_close(sky.colors(rays), torch.sigmoid(on_cube @ slope), rtol=0, atol=1e-5)
+    torch.testing.assert_close(sky.colors(37.0 * rays), torch.sigmoid(on_cube @ slope), rtol=0, atol=1e-5)
 
 
 def edge_points() -> list[np.ndarray]:
@@ -103,39 +84,12 @@ def edge_points() -> list[np.ndarray]:
     return points
 
 
-@pytest.mark.parametrize("resolution", [2, 8])
-def test_no_seam_shows_at_any_edge_or_corner(resolution):
-    sky = random_sky(resolution)
-    for point in edge_points():
-        aside = np.array(list(itertools.product((-1e-6, 0.0, 1e-6), repeat=3)))
-        around = torch.from_numpy(point + aside).float()[None]
-        faces = face_coordinates(around)[..., 2].unique()
-        assert len(faces) >= 2, "the rays must fall on both sides of the seam"
-        colors = sky.colors(around)[0].detach()
-        assert float((colors.amax(dim=0) - colors.amin(dim=0)).max()) < 1e-4
-
-
-def test_colours_are_continuous_in_the_direction():
-    sky = random_sky(8).requires_grad_(False)
-    rays = random_rays(4, 5000)
-    turn = torch.from_numpy(Rotation.from_rotvec([4e-5, -3e-5, 5e-5]).as_matrix()).float()
-    assert float((sky.colors(rays @ turn.T) - sky.colors(rays)).abs().max()) < 2e-3
-
-
-def test_the_gradient_is_that_of_finite_differences():
-    sky = random_sky(3).double()
-    rays, weights = random_rays(5, 40).double(), torch.from_numpy(np.random.default_rng(6).normal(size=(1, 40, 3)))
-    texels = sky.params["texels"]
-    (sky.colors(rays) * weights).sum().backward()
-    step = 1e-5
-    with torch.no_grad():
-        for i, c in itertools.product(range(len(texels)), range(3)):
-            values = []
-            for sign in (1.0, -1.0):
-                texels[i, c] += sign * step
-                values.append(float((sky.colors(rays) * weights).sum()))
-                texels[i, c] -= sign * step
-            assert float(texels.grad[i, c]) == pytest.approx((values[0] - values[1]) / (2 * step), abs=1e-8)
+def test_no_seam_shows_at_any_edge_or_corner():
+    sky, aside = random_sky(8), np.array(list(itertools.product((-1e-6, 0.0, 1e-6), repeat=3)))
+    around = torch.from_numpy(np.array(edge_points())[:, None] + aside).float()
+    faces, colors = face_coordinates(around)[..., 2], sky.colors(around).detach()
+    assert (faces.amax(dim=1) > faces.amin(dim=1)).all(), "the rays must fall on both sides of the seam"
+    assert float((colors.amax(dim=1) - colors.amin(dim=1)).max()) < 1e-4
 
 
 def test_every_texel_learns_from_an_all_round_view():
@@ -144,8 +98,8 @@ def test_every_texel_learns_from_an_all_round_view():
     assert (sky.params["texels"].grad > 0).all()
 
 
-@pytest.mark.parametrize("color", [(0.2, 0.5, 0.9), (0.75, 0.75, 0.75)])
-def test_a_new_cube_map_has_its_start_colour_in_all_directions(color):
+def test_a_new_cube_map_has_its_start_colour_in_all_directions():
+    color = 0.2, 0.5, 0.9
     colors = CubemapSky(5, torch.tensor(color), 1e-2).colors(random_rays(8, 1000))
     torch.testing.assert_close(colors, torch.tensor(color).expand_as(colors), rtol=0, atol=1e-5)
 
@@ -171,22 +125,11 @@ def test_a_black_or_white_start_can_still_learn(kind, color):
     assert torch.isfinite(gradient).all() and float(gradient.abs().max()) > 1e-3
 
 
-@pytest.mark.parametrize(("kind", "name"), [("constant", "color"), ("cubemap", "texels")])
-def test_learning_rates_are_given_for_every_parameter(kind, name):
+def test_a_sky_learns_and_saves_its_colour_or_its_texels_alone():
     start = torch.full((3,), 0.5)
-    sky = ConstantSky(start, 3e-3) if kind == "constant" else CubemapSky(2, start, 3e-3)
-    assert sky.learning_rates() == {name: 3e-3} and set(sky.params) == {name}
-
-
-def test_only_learned_texels_are_saved():
-    assert set(random_sky(4).state_dict()) == {"params.texels"}
-    assert math.prod(random_sky(4).state_dict()["params.texels"].shape) == 56 * 3
-
-
-@pytest.mark.parametrize("resolution", [2, 5, 16])
-def test_directions_are_those_of_the_texels(resolution):
-    sky = random_sky(resolution)
-    assert torch.allclose(sky.directions()[sky.index], surface_points(resolution), atol=1e-6)
+    for sky, name, size in ((ConstantSky(start, 3e-3), "color", 3), (CubemapSky(4, start, 3e-3), "texels", 56 * 3)):
+        assert sky.learning_rates() == {name: 3e-3}
+        assert {key: value.numel() for key, value in sky.state_dict().items()} == {f"params.{name}": size}
 
 
 def test_sums_are_the_transpose_of_the_interpolation():

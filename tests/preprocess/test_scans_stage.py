@@ -61,10 +61,13 @@ def test_sweeps_between_key_frames_need_to_be_read():
 
 
 def test_a_scan_holds_the_rays_of_the_pattern_with_and_without_a_return(tmp_path):
-    ranges = room()
+    """Points that are not finite are holes."""
+    ranges, x = room(), (directions() * 12.0)[..., 0]
     ranges[1, 3] = ranges[0, 100] = np.nan
-    ranges[2, 50] = 30.0
-    (record,) = scan_records(drive_of(tmp_path, [ranges]), job()).scans
+    ranges[2, 50], x[0, 7] = 30.0, np.nan
+    sweeps = [sweep_of(write_returns(tmp_path / "0.npz", ranges), 0, (1.0, 2.0, 3.0))]
+    (record,) = scan_records(scene_of(sweeps), job()).scans
+    np.testing.assert_allclose(record.sensor_to_world, at((1.0, 2.0, 3.0)))
     scan = record.scan
     np.testing.assert_array_equal(scan.returned, np.isfinite(ranges))
     np.testing.assert_allclose(scan.ranges, np.nan_to_num(ranges), rtol=1e-5)
@@ -72,6 +75,15 @@ def test_a_scan_holds_the_rays_of_the_pattern_with_and_without_a_return(tmp_path
     np.testing.assert_allclose(scan.intensities, 0.5 * np.isfinite(ranges))
     assert record.measured.all() and (record.objects == NO_OBJECT).all() and not scan.rays.offsets_s.any()
     assert not record.linear.any() and not record.angular.any() and record.group == "train"
+    write_returns(tmp_path / "0.npz", room(), x=x.ravel())
+    (record,) = scan_records(scene_of(sweeps), job()).scans
+    assert np.argwhere(~record.scan.returned).tolist() == [[0, 7]]
+
+
+def swept(folder, ranges: np.ndarray, count: int) -> list:
+    """The same sweep at some key frames."""
+    path = write_returns(folder / "each.npz", ranges)
+    return [sweep_of(path, i * KEY_FRAME_US) for i in range(count)]
 
 
 def test_each_return_has_the_object_that_it_lay_in_at_its_own_time(tmp_path):
@@ -85,29 +97,26 @@ def test_each_return_has_the_object_that_it_lay_in_at_its_own_time(tmp_path):
     ranges[2] = np.minimum(ranges[2], to_car)
     ranges[2, STEPS // 2] = 12.0
     spin = dataclasses.replace(SPIN, start_azimuth=0.0)  # clockwise from ahead: the left comes after 3/4 of 0.1 s
-    paths = [write_returns(tmp_path / f"{i}.npz", ranges) for i in range(4)]
-    sweeps = [sweep_of(path, i * KEY_FRAME_US) for i, path in enumerate(paths)]
-    records = scan_records(scene_of(sweeps, cone, moving, lidar=dataclasses.replace(LIDAR, spin=spin)), job())
+    scene = scene_of(swept(tmp_path, ranges, 4), cone, moving, lidar=dataclasses.replace(LIDAR, spin=spin))
+    records = scan_records(scene, job())
     assert records.tracks == ["cone", "car"]
-    record = records.scans[2]
-    beam = record.scan.rays
+    objects, beam = records.scans[2].objects, records.scans[2].scan.rays
     with np.errstate(divide="ignore"):
         x = 7.5 / np.tan(beam.azimuths[2].astype(float))
     seconds = 2 * 0.5 + beam.offsets_s[2].astype(float)
     passing = (np.sin(beam.azimuths[2]) > 0.3) & (ranges[2] < 29.0)
     expected = passing & (np.abs(x - 20.0 * (seconds - 1.0)) < 2.0)
     at_timestamp = passing & (np.abs(x) < 2.0)
-    np.testing.assert_array_equal(record.objects[2] == 1, expected)
+    np.testing.assert_array_equal(objects[2] == 1, expected)
     assert expected.sum() > 10 and (expected != at_timestamp).any()
-    assert (record.objects[[0, 1, 3]] == NO_OBJECT).all(), "above and below it"
-    assert (record.objects[2, ~expected] == NO_OBJECT).all(), "cones are static"
+    assert (objects[[0, 1, 3]] == NO_OBJECT).all(), "above and below it"
+    assert (objects[2, ~expected] == NO_OBJECT).all(), "cones are static"
 
 
 def test_of_two_boxes_around_a_return_the_nearer_one_is_taken(tmp_path):
     far, near = (track_of(name, [(x, 0.0, 0.0)] * 2) for name, x in (("far", 13.0), ("near", 11.0)))
-    paths = [write_returns(tmp_path / f"{i}.npz", room()) for i in range(2)]
-    scene = scene_of([sweep_of(path, i * KEY_FRAME_US) for i, path in enumerate(paths)], far, near)
-    assert scan_records(scene, job()).scans[0].objects[2, STEPS // 2] == 1
+    scans = scan_records(scene_of(swept(tmp_path, room(), 2), far, near), job()).scans
+    assert scans[0].objects[2, STEPS // 2] == 1
 
 
 @pytest.mark.parametrize(
@@ -161,18 +170,17 @@ def test_a_revolution_has_the_firings_that_the_times_of_its_returns_tell(times, 
     assert firings(LidarReturns(np.zeros((9, 3)), offsets_s=offsets_s), stated) == expected
 
 
-BAD = {
-    "no rings and unknown beams": ({"leave_out": ("ring",)}, "rings"),
-    "no finite point": ({"x": np.full(4 * STEPS, np.nan)}, "no return"),
-    "an intensity of NaN": ({"intensity": np.full(4 * STEPS, np.nan)}, "an intensity is not finite"),
-    "ranges of zero": ({"x": np.zeros(4 * STEPS), "y": np.zeros(4 * STEPS), "z": np.zeros(4 * STEPS)}, "needs"),
-    "missing": (None, "is missing"),
-}
-
-
-@pytest.mark.parametrize("fault", BAD)
-def test_a_sweep_that_gives_no_scan_stops_and_is_named_or_is_left_out(fault, tmp_path, caplog):
-    columns, reason = BAD[fault]
+@pytest.mark.parametrize(
+    ("columns", "reason"),
+    [
+        pytest.param({"leave_out": ("ring",)}, "rings", id="no rings and unknown beams"),
+        pytest.param({"x": np.full(4 * STEPS, np.nan)}, "no return", id="no finite point"),
+        pytest.param({"intensity": np.full(4 * STEPS, np.nan)}, "an intensity is not finite", id="an intensity of NaN"),
+        pytest.param(dict.fromkeys("xyz", np.zeros(4 * STEPS)), "needs", id="ranges of zero"),
+        pytest.param(None, "is missing", id="missing"),
+    ],
+)
+def test_a_sweep_that_gives_no_scan_stops_and_is_named_or_is_left_out(columns, reason, tmp_path, caplog):
     scene = drive_of(tmp_path, [room(), room(), room()], lidar=Lidar("top", None, STEPS))
     bad = tmp_path / "1.npz"
     bad.unlink() if columns is None else write_returns(bad, room(), **columns)
@@ -183,6 +191,13 @@ def test_a_sweep_that_gives_no_scan_stops_and_is_named_or_is_left_out(fault, tmp
     assert [scan.sample_index for scan in records.scans] == [0, 2]
     assert any("1.npz" in line and reason in line for line in caplog.messages)
     assert "1 of 3 sweeps of LiDAR top give no scan; they are left out" in caplog.messages
+
+
+def test_a_drive_without_lidar_is_refused_in_a_sentence():
+    with pytest.raises(
+        DatasetError, match=r"scene hand has no LiDAR sweep that gives a scan.* tracks: discovered other"
+    ):
+        scan_records(scene_of([]), job())
 
 
 def test_a_sweep_without_intensities_and_one_with_duplicated_azimuths_are_scans(tmp_path):
@@ -198,21 +213,6 @@ def test_a_sweep_without_intensities_and_one_with_duplicated_azimuths_are_scans(
         assert first.scan.intensities is None and first.scan.returned.all()
         assert second.scan.rays.shape == (len(BEAMS), STEPS)
         np.testing.assert_allclose(second.scan.ranges, 12.0, rtol=1e-5)
-
-
-def test_points_that_are_not_finite_are_holes(tmp_path):
-    scene, x = drive_of(tmp_path, [room()]), (directions() * 12.0)[..., 0].ravel()
-    x[7] = np.nan
-    write_returns(tmp_path / "0.npz", room(), x=x)
-    (record,) = scan_records(scene, job()).scans
-    assert np.argwhere(~record.scan.returned).tolist() == [[0, 7]]
-
-
-def test_a_drive_without_lidar_is_refused_in_a_sentence():
-    with pytest.raises(
-        DatasetError, match=r"scene hand has no LiDAR sweep that gives a scan.* tracks: discovered other"
-    ):
-        scan_records(scene_of([]), job())
 
 
 @pytest.fixture(scope="module")
@@ -255,8 +255,3 @@ def test_a_damaged_range_image_is_named(range_images, tmp_path):
     damaged = dataclasses.replace(scene, sweeps=(dataclasses.replace(sweep, path=str(path)),))
     with pytest.raises(DatasetError, match=r"LiDAR file .*top\.npz is corrupt \(.*azimuth"):
         scan_records(damaged, job())
-
-
-def test_poses_of_the_record_are_those_of_the_sweeps(tmp_path):
-    scene = scene_of([sweep_of(write_returns(tmp_path / "0.npz", room()), 0, (1.0, 2.0, 3.0))])
-    np.testing.assert_allclose(scan_records(scene, job()).scans[0].sensor_to_world, at((1.0, 2.0, 3.0)))

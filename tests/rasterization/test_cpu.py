@@ -1,4 +1,4 @@
-"""The CPU rasterizer against the reference, which test_reference.py compares with closed forms."""
+"""The CPU rasterizer against the reference, in plain torch; test_closed_forms.py compares it with closed forms."""
 
 import multiprocessing
 import os
@@ -72,32 +72,30 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("degree", "antialiased"), [(0, False), (1, True), (2, False), (3, True)])
 def test_harmonics_of_each_degree_agree_in_several_cameras(degree, antialiased):
     scene = with_harmonics(random_scene(degree, n=70, width=39, height=22, cameras=2), degree, degree)
     scene.means[:6, 2] *= -1.0
     assert not disagreements(scene, sh_degree=degree, antialiased=antialiased, with_depth=True)
+    if degree == 3:
+        assert not disagreements(scene, sh_degree=1), "of fewer degrees than there are coefficients"
 
 
-def test_lower_degrees_of_more_coefficients_agree():
-    scene = with_harmonics(random_scene(3, n=40, width=24, height=20), 3, degree=3)
-    assert not disagreements(scene, sh_degree=1)
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("with_depth", [False, True])
-@pytest.mark.parametrize("channels", [1, 3, 7])
+@pytest.mark.parametrize(
+    ("channels", "with_depth", "antialiased"), [(1, True, True), (3, False, False), (7, True, False)]
+)
 def test_any_number_of_channels_agrees(channels, with_depth, antialiased):
     scene = random_scene(channels, n=60, width=37, height=21)
     scene.colors = torch.from_numpy(np.random.default_rng(channels).normal(size=(60, channels)))
     assert not disagreements(scene, with_depth=with_depth, antialiased=antialiased)
 
 
-@pytest.mark.parametrize("seed", [20, 21, 22])
 @pytest.mark.parametrize(("width", "height"), [(5, 3), (16, 32), (17, 50)])
-def test_every_image_size_agrees(seed, width, height):
-    assert not disagreements(random_scene(seed, n=50, width=width, height=height), with_depth=True)
+def test_every_image_size_agrees(width, height):
+    """Of cameras whose axes of the image are not at right angles, and whose principal point is beside the middle."""
+    scene = random_scene(20, n=50, width=width, height=height)
+    scene.Ks[:, 0, 1], scene.Ks[:, 0, 2] = 0.7, 0.1 * width
+    assert not disagreements(scene, with_depth=True)
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -127,15 +125,9 @@ def test_equal_depths_keep_their_order():
 
 def test_rays_that_end_early_agree():
     """With opaque Gaussians in many layers most lists are not processed to their end."""
-    scene = random_scene(32, n=400, width=33, height=20)
-    scene.opacities[:] = torch.linspace(0.6, 1.0, 400)
+    scene = random_scene(32, n=200, width=33, height=20)
+    scene.opacities[:] = torch.linspace(0.6, 1.0, 200)
     assert not disagreements(scene, with_depth=True)
-
-
-def test_skew_and_off_centre_intrinsics_agree():
-    scene = random_scene(33, n=50, width=30, height=20)
-    scene.Ks[:, 0, 1], scene.Ks[:, 0, 2] = 0.7, 3.0
-    assert not disagreements(scene)
 
 
 def test_the_number_of_windows_does_not_change_an_image(monkeypatch):
@@ -167,11 +159,10 @@ def test_without_a_gaussian_in_view_image_and_gradients_are_zero(n):
     assert all((value == 0).all() for value in found.values())
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_float32_agrees_except_for_gaussians_at_the_cut_off(antialiased):
-    scene = with_harmonics(random_scene(36, n=300, width=64, height=48, cameras=2), 36, degree=3)
-    expected = seen_and_gradients(scene, "reference", sh_degree=3, antialiased=antialiased)
-    found = seen_and_gradients(scene.float(), "cpu", sh_degree=3, antialiased=antialiased)
+def test_float32_agrees_except_for_gaussians_at_the_cut_off():
+    scene = with_harmonics(random_scene(36, n=150, width=48, height=32, cameras=2), 36, degree=3)
+    expected = seen_and_gradients(scene, "cpu", sh_degree=3, antialiased=True)
+    found = seen_and_gradients(scene.float(), "cpu", sh_degree=3, antialiased=True)
     for name, truth in expected.items():
         if name != "radii":
             assert found[name].dtype == torch.float32
@@ -202,7 +193,7 @@ def test_gradients_are_those_of_finite_differences(antialiased):
         return rendering.image, rendering.alpha, rendering.depth
 
     assert float(seen(*inputs)[1].detach().mean()) > 0.1
-    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
+    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def test_too_few_coefficients_for_the_degree_are_an_error():
@@ -211,16 +202,14 @@ def test_too_few_coefficients_for_the_degree_are_an_error():
         render(scene, sh_degree=2)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_results_are_bitwise_equal_for_every_run_and_number_of_threads(count):
-    scene = with_harmonics(random_scene(39, n=5000, width=90, height=70), 39, degree=2).float()
+def test_results_are_bitwise_equal_for_every_run_and_number_of_threads():
+    scene = with_harmonics(random_scene(39, n=2500, width=90, height=70), 39, degree=2).float()
     scene.scales = scene.scales * 0.3
-    with threads(1):
-        expected = seen_and_gradients(scene, "cpu", sh_degree=2, with_depth=True)
-    with threads(count):
-        for _ in range(2):
-            found = seen_and_gradients(scene, "cpu", sh_degree=2, with_depth=True)
-            assert all(torch.equal(found[name], value) for name, value in expected.items())
+    results = []
+    for count in (1, 2, 2, 3):
+        with threads(count):
+            results.append(seen_and_gradients(scene, "cpu", sh_degree=2, with_depth=True))
+    assert all(torch.equal(found[name], value) for found in results[1:] for name, value in results[0].items())
 
 
 def test_info_equals_the_references():
@@ -253,13 +242,12 @@ def test_gsplats_default_strategy_reads_info(absgrad):
     assert (state["grad2d"][seen] > 0).sum() > 10
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients(antialiased):
-    scene = random_scene(42, n=6, width=18, height=5, cameras=2)  # two tiles
+def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients():
+    scene = random_scene(42, n=6, width=18, height=3, cameras=2)  # two tiles
     scene.means.requires_grad_()
 
     def rendering_and_loss(backend: str, **options) -> tuple[Rendering, torch.Tensor]:
-        rendering = render(scene, backend, antialiased=antialiased, **options)
+        rendering = render(scene, backend, antialiased=True, **options)
         return rendering, rendering.image.square().sum(dim=-1)
 
     reference, losses = rendering_and_loss("reference")

@@ -8,7 +8,7 @@ import pytest
 import drivesplat.readers
 from drivesplat.errors import DatasetError
 from drivesplat.provenance.code_digest import expanded
-from drivesplat.readers.datasets import LAYOUT, READER, index, layout, reader
+from drivesplat.readers.datasets import LAYOUT, READER, layout, reader
 from drivesplat.readers.sweeps import SWEEP_FILE
 from drivesplat.settings.dataset import DatasetSettings
 
@@ -22,17 +22,6 @@ def test_every_allowed_reader_has_a_package_with_all_modules_and_every_package_i
         assert set(expanded(pattern)) == {pattern.replace("*", name) for name in ALLOWED}
     assert set(expanded(SWEEP_FILE)) <= {SWEEP_FILE.replace("*", name) for name in ALLOWED}
     assert SWEEP_FILE.replace("*", "nuscenes") in expanded(SWEEP_FILE)
-
-
-@pytest.mark.parametrize("name", sorted(ALLOWED))
-def test_the_modules_of_a_reader_have_their_functions(name):
-    assert callable(layout(name).find_root) and callable(layout(name).table_files) and callable(reader(name).read)
-    assert callable(layout(name).camera_names)
-
-
-def test_the_tables_of_nuscenes_are_split_into_scenes_and_other_tables_are_read_whole():
-    assert callable(index("nuscenes").index_tables) and callable(index("nuscenes").scene_file)
-    assert index("unknown") is None
 
 
 @pytest.mark.parametrize("module", [layout, reader])

@@ -3,7 +3,6 @@
 import logging
 import multiprocessing
 import os
-import re
 import shutil
 import signal
 import time
@@ -17,8 +16,8 @@ from helpers.drives import World, write_world
 from helpers.patience import wait_until
 
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.readers.nuscenes.download import console, nuscenes_mini
 from drivesplat.readers.nuscenes.download import fetch as fetching
+from drivesplat.readers.nuscenes.download import nuscenes_mini
 from drivesplat.readers.nuscenes.download.destination import download_job, is_present
 from drivesplat.readers.nuscenes.download.fetch import fetch
 from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
@@ -71,50 +70,39 @@ def refused(what: str, *words: str, call) -> str:
     return message
 
 
-def test_a_valid_archive_becomes_the_dataset_and_leaves_no_other_files(site, world, tmp_path):
+def test_a_valid_archive_becomes_the_dataset_which_is_then_left_unchanged(site, world, tmp_path, capsys):
     root = tmp_path / "data/nuscenes/v1.0-mini"
     download(site.job(root))
     assert files(root) == files(world)
     assert [path.name for path in root.parent.iterdir()] == [root.name]
     assert len(drives.scene_at(root, dataset="nuscenes", sweeps=False).frames) == 3
-
-
-def test_an_existing_dataset_is_left_unchanged_and_nothing_is_fetched(site, tmp_path, capsys):
-    download(site.job(tmp_path / "mini"))
-    (tmp_path / "mini/mine.txt").write_text("mine")
+    (root / "mine.txt").write_text("mine")
     site.asked.clear()
-    download(site.job(tmp_path / "mini"))
+    download(site.job(root))
     assert "already: nothing to do" in capsys.readouterr().err
-    assert site.asked == [] and (tmp_path / "mini/mine.txt").read_text() == "mine"
+    assert site.asked == [] and (root / "mine.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("part_only", [False, True])
-def test_other_data_in_the_folder_are_left_unchanged(site, world, tmp_path, part_only):
-    root = tmp_path / "mini"
-    if part_only:
-        shutil.copytree(world, root)
-        (root / "v1.0-mini/sample.json").unlink()
-    else:
-        root.mkdir()
-        (root / "thesis.tex").write_text("years of work")
-    before = files(root)
-    refused(str(root), "datasets.nuscenes.dataroot", call=lambda: download(site.job(root)))
-    assert files(root) == before and site.asked == []
-
-
-def test_nothing_is_fetched_without_accepted_terms(site, tmp_path):
+def test_other_data_in_the_folder_are_left_unchanged_and_terms_must_be_accepted(site, world, tmp_path):
+    foreign, part = tmp_path / "foreign", Path(shutil.copytree(world, tmp_path / "part"))
+    foreign.mkdir()
+    (foreign / "thesis.tex").write_text("years of work")
+    (part / "v1.0-mini/sample.json").unlink()
+    for root in (foreign, part):
+        before = files(root)
+        refused(str(root), "datasets.nuscenes.dataroot", call=lambda root=root: download(site.job(root)))
+        assert files(root) == before and site.asked == []
     job = site.job(tmp_path / "mini").model_copy(update={"accept_nuscenes_terms": False})
     refused("accept_nuscenes_terms: true", "https://www.nuscenes.org/terms-of-use", call=lambda: download(job))
-    assert site.asked == [] and list(tmp_path.iterdir()) == []
+    assert site.asked == [] and set(tmp_path.iterdir()) == {foreign, part}
 
 
-def test_an_acceptance_of_the_wrong_type_is_refused_with_the_correct_spelling():
-    refused("accept_nuscenes_terms", "write True", call=lambda: load({"accept_nuscenes_terms": "true"}))
-
-
-def test_a_kept_archive_is_unpacked_without_network(site, world, tmp_path):
-    job = site.job(tmp_path / "mini", keep_archive=True)
-    download(job)
+def test_a_kept_archive_is_unpacked_without_network(site, world, tmp_path, caplog):
+    """Without a checksum its size alone is checked."""
+    job = site.job(tmp_path / "mini", keep_archive=True, sha256=None)
+    with caplog.at_level(logging.WARNING):
+        download(job)
+    assert "only the size of" in caplog.text and is_present(job)
     assert [path.name for path in work_folder(job).iterdir()] == ["v1.0-mini.tgz"]
     shutil.rmtree(tmp_path / "mini")
     site.asked.clear()
@@ -166,12 +154,6 @@ def test_bytes_outside_the_requested_range_are_not_appended(plain, tmp_path, kin
     assert plain.ranges_asked == ["bytes=400000-", None] and (tmp_path / "file").read_bytes() == plain.content
 
 
-def test_a_checksum_of_null_warns_and_checks_the_size_only(site, tmp_path, caplog):
-    with caplog.at_level(logging.WARNING):
-        download(site.job(tmp_path / "mini", sha256=None))
-    assert "only the size of" in caplog.text and is_present(site.job(tmp_path / "mini"))
-
-
 def in_a_process(call, *arguments) -> multiprocessing.Process:
     process = multiprocessing.get_context("fork").Process(target=call, args=arguments)
     process.start()
@@ -220,14 +202,6 @@ def test_a_run_killed_while_unpacking_unpacks_again_without_fetching(site, world
     site.asked.clear()
     download(job)
     assert site.asked == [] and files(tmp_path / "mini") == files(world)
-
-
-def test_progress_counts_what_earlier_calls_received(monkeypatch, capsys):
-    monkeypatch.setattr(console, "INTERVAL_S", 0.0)
-    with console.byte_progress("download", 4_000_000_000, 1_000_000_000) as progress:
-        progress.update(1_000_000_000)
-    lines = capsys.readouterr().err.replace("\r", "\n")
-    assert re.search(r"^download: +50%.*\b2\.00G/4\.00G .*B/s\]", lines, re.MULTILINE)
 
 
 def test_the_first_recorded_dataset_of_the_mini_split_is_the_destination():

@@ -4,8 +4,6 @@ import copy
 import dataclasses
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,6 @@ import pytest
 from helpers import REPOSITORY, drives
 from helpers.drives import scene_at
 from helpers.mutations import damages, mutate_json
-from helpers.patience import PATIENCE_S
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
@@ -29,6 +26,8 @@ from drivesplat.scene.scene import Scene
 from drivesplat.settings.extract import SceneSource
 
 pytestmark = pytest.mark.usefixtures("uncompared")
+
+POINTS = np.array([(5.0, 1.0, 0.5), (9.0, -2.0, 0.1)], dtype=[(name, "f4") for name in "xyz"])
 
 
 def source(**changes: Any) -> SceneSource:
@@ -49,28 +48,27 @@ def folder(recorded, tmp_path_factory) -> Path:
     return root
 
 
+COLUMNS = {
+    "frames": ("camera_to_world", "ego_to_world", "intrinsics", "timestamp", "is_key_frame", "sample_index"),
+    "sweeps": ("sensor_to_world", "timestamp", "is_key_frame", "sample_index"),
+    "tracks": ("id", "object_class", "category", "size", "timestamps", "sample_indices", "object_to_world",
+               "visibility"),
+}  # fmt: skip
+
+
 def test_a_written_scene_is_read_back_to_the_last_bit(recorded, folder):
     again = extract_scene(source(), folder)
-    assert len(again.frames) == len(recorded.frames) > 10 and len(again.sweeps) == len(recorded.sweeps) >= 10
-    np.testing.assert_array_equal(again.origin, recorded.origin)
-    np.testing.assert_array_equal(again.key_frame_timestamps, recorded.key_frame_timestamps)
-    assert again.key_frame_hz == recorded.key_frame_hz
-    for name in ("camera_to_world", "ego_to_world", "intrinsics"):
-        for one, other in zip(again.frames, recorded.frames, strict=True):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    for one, other in zip([*again.frames, *again.sweeps], [*recorded.frames, *recorded.sweeps], strict=True):
-        assert (one.timestamp, one.is_key_frame, one.sample_index) == (
-            other.timestamp, other.is_key_frame, other.sample_index,
-        )  # fmt: skip
+    assert len(again.frames) > 10 and len(again.sweeps) >= 10
+    for name in ("origin", "key_frame_timestamps", "key_frame_hz"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(recorded, name))
+    for records, columns in COLUMNS.items():
+        for one, other in zip(getattr(again, records), getattr(recorded, records), strict=True):
+            for name in columns:
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     for one, other in zip(again.sweeps, recorded.sweeps, strict=True):
-        np.testing.assert_array_equal(one.sensor_to_world, other.sensor_to_world)
         mine, theirs = read_returns(one), read_returns(other)
         for field in ("points", "intensity", "rings"):
             np.testing.assert_array_equal(getattr(mine, field), getattr(theirs, field))
-    for one, other in zip(again.tracks, recorded.tracks, strict=True):
-        assert (one.id, one.object_class, one.category) == (other.id, other.object_class, other.category)
-        for field in ("size", "timestamps", "sample_indices", "object_to_world", "visibility"):
-            np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
 
 
 def test_a_track_that_is_absent_at_one_key_frame_stays_absent(recorded, tmp_path):
@@ -80,6 +78,8 @@ def test_a_track_that_is_absent_at_one_key_frame_stays_absent(recorded, tmp_path
     broken = dataclasses.replace(track, **{name: getattr(track, name)[kept] for name in columns})
     scene = dataclasses.replace(recorded, tracks=(broken,))
     write_drive(scene, tmp_path / "again")
+    with pytest.raises(DatasetError, match="is not empty"):
+        write_drive(scene, tmp_path / "again")
     (again,) = read(tmp_path / "again", source()).tracks
     np.testing.assert_array_equal(again.sample_indices, broken.sample_indices)
     np.testing.assert_array_equal(again.object_to_world, broken.object_to_world)
@@ -110,148 +110,131 @@ def content(folder) -> dict[str, Any]:
 
 def test_what_a_person_writes_by_hand(content, folder, tmp_path):
     """Ego poses at 20 Hz as quaternions, no marks, no own poses, boxes at the drive's own times, and PLY sweeps."""
-    drive = tmp_path / "mine"
-    (drive / "sweeps").mkdir(parents=True)
-    (drive / "images").symlink_to(folder / "0001/images")
+    (tmp_path / "images").symlink_to(folder / "0001/images")
     first = content["frames"][0]
     begin, end = first["timestamp"] - 50_000, content["frames"][-1]["timestamp"] + 50_000
+    upright = [1.0, 0.0, 0.0, 0.0]
     poses = [
-        {"timestamp": t, "translation": [8.0 * (t - begin) * 1e-6, 100.0, 0.0], "rotation": [1.0, 0.0, 0.0, 0.0]}
+        {"timestamp": t, "translation": [8.0 * (t - begin) * 1e-6, 100.0, 0.0], "rotation": upright}
         for t in range(begin, end + 50_000, 50_000)
     ]
-    points = np.array([(5.0, 1.0, 0.5), (9.0, -2.0, 0.1)], dtype=[(name, "f4") for name in "xyz"])
-    PlyData([PlyElement.describe(points, "vertex")]).write(drive / "sweeps/one.ply")
+    boxes = [
+        {"timestamp": t, "translation": [20.0, 100.0, 0.7], "rotation": upright} for t in range(begin, end, 500_000)
+    ]
+    PlyData([PlyElement.describe(POINTS, "vertex")]).write(tmp_path / "one.ply")
     record = {
-        "format": "drivesplat drive",
-        "version": 1,
-        "cameras": content["cameras"],
-        "lidars": {"top": {"sensor_to_ego": {"translation": [0, 0, 1.8], "rotation": [1, 0, 0, 0]}}},
-        "ego_poses": poses,
+        "format": "drivesplat drive", "version": 1, "cameras": content["cameras"], "ego_poses": poses,
+        "lidars": {"top": {"sensor_to_ego": {"translation": [0, 0, 1.8], "rotation": upright}}},
         "frames": [{key: frame[key] for key in ("camera", "timestamp", "file")} for frame in content["frames"]],
-        "sweeps": [{"lidar": "top", "timestamp": first["timestamp"], "file": "sweeps/one.ply"}],
-        "tracks": [
-            {
-                "id": "car",
-                "class": "car",
-                "size": [4.0, 2.0, 1.5],
-                "poses": [
-                    {"timestamp": t, "translation": [20.0, 100.0, 0.7], "rotation": [1, 0, 0, 0]}
-                    for t in range(begin, end, 500_000)
-                ],
-            }
-        ],
-    }
-    (drive / "drive.json").write_text(json.dumps(record), encoding="utf-8")
-    scene = extract_scene(source(), drive)
+        "sweeps": [{"lidar": "top", "timestamp": first["timestamp"], "file": "one.ply"}],
+        "tracks": [{"id": "car", "class": "car", "size": [4.0, 2.0, 1.5], "poses": boxes}],
+    }  # fmt: skip
+    (tmp_path / "drive.json").write_text(json.dumps(record), encoding="utf-8")
+    scene = extract_scene(source(scene=tmp_path.name), tmp_path)
     assert len(scene.key_frame_timestamps) == len(scene.frames) == len(content["frames"])
     np.testing.assert_allclose(scene.origin, [8.0 * 0.05, 100.0, 0.0], atol=1e-12)
     for frame in scene.frames:
         seconds = (frame.timestamp - first["timestamp"]) * 1e-6
         np.testing.assert_allclose(frame.ego_to_world[:3, 3], [8.0 * seconds, 0.0, 0.0], atol=1e-9)
-    (sweep,) = scene.sweeps
+    (sweep,), (track,) = scene.sweeps, scene.tracks
     assert sweep.is_key_frame and sweep_fault(sweep) is None
     np.testing.assert_allclose(read_returns(sweep).points, [(5.0, 1.0, 0.5), (9.0, -2.0, 0.1)], atol=1e-6)
-    (track,) = scene.tracks
     assert track.category == "car" and set(track.visibility) == {0} and len(track.timestamps) > 5
 
 
-@pytest.mark.parametrize(
-    ("times", "marked", "between", "expected"),
-    [
-        ([0, 100, 205, 300], [None] * 4, False, [(0, 0, True), (2, 1, True)]),
-        ([0, 100, 205, 300], [None] * 4, True, [(0, 0, True), (1, 0, False), (2, 1, True)]),
-        ([0, 100, 205, 300], [True, True, False, False], False, [(0, 0, True), (1, 1, True)]),
-        ([350, 400], [None] * 2, False, []),
-        ([], [], True, []),
-    ],
-)
-def test_the_recording_of_a_key_frame_is_the_nearest_within_half_an_interval(times, marked, between, expected):
-    assert chosen_recordings(times, marked, np.array([0, 200]), between) == expected
+def test_the_recording_of_a_key_frame_is_the_nearest_within_half_an_interval():
+    key_frames, times = np.array([0, 200]), [0, 100, 205, 300]
+    for marked, between, expected in (
+        ([None] * 4, False, [(0, 0, True), (2, 1, True)]),
+        ([None] * 4, True, [(0, 0, True), (1, 0, False), (2, 1, True)]),
+        ([True, True, False, False], False, [(0, 0, True), (1, 1, True)]),
+    ):
+        assert chosen_recordings(times, marked, key_frames, between) == expected
+    assert chosen_recordings([350, 400], [None] * 2, key_frames, False) == []
+    assert chosen_recordings([], [], key_frames, True) == []
+
+
+CAMERA, FRAME, TRACK = "cameras.CAM_FRONT", "frames.0", "tracks.0"
+
+
+def with_value(content: dict[str, Any], place: str, value: Any) -> dict[str, Any]:
+    """A copy of a record with another value at a place: `value`, or what it makes of the one that is there."""
+    changed = copy.deepcopy(content)
+    *way, last = (int(key) if key.isdigit() else key for key in place.split("."))
+    holder: Any = changed
+    for key in way:
+        holder = holder[key]
+    holder[last] = value(holder[last]) if callable(value) else value
+    return changed
+
+
+def timed(factor: int, divisor: int = 1):
+    return lambda records: [{**one, "timestamp": one["timestamp"] * factor // divisor} for one in records]
 
 
 FAULTS = {
-    "not a drive": (lambda d: d.update(format="nuscenes"), "format is 'nuscenes'"),
-    "another key": (lambda d: d.update(camera={}), "camera is no key of the format"),
-    "seconds": (
-        lambda d: [f.update(timestamp=f["timestamp"] // 10**6) for f in d["frames"]],
-        "timestamps must be microseconds",
-    ),
-    "nanoseconds of a camera": (
-        lambda d: [f.update(timestamp=f["timestamp"] * 1000) for f in d["frames"]],
-        "frames of camera CAM_FRONT span",
-    ),
-    "milliseconds of sweeps": (
-        lambda d: [s.update(timestamp=s["timestamp"] // 1000) for s in d["sweeps"]],
-        "sweeps of lidar LIDAR_TOP are",
-    ),
-    "a name that no file can have": (lambda d: d["frames"][0].update(file="a" * 300), "no file can have it"),
+    "not a drive": ("format", "nuscenes", "format is 'nuscenes'"),
+    "another key": ("camera", {}, "camera is no key of the format"),
+    "seconds": ("frames", timed(1, 10**6), "timestamps must be microseconds"),
+    "nanoseconds of a camera": ("frames", timed(1000), "frames of camera CAM_FRONT span"),
+    "milliseconds of sweeps": ("sweeps", timed(1, 1000), "sweeps of lidar LIDAR_TOP are"),
+    "a name that no file can have": (f"{FRAME}.file", "a" * 300, "no file can have it"),
     "key frames out of order": (
-        lambda d: d["key_frames"].__setitem__(slice(3), d["key_frames"][2::-1]),
-        "key_frames[2]: its timestamp is not later",
+        "key_frames", lambda times: [*times[2::-1], *times[3:]], "key_frames[2]: its timestamp is not later",
     ),
     "a mirrored camera": (
-        lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
+        f"{CAMERA}.sensor_to_ego.rotation", [[1, 0, 0], [0, 1, 0], [0, 0, -1]],
         "cameras.CAM_FRONT: its transform mirrors",
     ),
     "K of another image": (
-        lambda d: d["cameras"]["CAM_FRONT"].update(K=[[1e-300, 0, 40], [0, 60, 27], [0, 0, 1]]),
+        f"{CAMERA}.K", [[1e-300, 0, 40], [0, 60, 27], [0, 0, 1]],
         "its focal length is 1e-300 pixels; images of 96x54",
     ),
     "coefficients": (
-        lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "fisheye", "coefficients": [0.1]}),
+        f"{CAMERA}.distortion", {"model": "fisheye", "coefficients": [0.1]},
         "distortion fisheye has 1 coefficients; it takes 4",
     ),
     "degrees": (
-        lambda d: d["lidars"]["LIDAR_TOP"].update(beam_elevations=[-30.7, -10.0, 10.7]),
+        "lidars.LIDAR_TOP.beam_elevations", [-30.7, -10.0, 10.7],
         "lidars.LIDAR_TOP: its beam_elevations reach 30.7; they are radians",
     ),
     "a lens that folds": (
-        lambda d: d["cameras"]["CAM_FRONT"].update(
-            distortion={"model": "angle_to_radius", "coefficients": [d["cameras"]["CAM_FRONT"]["K"][0][0], 0.0, -200.0]}
-        ),
+        f"{CAMERA}.distortion", {"model": "angle_to_radius", "coefficients": [0.62 * 96, 0.0, -200.0]},
         "cameras.CAM_FRONT: its distortion folds",
     ),
     "a polynomial of another lens": (
-        lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "radius_to_angle", "coefficients": [0.3]}),
+        f"{CAMERA}.distortion", {"model": "radius_to_angle", "coefficients": [0.3]},
         "cameras.CAM_FRONT: K states a focal length of",
     ),
-    "another camera": (lambda d: d["frames"][0].update(camera="left"), "camera 'left' is not in cameras"),
-    "a file outside": (
-        lambda d: d["frames"][0].update(file="../x.jpg"),
-        "its file '../x.jpg' must be a path below the dataset's root",
-    ),
+    "another camera": (f"{FRAME}.camera", "left", "camera 'left' is not in cameras"),
+    "a file outside": (f"{FRAME}.file", "../x.jpg", "its file '../x.jpg' must be a path below the dataset's root"),
     "no pose": (
-        lambda d: d["frames"][0].update(ego_to_world=None, camera_to_world=None),
+        FRAME, lambda frame: {**frame, "ego_to_world": None, "camera_to_world": None},
         "frames[0]: there are no ego_poses",
     ),
-    "two tracks of one id": (lambda d: d["tracks"].append(d["tracks"][0]), "another track has this id"),
-    "a track out of order": (lambda d: d["tracks"][0]["poses"].reverse(), "not later than that of the one before"),
-    "a flat box": (
-        lambda d: d["tracks"][0].update(size=[4.0, 0.0, 1.5]),
-        "it must be three positive numbers of metres",
-    ),
-    "an unknown class": (lambda d: d["tracks"][0].update({"class": "lorry"}), "tracks[0].class is 'lorry'"),
-    "no frames": (lambda d: d.update(frames=[], sweeps=[]), "frames: there is none"),
-}
+    "two tracks of one id": ("tracks", lambda tracks: [*tracks, tracks[0]], "another track has this id"),
+    "a track out of order": (f"{TRACK}.poses", lambda poses: poses[::-1], "not later than that of the one before"),
+    "a flat box": (f"{TRACK}.size", [4.0, 0.0, 1.5], "it must be three positive numbers of metres"),
+    "an unknown class": (f"{TRACK}.class", "lorry", "tracks[0].class is 'lorry'"),
+    "no recordings": ("frames", [], "frames: there is none"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_every_fault_is_a_sentence_of_the_checker_and_stops_the_reader(fault, content, folder, tmp_path, capsys):
-    changed = copy.deepcopy(content)
-    change, words = FAULTS[fault]
-    change(changed)
+def test_every_fault_is_a_sentence_of_the_checker_and_stops_the_reader(fault, content, tmp_path, capsys):
+    place, value, words = FAULTS[fault]
+    changed = with_value(content, place, value) | ({"sweeps": []} if fault == "no recordings" else {})
     mine = tmp_path / "0001"
     mine.mkdir()
     (mine / "drive.json").write_text(json.dumps(changed), encoding="utf-8")
     assert main(["check", str(mine)]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert any(words in line for line in lines), lines
-    with pytest.raises(DatasetError) as stopped:
+    with pytest.raises(DatasetError, match=r"drive\.json"):
         extract_scene(source(), tmp_path)
-    assert "drive.json" in str(stopped.value)
 
 
-@damages(60, 200)
+@damages(25, 200)
 def test_mutated_files_end_with_a_sound_scene_or_sentences(content, tmp_path, random):
     """Whatever is accepted is finite, in order, and of the drive's cameras."""
     path = tmp_path / "drive.json"
@@ -268,18 +251,15 @@ def test_mutated_files_end_with_a_sound_scene_or_sentences(content, tmp_path, ra
     assert all((track.size > 0).all() and np.isfinite(track.object_to_world).all() for track in scene.tracks)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "is not JSON"), ("[1]", "the file is [1]"), ("{" + "\"a\": [" * 200_000, "is not JSON"),
-        ('{"format": NaN}', "format is nan"),
-    ],
-)  # fmt: skip
-def test_a_file_that_is_no_record_is_refused_in_a_sentence(text, words, tmp_path):
-    (tmp_path / "drive.json").write_text(text, encoding="utf-8")
-    with pytest.raises(DatasetError) as stopped:
-        read(tmp_path, source())
-    assert words in str(stopped.value)
+def test_a_file_that_is_no_record_is_refused_in_a_sentence(tmp_path):
+    deep = '{"a": ' + "[" * 200_000
+    for text, words in (
+        ("", "is not JSON"), ("[1]", "the file is [1]"), (deep, "is not JSON"), ('{"format": NaN}', "format is nan"),
+    ):  # fmt: skip
+        (tmp_path / "drive.json").write_text(text, encoding="utf-8")
+        with pytest.raises(DatasetError) as stopped:
+            read(tmp_path, source())
+        assert words in str(stopped.value)
 
 
 def test_the_checker_draws_a_picture_of_a_sound_folder(folder, tmp_path, capsys):
@@ -293,28 +273,23 @@ def test_the_checker_draws_a_picture_of_a_sound_folder(folder, tmp_path, capsys)
     assert 100 < boxes.sum() < 20_000
 
 
-@pytest.mark.parametrize(
-    ("columns", "words"),
-    [
+def test_a_sweep_that_cannot_be_is_named(recorded, tmp_path):
+    sweep = dataclasses.replace(recorded.sweeps[0], path=str(tmp_path / "sweep.npz"), reader="drive")
+    for columns, words in (
         ({"x": [1.0], "y": [2.0]}, "it has no z"),
         ({"x": [1.0], "y": [2.0], "z": [3.0, 4.0]}, "its columns have 1, 2 rows"),
         ({"x": [1e11], "y": [0.0], "z": [0.0]}, "a return is 1e+11 m away"),
         ({"x": [1.0], "y": [0.0], "z": [0.0], "intensity": [200.0]}, "divide them"),
         ({"x": [np.nan], "y": [0.0], "z": [0.0]}, "it has no return with finite coordinates"),
+        ({"x": [1001.0], "y": [0.0], "z": [0.0]}, "a return is 1e+03 m away"),
+        ({"x": [1.0], "y": [0.0], "z": [0.0], "intensity": [np.nan]}, "intensit"),
+        ({"x": [1.0], "y": [0.0], "z": [0.0], "time": [np.inf]}, "time"),
+        ({"x": [999.0], "y": [0.0], "z": [0.0]}, ""),
         ({"x": [], "y": [], "z": []}, "is empty"),
         ({"x": ["a"], "y": ["b"], "z": ["c"]}, "no column of numbers"),
-    ],
-)
-def test_a_sweep_that_cannot_be_is_named(columns, words, recorded, tmp_path):
-    path = tmp_path / "sweep.npz"
-    np.savez(path, **{name: np.array(values) for name, values in columns.items()})
-    sweep = recorded.sweeps[0].__class__(**{**vars(recorded.sweeps[0]), "path": str(path), "reader": "drive"})
-    assert words in (sweep_fault(sweep) or "")
-
-
-def test_a_folder_that_is_not_empty_is_not_written_into(recorded, folder):
-    with pytest.raises(DatasetError, match="is not empty"):
-        write_drive(recorded, folder / "0001")
+    ):
+        np.savez(sweep.path, **{name: np.array(values) for name, values in columns.items()})
+        assert words in (sweep_fault(sweep) or "")
 
 
 def test_the_converter_of_the_documentation_writes_a_sound_folder(tmp_path, monkeypatch, capsys):
@@ -322,12 +297,11 @@ def test_the_converter_of_the_documentation_writes_a_sound_folder(tmp_path, monk
     (converter,) = (code for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "drive.json" in code)
     for name in ("front", "top"):
         (tmp_path / "monday" / name).mkdir(parents=True)
-    points = np.array([(5.0, 1.0, 0.5), (9.0, -2.0, 0.1)], dtype=[(name, "f4") for name in "xyz"])
     rows = ["timestamp,x,y,z,qw,qx,qy,qz"]
     for i in range(5):
         time = 1_700_000_000_000_000 + 500_000 * i
         Image.new("RGB", (1600, 900), (50 * i, 90, 120)).save(tmp_path / f"monday/front/{time}.jpg")
-        PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / f"monday/top/{time}.ply")
+        PlyData([PlyElement.describe(POINTS, "vertex")]).write(tmp_path / f"monday/top/{time}.ply")
         rows.append(f"{time},{4.0 * i},0.0,0.0,1,0,0,0")
     (tmp_path / "monday/poses.csv").write_text("\n".join(rows))
     monkeypatch.chdir(tmp_path)
@@ -339,20 +313,25 @@ def test_the_converter_of_the_documentation_writes_a_sound_folder(tmp_path, monk
     np.testing.assert_allclose(scene.frames[2].camera_to_world[:3, 2], [1.0, 0.0, 0.0], atol=1e-9), "it looks ahead"
 
 
+def rewritten(folder: Path, path: Path, content: dict[str, Any]) -> Path:
+    """Another record beside the images and sweeps of the drive."""
+    path.mkdir()
+    for name in ("images", "sweeps"):
+        (path / name).symlink_to(folder / "0001" / name)
+    (path / "drive.json").write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
 @pytest.fixture
 def lidar_alone(content, folder, tmp_path) -> Path:
     """The drive without cameras and images."""
-    mine = tmp_path / "0001"
-    mine.mkdir()
-    (mine / "sweeps").symlink_to(folder / "0001/sweeps")
     less = {key: value for key, value in content.items() if key not in ("cameras", "frames", "key_frames", "origin")}
-    (mine / "drive.json").write_text(json.dumps(less), encoding="utf-8")
-    return mine
+    return rewritten(folder, tmp_path / "0001", less)
 
 
-def test_lidar_alone_is_read(lidar_alone, recorded):
+def test_lidar_alone_is_read_checked_and_drawn_from_above(lidar_alone, recorded, capsys):
     """Its key frames are the sweeps, and its world begins at the first one."""
-    scene = read(lidar_alone, source())
+    scene = extract_scene(source(cameras=()), lidar_alone)
     assert scene.frames == scene.cameras == () and [lidar.name for lidar in scene.lidars] == ["LIDAR_TOP"]
     np.testing.assert_array_equal(scene.key_frame_timestamps, [sweep.timestamp for sweep in recorded.sweeps])
     assert all(sweep.is_key_frame for sweep in scene.sweeps) and scene.seconds(scene.sweeps[2].timestamp) > 0
@@ -360,34 +339,6 @@ def test_lidar_alone_is_read(lidar_alone, recorded):
     for one, other in zip(scene.sweeps, recorded.sweeps, strict=True):
         np.testing.assert_allclose(one.sensor_to_world[:3, 3] + moved, other.sensor_to_world[:3, 3], atol=1e-9)
     assert len(scene.tracks) == len(recorded.tracks)
-
-
-def test_lidar_alone_is_refused_where_the_settings_name_cameras(lidar_alone):
-    with pytest.raises(DatasetError, match=r"scene 0001: it has no image of CAM_FRONT; name cameras that") as stopped:
-        extract_scene(source(), lidar_alone)
-    assert "\n" not in str(stopped.value)
-    assert camera_names(lidar_alone.parent, "") == [], "planning refuses them"
-
-
-def test_without_cameras_a_drive_is_extracted_from_its_sweeps(lidar_alone, folder):
-    """Of a drive with images, too, whose key frames are then those of its images."""
-    alone = extract_scene(source(cameras=()), lidar_alone)
-    assert alone.frames == () and len(alone.sweeps) == len(alone.key_frame_timestamps) > 3 and alone.dataset == "mine"
-    beside_images, with_images = extract_scene(source(cameras=()), folder), extract_scene(source(), folder)
-    assert beside_images.frames == beside_images.cameras == ()
-    assert [sweep.token for sweep in beside_images.sweeps] == [sweep.token for sweep in with_images.sweeps]
-    np.testing.assert_array_equal(beside_images.key_frame_timestamps, with_images.key_frame_timestamps)
-
-
-def test_a_drive_without_sweeps_is_refused_without_cameras(content, folder, tmp_path):
-    without = {key: value for key, value in content.items() if key not in ("sweeps", "lidars")}
-    (tmp_path / "drive.json").write_text(json.dumps(without), encoding="utf-8")
-    with pytest.raises(DatasetError, match=r"scene 0001: it has no LiDAR sweep, and the settings name no camera") as it:
-        extract_scene(source(cameras=()), tmp_path)
-    assert "\n" not in str(it.value)
-
-
-def test_lidar_alone_is_checked_and_drawn_from_above(lidar_alone, capsys):
     assert main(["check", str(lidar_alone)]) == 0
     said = capsys.readouterr().out
     assert "no images: methods that render LiDAR are trained and measured with cameras: []" in said
@@ -396,29 +347,38 @@ def test_lidar_alone_is_checked_and_drawn_from_above(lidar_alone, capsys):
     assert (pixels[20:].max(axis=2) > 0).sum() > 1000, "returns"
 
 
+def test_sensors_that_a_drive_lacks_are_refused_in_a_line(lidar_alone, content, folder, tmp_path):
+    with pytest.raises(DatasetError, match=r"scene 0001: it has no image of CAM_FRONT; name cameras that [^\n]*$"):
+        extract_scene(source(), lidar_alone)
+    assert camera_names(lidar_alone.parent, "") == [], "planning refuses them"
+    without = {key: value for key, value in content.items() if key not in ("sweeps", "lidars")}
+    images_alone = rewritten(folder, tmp_path / "images_alone", without)
+    words = r"scene images_alone: it has no LiDAR sweep, and the settings name no camera[^\n]*$"
+    with pytest.raises(DatasetError, match=words):
+        extract_scene(source(cameras=(), scene="images_alone"), images_alone)
+
+
+def test_without_cameras_a_drive_with_images_has_their_key_frames(folder):
+    beside_images, with_images = extract_scene(source(cameras=()), folder), extract_scene(source(), folder)
+    assert beside_images.frames == beside_images.cameras == ()
+    assert [sweep.token for sweep in beside_images.sweeps] == [sweep.token for sweep in with_images.sweeps]
+    np.testing.assert_array_equal(beside_images.key_frame_timestamps, with_images.key_frame_timestamps)
+
+
 @pytest.fixture
 def unposed(content, folder, tmp_path) -> Path:
     """The drive without any pose."""
-    mine = tmp_path / "0001"
-    mine.mkdir()
-    for name in ("images", "sweeps"):
-        (mine / name).symlink_to(folder / "0001" / name)
-    less = copy.deepcopy(content)
-    for record in (*less["frames"], *less["sweeps"]):
-        for key in ("camera_to_world", "ego_to_world", "lidar_to_world"):
-            record.pop(key, None)
-    (mine / "drive.json").write_text(json.dumps(less), encoding="utf-8")
-    return mine
-
-
-def test_a_drive_without_poses_is_refused_where_none_are_estimated(unposed):
-    with pytest.raises(
-        DatasetError, match=r"there are no poses; add ego_poses, or set refine_poses: \{enabled: true, st"
-    ):
-        read(unposed, source())
+    kept = ("camera", "lidar", "timestamp", "file", "key_frame")
+    less = {
+        name: [{key: value for key, value in record.items() if key in kept} for record in content[name]]
+        for name in ("frames", "sweeps")
+    }
+    return rewritten(folder, tmp_path / "0001", content | less)
 
 
 def test_a_drive_without_poses_is_read_where_they_are_estimated(unposed, caplog):
+    with pytest.raises(DatasetError, match=r"there are no poses; add ego_poses, or set refine_poses: \{enabled: "):
+        read(unposed, source())
     scene = extract_scene(source(poses_from_images=True), unposed)
     assert scene.poses == "none" and len(scene.frames) > 10
     assert all((frame.ego_to_world == np.eye(4)).all() for frame in scene.frames)
@@ -438,12 +398,3 @@ def test_without_poses_a_drive_needs_images_and_lidar(unposed, lacking, capsys):
     assert "poses can be estimated only where there are both images and LiDAR sweeps" in capsys.readouterr().out
     with pytest.raises(DatasetError, match="only where there are both"):
         read(unposed, source(poses_from_images=True))
-
-
-def test_the_command_runs_as_documented(folder, tmp_path):
-    arguments = ["check", str(folder / "0001"), "--picture", str(tmp_path / "check.png")]
-    done = subprocess.run(
-        [sys.executable, "-m", "drivesplat.readers.drive", *arguments],
-        cwd=REPOSITORY, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0 and done.stderr == "", done.stderr

@@ -1,4 +1,4 @@
-"""What the checker of drive folders refuses, and what it prints."""
+"""What the checker of drive folders refuses, what it prints, and the mistakes of a converter that it warns of."""
 
 import copy
 import json
@@ -11,10 +11,17 @@ import pytest
 import yaml
 from helpers.drives import scene_at
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from drivesplat.poses import lens
 from drivesplat.readers.drive.__main__ import main
+from drivesplat.readers.drive.format import Pose
+from drivesplat.readers.drive.poses import matrix_of
 from drivesplat.readers.drive.write import write_drive
+from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.settings.config import load
+
+pytestmark = pytest.mark.usefixtures("uncompared")
 
 Content = dict[str, Any]
 MUNICH = np.array([691607.8, 5335742.3, 519.0])
@@ -73,14 +80,12 @@ def other_zone(drive: Content) -> None:
 
 
 def hour_late(drive: Content) -> None:
-    for track in drive["tracks"]:
-        for pose in track["poses"]:
-            pose["timestamp"] += 3_600_000_000
+    for pose in (pose for track in drive["tracks"] for pose in track["poses"]):
+        pose["timestamp"] += 3_600_000_000
 
 
 def elsewhere(drive: Content) -> None:
-    for track in drive["tracks"]:
-        shift([(0, pose["translation"]) for pose in track["poses"]], MUNICH)
+    shift([(0, pose["translation"]) for track in drive["tracks"] for pose in track["poses"]], MUNICH)
 
 
 @pytest.mark.parametrize(
@@ -133,15 +138,12 @@ def test_a_short_drive_without_lidar_gets_the_settings_that_it_needs(content, fo
 
 
 def test_a_picture_that_cannot_be_written_is_one_sentence_after_the_faults(content, folder, tmp_path, capsys):
-    taken = tmp_path / "check.png"
-    taken.mkdir()
-    status, lines = checked(content, folder, capsys, taken)
-    assert status == 0 and lines[0].startswith("check.png cannot be written there")
-    assert lines[0].endswith("--picture names another place")
+    (taken := tmp_path / "check.png").mkdir()
     changed = copy.deepcopy(content)
     changed["frames"][0]["file"] = "images/none.png"
     status, lines = checked(changed, folder, capsys, taken)
-    assert status == 1 and "is missing" in lines[0] and lines[1].startswith("check.png cannot"), lines
+    assert status == 1 and "is missing" in lines[0] and lines[1].startswith("check.png cannot be written there"), lines
+    assert lines[1].endswith("--picture names another place")
 
 
 def test_a_fault_of_many_images_is_one_line_with_their_number(content, folder, tmp_path, capsys):
@@ -159,6 +161,151 @@ def test_a_fault_of_many_images_is_one_line_with_their_number(content, folder, t
 def test_six_cameras_are_drawn_in_a_grid(content, folder, tmp_path, capsys):
     names = [f"camera {i}" for i in range(6)]
     changed = {**content, "cameras": dict.fromkeys(names, content["cameras"]["CAM_FRONT"]), "tracks": []}
-    changed["frames"] = [{**frame, "camera": name} for name in names for frame in content["frames"]]
+    changed |= {"key_frames": content["key_frames"][:2], "sweeps": content["sweeps"][:2]}
+    changed["frames"] = [{**frame, "camera": name} for name in names for frame in content["frames"][:3]]
     checked(changed, folder, capsys, tmp_path / "six.png")
     assert Image.open(tmp_path / "six.png").size == (1920, 4 * 360)
+
+
+# Mistakes of a converter that leave a sound drive.json
+
+
+@pytest.fixture(scope="module")
+def plain(folder) -> Content:
+    """The tiny drive as a person writes it, with ego poses and mounts, in a world whose north it does not follow."""
+    drive = json.loads((folder / "drive.json").read_text())
+    ego = {frame["timestamp"]: matrix_of(Pose.model_validate(frame["ego_to_world"])) for frame in drive["frames"]}
+    mount = matrix_of(Pose.model_validate(drive["frames"][0]["camera_to_world"]))
+    mount = inverse(ego[drive["frames"][0]["timestamp"]]) @ mount
+    sweep = drive["sweeps"][2]
+    nearest = ego[min(ego, key=lambda time: abs(time - sweep["timestamp"]))]
+    lidar = inverse(nearest) @ matrix_of(Pose.model_validate(sweep["lidar_to_world"]))
+    for record in (*drive["frames"], *drive["sweeps"]):
+        for key in ("camera_to_world", "ego_to_world", "lidar_to_world"):
+            record.pop(key, None)
+    times = sorted(ego)
+    step = ego[times[1]][:3, 3] - ego[times[0]][:3, 3]
+    poses = {times[0] - times[1] + times[0]: -step, **dict.fromkeys(times, 0.0), 2 * times[-1] - times[-2]: step}
+    drive["ego_poses"] = []
+    for time, moved in sorted(poses.items()):
+        pose = ego[min(max(time, times[0]), times[-1])].copy()
+        pose[:3, 3] += moved
+        drive["ego_poses"].append({"timestamp": time, **as_record(WORLD @ pose)})
+    drive["cameras"]["CAM_FRONT"]["sensor_to_ego"] = as_record(mount)
+    drive["lidars"]["LIDAR_TOP"]["sensor_to_ego"] = as_record(lidar)
+    drive["tracks"] = []
+    return drive
+
+
+WORLD = rigid(Rotation.from_euler("zyx", [40.0, 2.0, -1.0], degrees=True).as_matrix(), np.array([5.0, -3.0, 1.0]))
+
+
+def as_record(pose: np.ndarray) -> Content:
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    return {"translation": pose[:3, 3].tolist(), "rotation": [w, x, y, z]}
+
+
+CAMERA, MOUNT = "cameras.CAM_FRONT", "cameras.CAM_FRONT.sensor_to_ego"
+LIDAR = "lidars.LIDAR_TOP.sensor_to_ego"
+
+
+def said_of(plain: Content, place: str, value: Any, folder: Path, capsys) -> tuple[int, list[str]]:
+    """The checker's exit status, and what it says of the drive with another value at a place of the record: `value`, or
+    what it makes of the one that is there."""
+    changed = copy.deepcopy(plain)
+    *way, last = place.split(".")
+    holder = changed
+    for key in way:
+        holder = holder[key]
+    holder[last] = value(holder[last]) if callable(value) else value
+    return checked(changed, folder, capsys)
+
+
+def timed(factor: float, divisor: int = 1) -> Callable[[list[Content]], list[Content]]:
+    return each(lambda pose: {**pose, "timestamp": pose["timestamp"] * factor // divisor})
+
+
+def rolled(pose: Content) -> Content:
+    matrix = matrix_of(Pose.model_validate({key: pose[key] for key in ("translation", "rotation")}))
+    matrix[:3, :3] = Rotation.from_euler("x", 90.0, degrees=True).as_matrix() @ matrix[:3, :3]
+    return pose | as_record(matrix)
+
+
+def w_last(pose: Content) -> Content:
+    return {**pose, "rotation": [*pose["rotation"][1:], pose["rotation"][0]]}
+
+
+def each(change: Callable[[Content], Content]) -> Callable[[list[Content]], list[Content]]:
+    return lambda poses: [change(pose) for pose in poses]
+
+
+def reversing(poses: list[Content]) -> list[Content]:
+    return [{**pose, "timestamp": at["timestamp"]} for pose, at in zip(reversed(poses), poses, strict=True)]
+
+
+def of_larger_images(k: list[list[float]]) -> list[list[float]]:
+    return [[value / 0.75 for value in row] for row in k[:2]] + k[2:]
+
+
+def test_a_drive_without_mistakes_has_the_warnings_of_its_images_alone(plain, folder, capsys, monkeypatch):
+    monkeypatch.setattr(lens, "lens_warnings", lambda scene: [f"{scene.name} looks distorted"])
+    status, said = said_of(plain, "tracks", [], folder, capsys)
+    warnings = [line for line in said if line.startswith("warning")]
+    assert status == 0 and warnings == [f"warning: {folder.name} looks distorted"]
+
+
+MISTAKES = {
+    "poses with w last": ("ego_poses", each(w_last), "check that rotations of poses are w, x, y, z"),
+    "poses rolled": ("ego_poses", each(rolled), "the ego vehicle is tilted by"),
+    "poses turned": (
+        "ego_poses", each(lambda pose: {**pose, "rotation": [0.7071068, 0, 0, 0.7071068]}), "degrees to its x axis",
+    ),
+    "poses backwards": ("ego_poses", reversing, "the ego vehicle moves backwards"),
+    "camera axes": (
+        f"{MOUNT}.rotation", [1, 0, 0, 0], "its y axis, which points down in the image, is 90 degrees",
+    ),
+    "a camera upside down": (
+        f"{MOUNT}.rotation", [0.5, 0.5, -0.5, -0.5],
+        "check that the axes of sensor_to_ego are x right, y down, z forward",
+    ),
+    "LiDAR rolled": (LIDAR, rolled, "hardly any return lies near the ground"),
+    "camera far above": (
+        f"{MOUNT}.translation", [90.0, 60.0, 90.0], "no return of a LiDAR falls into its images",
+    ),
+    "K of another image size": (f"{CAMERA}.K", of_larger_images, "K may belong to another image size"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_a_warning_that_says_what_to_check(mistake, plain, folder, capsys):
+    place, value, words = MISTAKES[mistake]
+    status, said = said_of(plain, place, value, folder, capsys)
+    warnings = [line for line in said if line.startswith("warning: ")]
+    assert status == 0 and any(words in line for line in warnings), said
+
+
+FAULTS = {
+    "poses in seconds": (
+        "ego_poses", timed(1, 10**6),
+        "ego_poses: timestamps are seconds, those of frames and sweeps microseconds; multiply them by 1e+06",
+    ),
+    "poses in nanoseconds": (
+        "ego_poses", timed(1000), "ego_poses: timestamps are nanoseconds, those of frames and sweeps microseconds",
+    ),
+    "seconds as decimals": (
+        "ego_poses", each(lambda pose: {**pose, "timestamp": pose["timestamp"] * 1e-6}),
+        "timestamps are whole microseconds; from seconds: round(t * 1e6)",
+    ),
+    "a mount in millimetres": (f"{MOUNT}.translation", [1700.0, 0.0, 1500.0], "cameras.CAM_FRONT: its translation is"),
+    "a polynomial of pixels as fisheye": (
+        f"{CAMERA}.distortion", {"model": "fisheye", "coefficients": [339.749, -31.988, 48.275, -7.201]},
+        "probably those of another model",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_unit_or_model_is_a_fault_that_names_the_cause_in_few_lines(fault, plain, folder, capsys):
+    place, value, words = FAULTS[fault]
+    status, said = said_of(plain, place, value, folder, capsys)
+    assert status == 1 and any(words in line for line in said) and len(said) <= 8, said

@@ -82,10 +82,7 @@ TRACKS = {
     "width first": (lambda s: sized(s, lambda size: size[[1, 0, 2]]), "tracks: length < width for"),
     "in feet": (lambda s: sized(s, lambda size: size * 3.28084), "tracks: boxes of class car are"),
     "half sizes": (lambda s: sized(s, lambda size: size / 2), "tracks: boxes of class car are"),
-    "at the bottom": (
-        lambda s: posed(s, lambda t, i, p: raised(p, -t.size[2] / 2)),
-        "tracks: the floors of boxes lie 0.8",
-    ),
+    "at the bottom": (lambda s: posed(s, lambda t, i, p: raised(p, -t.size[2] / 2)), "the floors of boxes lie 0.8"),
     "2 m above": (lambda s: posed(s, lambda t, i, p: raised(p, 2.0)), "tracks: the floors of boxes lie 2.0"),
     "ego frame": (lambda s: in_frame(s, lambda time: ego_at(s, time)), "to be in the ego frame"),
     "LiDAR frame": (lambda s: in_frame(s, lambda time: lidar_at(s, time)), "to be in the LiDAR frame"),
@@ -148,23 +145,18 @@ def mirrored(scene: Scene) -> Scene:
     )
 
 
+LEFT = rigid(Rotation.from_euler("y", 3.0, degrees=True).as_matrix(), np.zeros(3))
+LARGER = np.diag([4 / 3, 4 / 3, 1.0])
 CAMERAS = {
     "of larger images": (
-        lambda s: of_frames(s, lambda f: {"intrinsics": np.diag([4 / 3, 4 / 3, 1.0]) @ f.intrinsics}),
-        "if K is multiplied by 0.75",
+        lambda s: of_frames(s, lambda f: {"intrinsics": LARGER @ f.intrinsics}), "if K is multiplied by 0.75",
     ),
     "turned": (
-        lambda s: of_frames(
-            s,
-            lambda f: {
-                "camera_to_world": f.camera_to_world
-                @ rigid(Rotation.from_euler("y", 3.0, degrees=True).as_matrix(), np.zeros(3))
-            },
-        ),
+        lambda s: of_frames(s, lambda f: {"camera_to_world": f.camera_to_world @ LEFT}),
         "turned by 3.0 degrees to the left",
     ),
     "mirrored drive": (mirrored, "if the drive is mirrored"),
-}
+}  # fmt: skip
 MISTAKES = {
     f"{kind} {name}": mistake
     for kind, mistakes in (("tracks", TRACKS), ("poses", POSES), ("camera", CAMERAS))
@@ -177,7 +169,9 @@ def test_a_sound_drive_is_not_warned_of(sound):
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_named_with_its_cause(name, sound):
+def test_a_mistake_is_named_with_its_cause(name, sound, monkeypatch):
+    if not name.startswith("camera"):  # the comparison of images takes most of the time
+        monkeypatch.setattr(f"{drive_warnings.__module__}.image_warnings", lambda scene, sweeps: [])
     change, words = MISTAKES[name]
     found = drive_warnings(change(sound))
     assert any(words in sentence for sentence in found), found
@@ -187,21 +181,12 @@ SHARED = REPOSITORY.parent / "shared/data"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ddad-02", "nuscenes-sixcam-frame", "kitti-odometry-1"])
-def test_recorded_drives_are_not_warned_of(name):
+@pytest.mark.parametrize("name", ["ddad-02", "nuscenes-sixcam-frame", "kitti-odometry-1", "kitti-0005-lidar"])
+def test_recorded_drives_are_not_warned_of(name, tmp_path):
     folder = SHARED / name
     if not (folder / "drive.json").is_file():
         pytest.skip(f"no recorded drive at {folder}")
     assert drive_warnings(whole_scene(read_drive(folder), folder)) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [".", "odometry", "with_images"])
-def test_a_recorded_drive_of_77_sweeps_is_not_warned_of(name, tmp_path):
-    folder = SHARED / "kitti-0005-lidar"
-    if not (folder / "drive.json").is_file():
-        pytest.skip(f"no recorded drive at {folder}")
-    (tmp_path / "drive.json").write_bytes((folder / name / "drive.json").read_bytes())
-    (tmp_path / "velodyne").symlink_to(folder / "velodyne")
-    (tmp_path / "image_02").symlink_to(folder / "with_images/image_02")
-    assert drive_warnings(whole_scene(read_drive(tmp_path), tmp_path)) == []
+    for other in (folder / "odometry", folder / "with_images"):
+        if (other / "drive.json").is_file():
+            assert drive_warnings(whole_scene(read_drive(other), other)) == []

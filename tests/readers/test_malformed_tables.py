@@ -15,6 +15,8 @@ from drivesplat.readers.drive_checks import jumps
 from drivesplat.readers.nuscenes.layout import camera_names
 from drivesplat.readers.nuscenes.scene_tables import index_tables
 
+pytestmark = pytest.mark.usefixtures("uncompared")
+
 SAMPLE, IMAGE, SWEEP = "0001 sample 1", "0001 CAM_FRONT 2", "0001 LIDAR_TOP 1"
 BETWEEN = "0001 CAM_FRONT 3"
 BOX = "0001 annotation 1 1"
@@ -83,21 +85,23 @@ NAMES = [
 ]  # fmt: skip
 
 
-def all_and_two(records: list[tuple], values: list) -> list[tuple]:
-    """Every value for the first record, two of them for each of the others, which the same check reads."""
-    return [(record, values[2:4] if i else values) for i, record in enumerate(records)]
+def all_and_one(records: list[tuple], values: list) -> list[tuple]:
+    """Every value for the first record, one of them for each of the others, which the same check reads."""
+    return [(record, values[2:3] if i else values) for i, record in enumerate(records)]
 
 
 MALFORMED = [
-    *((*record, "translation", values, "its translation is") for record, values in all_and_two(POSES, NOT_A_POSITION)),
-    *((*record, "rotation", values, "its rotation is") for record, values in all_and_two(POSES, NOT_A_ROTATION)),
+    *((*record, "translation", values, "its translation is") for record, values in all_and_one(POSES, NOT_A_POSITION)),
+    *((*record, "rotation", values, "its rotation is") for record, values in all_and_one(POSES, NOT_A_ROTATION)),
     *((*record, "timestamp", values, ": its timestamp is .*microseconds")
-      for record, values in all_and_two(TIMED, NOT_A_TIME)),
-    *((*name, values, name[2]) for name, values in all_and_two(NAMES, NOT_A_TOKEN)),
+      for record, values in all_and_one(TIMED, NOT_A_TIME)),
+    *((*name, values, name[2]) for name, values in all_and_one(NAMES, NOT_A_TOKEN)),
     ("sample_annotation", BOX, "size", NOT_A_SIZE, r" \(instance 0001 instance 1\): its size is"),
     ("sample_annotation", BOX, "visibility_token", [4, ["4"], {}, True], ": its visibility_token is"),
-    *(("sample_data", IMAGE, name, NOT_A_NUMBER_OF_PIXELS, ": its image size is") for name in ("width", "height")),
-    *(("sample_data", token, "filename", NOT_A_FILE, ": its filename") for token in (IMAGE, SWEEP)),
+    ("sample_data", IMAGE, "width", NOT_A_NUMBER_OF_PIXELS, ": its image size is"),
+    ("sample_data", IMAGE, "height", [48.5, 0], ": its image size is"),
+    *(("sample_data", token, "filename", values, ": its filename")
+      for token, values in all_and_one([IMAGE, SWEEP], NOT_A_FILE)),
     ("sample_data", BETWEEN, "is_key_frame", ["False", "true", 0, 1, None, [], {}], ": its is_key_frame is .*true or"),
     ("scene", "scene 0001", "description", [7, ["text"], {}, "lone \ud800"], ": its description is"),
     ("calibrated_sensor", CAMERA, "camera_intrinsic", NO_PINHOLE, ": .*pinhole"),
@@ -111,6 +115,7 @@ MALFORMED = [
     )),
     ("calibrated_sensor", CAMERA, "translation", [[1700.0, 0.0, 1500.0]], "metres"),  # a mount in millimetres
     ("calibrated_sensor", CAMERA, "readout_s", ["fast", -0.01, 17.0], ": its readout time"),
+    ("calibrated_sensor", CAMERA, "readout_direction", ["sideways"], ": its readout direction"),
     ("calibrated_sensor", LIDAR, "beam_elevations", ["many", [[0.1], [0.2]], [-30.0, 10.0]], ": its beam elevations"),
     ("calibrated_sensor", LIDAR, "azimuth_steps", ["1085", 0], ": its azimuth steps"),
 ]  # fmt: skip
@@ -127,12 +132,6 @@ def test_a_malformed_value_is_refused_naming_its_record(root, table, token, colu
         edit(root, table, lambda _: original)
 
 
-def test_a_malformed_direction_of_the_readout_is_refused(root):
-    change = {"readout_s": 0.02, "readout_direction": "sideways"}
-    edit(root, "calibrated_sensor", lambda rows: row(rows, CAMERA).update(change))
-    assert refusal(root).startswith(f"calibrated_sensor {CAMERA}: its readout direction")
-
-
 def scaled(root: Path, convert) -> None:
     for table in ("sample", "sample_data", "ego_pose"):
         edit(root, table, lambda rows: [{**it, "timestamp": convert(it["timestamp"])} for it in rows])
@@ -140,8 +139,8 @@ def scaled(root: Path, convert) -> None:
 
 @pytest.mark.parametrize(
     "convert",
-    [lambda t: t // 1_000_000, lambda t: t * 1e-6, lambda t: t // 1000, lambda t: t * 1000, lambda t: f"{t}"],
-    ids=["whole seconds", "seconds", "milliseconds", "nanoseconds", "text"],
+    [lambda t: t // 1_000_000, lambda t: t * 1e-6, lambda t: t // 1000, lambda t: t * 1000],
+    ids=["whole seconds", "seconds", "milliseconds", "nanoseconds"],
 )
 def test_times_in_another_unit_are_refused_with_the_unit_that_is_wanted(root, convert):
     scaled(root, convert)
@@ -160,12 +159,12 @@ def test_a_recording_far_from_its_key_frame_is_refused_naming_it(root):
     assert message.startswith("sample_data 0001 CAM_FRONT 0") and "from that of its sample" in message
 
 
-@pytest.mark.parametrize("description", ["absent", None, "Rain.\nNight. " * 100])
-def test_a_description_may_be_missing_or_long_and_have_lines(root, description):
-    edit(root, "scene", lambda rows: rows[0].update(description=description))
-    if description == "absent":
-        edit(root, "scene", lambda rows: rows[0].pop("description") and None)
-    assert extracted(root).description == ("" if description in ("absent", None) else description)
+def test_a_description_may_be_missing_or_long_and_have_lines(root):
+    for description in ("Rain.\nNight. " * 100, None):
+        edit(root, "scene", lambda rows, text=description: rows[0].update(description=text))
+        assert extracted(root).description == (description or "")
+    edit(root, "scene", lambda rows: rows[0].pop("description") and None)
+    assert extracted(root).description == ""
 
 
 COLUMNS = [
@@ -186,7 +185,7 @@ def test_rows_without_a_column_are_refused_naming_table_and_token(root):
 @pytest.mark.parametrize(
     ("table", "content"),
     [("scene", "{}"), ("scene", "7"), ("sample_data", ""), ("sample_data", '[{"token": '), ("sensor", "[null]"),
-     ("sensor", "[[]]"), ("map", "[" * 200_000), ("map", "\ufeff[]"), ("sample_data", "[" + "9" * 5000 + "]")],
+     ("map", "[" * 200_000), ("map", "\ufeff[]"), ("sample_data", "[" + "9" * 5000 + "]")],
     ids=lambda content: content[:12] or "empty",
 )  # fmt: skip
 def test_a_table_that_is_no_list_of_rows_is_refused_with_its_folder(root, table, content):
@@ -195,78 +194,59 @@ def test_a_table_that_is_no_list_of_rows_is_refused_with_its_folder(root, table,
     assert f"nuScenes v1.0-mini in {root} cannot be read" in message and table in message
 
 
-@pytest.mark.parametrize("content", ["{}", "[1]", "[{}]", "[" * 200_000, '[{"modality": "camera"}]'])
-def test_cameras_of_a_malformed_table_are_refused_with_the_table(root, content):
-    (root / "v1.0-mini/sensor.json").write_text(content)
-    if content == "{}":
-        assert camera_names(root, "v1.0-mini") == []
-        return
-    with pytest.raises(DatasetError, match=r"sensor\.json cannot be read"):
-        camera_names(root, "v1.0-mini")
-
-
-def test_a_row_nested_too_deeply_in_an_unused_column_is_refused(root):
-    edit(root, "sample", lambda rows: rows[0].update(note="deep"))
+def test_a_row_nested_too_deeply_and_a_malformed_table_of_sensors_are_refused_with_the_table(root):
+    for content in ("[1]", "[{}]", "[" * 200_000, '[{"modality": "camera"}]'):
+        (root / "v1.0-mini/sensor.json").write_text(content)
+        with pytest.raises(DatasetError, match=r"sensor\.json cannot be read"):
+            camera_names(root, "v1.0-mini")
     path = root / "v1.0-mini/sample.json"
-    path.write_text(path.read_text().replace('"deep"', "[" * 200_000 + "]" * 200_000))
+    path.write_text(path.read_text().replace("{", '{"note": ' + "[" * 200_000 + "]" * 200_000 + ",", 1))
     assert "sample.json is nested too deeply" in refusal(root)
 
 
-FIRST_IMAGE, LAST_SAMPLE = "0001 CAM_FRONT 1", "sample 0001 sample 2"
-CHANGED = {
-    "a circle of samples": ("sample", SAMPLE, {"next": SAMPLE}, f"sample {SAMPLE}: its next is {SAMPLE}, which comes"),
-    "a circle to an earlier sample": (
-        "sample", SAMPLE, {"next": "0001 sample 0"}, f"sample {SAMPLE}: its next is 0001 sample 0, which comes before",
-    ),
-    "a circle of images": ("sample_data", BETWEEN, {"next": IMAGE}, f"sample_data {IMAGE}"),
-    "an image that follows itself": ("sample_data", BETWEEN, {"next": BETWEEN}, f"sample_data {BETWEEN}"),
-    "a key frame at the time of another": ("sample", SAMPLE, {"timestamp": START_US}, f"sample {SAMPLE}"),
-    "a key frame too early": ("sample", SAMPLE, {"timestamp": START_US - KEY_FRAME_US}, f"sample {SAMPLE}"),
-    "an image too early": ("sample_data", IMAGE, {"timestamp": START_US - 10 * KEY_FRAME_US}, f"sample_data {IMAGE}"),
-    "a sweep too early": ("sample_data", SWEEP, {"timestamp": START_US - 10 * KEY_FRAME_US}, f"sample_data {SWEEP}"),
-    "an image between two too early": ("sample_data", BETWEEN, {"timestamp": START_US}, f"sample_data {BETWEEN}"),
-    "a chain that ends between key frames": ("sample_data", BETWEEN, {"next": ""}, f"sample_data {BETWEEN}"),
-    "an ego pose of no row": ("sample_data", IMAGE, {"ego_pose_token": "nowhere"}, "nowhere"),
-    "a next image of no row": ("sample_data", IMAGE, {"next": "nowhere"}, "nowhere"),
-    "a next sample of no row": ("sample", SAMPLE, {"next": "nowhere"}, "nowhere"),
-    "a chain of samples that ends early": ("sample", SAMPLE, {"next": ""}, f"{LAST_SAMPLE}: it is in the scene, but"),
-    "a key frame that a chain leaves out": (
-        "sample_data", FIRST_IMAGE, {"next": BETWEEN}, f"sample_data {IMAGE}: the chain of CAM_FRONT leaves it out",
-    ),
-    "a chain that leads to another sensor": (
-        "sample_data", FIRST_IMAGE, {"next": SWEEP}, f"sample_data {SWEEP}: it stands in the chain of another sensor",
-    ),
-    "two key frames of a sensor in a sample": (
-        "sample_data", BETWEEN, {"is_key_frame": True},
-        f"sample_data {BETWEEN}: its sample 0001 sample 1 has another recording",
-    ),
-}  # fmt: skip
+FIRST_IMAGE, BEFORE = "0001 CAM_FRONT 1", START_US - 10 * KEY_FRAME_US
+CHANGED = [
+    ("sample", SAMPLE, {"next": SAMPLE}, f"sample {SAMPLE}: its next is {SAMPLE}, which comes"),
+    ("sample", SAMPLE, {"next": "0001 sample 0"}, f"sample {SAMPLE}: its next is 0001 sample 0, which comes before"),
+    ("sample", SAMPLE, {"timestamp": START_US}, f"sample {SAMPLE}"),
+    ("sample", SAMPLE, {"timestamp": START_US - KEY_FRAME_US}, f"sample {SAMPLE}"),
+    ("sample", SAMPLE, {"next": "nowhere"}, "nowhere"),
+    ("sample", SAMPLE, {"next": ""}, "sample 0001 sample 2: it is in the scene, but"),
+    ("sample_data", BETWEEN, {"next": IMAGE}, f"sample_data {IMAGE}"),
+    ("sample_data", BETWEEN, {"next": BETWEEN}, f"sample_data {BETWEEN}"),
+    ("sample_data", IMAGE, {"timestamp": BEFORE}, f"sample_data {IMAGE}"),
+    ("sample_data", SWEEP, {"timestamp": BEFORE}, f"sample_data {SWEEP}"),
+    ("sample_data", BETWEEN, {"timestamp": START_US}, f"sample_data {BETWEEN}"),
+    ("sample_data", BETWEEN, {"next": ""}, f"sample_data {BETWEEN}"),
+    ("sample_data", IMAGE, {"ego_pose_token": "nowhere"}, "nowhere"),
+    ("sample_data", IMAGE, {"next": "nowhere"}, "nowhere"),
+    ("sample_data", FIRST_IMAGE, {"next": BETWEEN}, f"sample_data {IMAGE}: the chain of CAM_FRONT leaves it out"),
+    ("sample_data", FIRST_IMAGE, {"next": SWEEP}, f"{SWEEP}: it stands in the chain of another sensor"),
+    ("sample_data", BETWEEN, {"is_key_frame": True},
+     f"sample_data {BETWEEN}: its sample 0001 sample 1 has another recording"),
+]  # fmt: skip
 """Otherwise a drive would be shorter, or another one, without a word."""
 
 
-@pytest.mark.parametrize("name", CHANGED)
-def test_times_and_links_that_cannot_be_are_refused_naming_the_record(root, name):
-    table, token, change, said = CHANGED[name]
+@pytest.mark.parametrize(("table", "token", "change", "said"), CHANGED)
+def test_times_and_links_that_cannot_be_are_refused_naming_the_record(root, table, token, change, said):
     edit(root, table, lambda rows: row(rows, token).update(change))
     assert said in refusal(root)
 
 
-REPEATED = {
-    "ego_pose": (IMAGE, {}, f"ego_pose {IMAGE}: two records have this token"),
-    "sample_data": (IMAGE, {}, f"sample_data {IMAGE}: two records have this token"),
-    "instance": ("0001 instance 1", {}, "instance 0001 instance 1: two records have this token"),
-    "category": ("category vehicle.car", {}, "category category vehicle.car: two records have this token"),
-    "scene": ("scene 0001", {"token": "again"}, "scene again: its name scene-0001 is that of another scene"),
-    "sample_annotation": (
-        BOX, {"token": "again"},
-        "sample_annotation again: instance 0001 instance 1 has another box in sample 0001 sample 1",
-    ),
-}  # fmt: skip
+AGAIN = "two records have this token"
+REPEATED = [
+    ("ego_pose", IMAGE, {}, f"ego_pose {IMAGE}: {AGAIN}"), ("sample_data", IMAGE, {}, f"sample_data {IMAGE}: {AGAIN}"),
+    ("instance", "0001 instance 1", {}, f"instance 0001 instance 1: {AGAIN}"),
+    ("category", "category vehicle.car", {}, f"category category vehicle.car: {AGAIN}"),
+    ("scene", "scene 0001", {"token": "again"}, "scene again: its name scene-0001 is that of another scene"),
+    ("sample_annotation", BOX, {"token": "again"},
+     "sample_annotation again: instance 0001 instance 1 has another box in sample 0001 sample 1"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("table", REPEATED)
-def test_a_row_that_repeats_another_is_refused_naming_it(root, table):
-    token, change, said = REPEATED[table]
+@pytest.mark.parametrize(("table", "token", "change", "said"), REPEATED)
+def test_a_row_that_repeats_another_is_refused_naming_it(root, table, token, change, said):
     edit(root, table, lambda rows: [*rows, {**row(rows, token), **change}])
     assert said in refusal(root)
 
@@ -283,8 +263,13 @@ def test_a_damaged_row_of_a_sensor_that_is_not_read_refuses_no_drive(root):
 
 @pytest.mark.parametrize("speed", [110.0, 130.0])
 def test_tracks_that_jump_are_warned_of_with_id_and_times(root, caplog, speed):
-    apart = speed * KEY_FRAME_US * 1e-6
-    edit(root, "sample_annotation", lambda rows: jump(rows, apart))
+    """A parked truck is moved once, at the second key frame."""
+
+    def jump(rows: list[dict]) -> None:
+        for token in (BOX, "0001 annotation 1 2"):
+            row(rows, token)["translation"][0] += speed * KEY_FRAME_US * 1e-6
+
+    edit(root, "sample_annotation", jump)
     with caplog.at_level(logging.WARNING):
         assert len(extracted(root).tracks) == 4
     found = [it.getMessage() for it in caplog.records if "jumps" in it.getMessage()]
@@ -293,11 +278,11 @@ def test_tracks_that_jump_are_warned_of_with_id_and_times(root, caplog, speed):
         assert not found or part in found[0]
 
 
-def jump(rows: list[dict], apart: float) -> None:
-    """Moves a parked truck once, at the second key frame."""
-    for it in rows:
-        if it["token"] in (BOX, "0001 annotation 1 2"):
-            it["translation"][0] += apart
+def test_an_ego_vehicle_that_jumps_is_warned_of(root, caplog):
+    edit(root, "ego_pose", lambda rows: row(rows, IMAGE).update(translation=[900.0, 1100.0, 0.0]))
+    with caplog.at_level(logging.WARNING):
+        extracted(root)
+    assert sum("the ego vehicle jumps, " in it.getMessage() for it in caplog.records) == 1
 
 
 def test_of_many_tracks_that_jump_ten_are_named(small_root):
@@ -305,16 +290,8 @@ def test_of_many_tracks_that_jump_ten_are_named(small_root):
     poses = scene.tracks[0].object_to_world.copy()
     poses[1, 0, 3] += 1000.0
     jumping = dataclasses.replace(scene.tracks[0], object_to_world=poses)
-    assert len(jumps(dataclasses.replace(scene, tracks=(jumping,) * 10))) == 10
     found = jumps(dataclasses.replace(scene, tracks=(jumping,) * 13))
     assert len(found) == 11 and found[-1] == "3 more tracks jump"
-
-
-def test_an_ego_vehicle_that_jumps_is_warned_of(root, caplog):
-    edit(root, "ego_pose", lambda rows: row(rows, IMAGE).update(translation=[900.0, 1100.0, 0.0]))
-    with caplog.at_level(logging.WARNING):
-        extracted(root)
-    assert sum("the ego vehicle jumps, " in it.getMessage() for it in caplog.records) == 1
 
 
 @pytest.mark.parametrize("table", ["sample_annotation", "sample_data"])

@@ -24,48 +24,34 @@ VALUES = np.array([0.0, 1.0, 30.0, 130.0, 255.0], dtype=np.float32)
 
 
 @pytest.mark.parametrize("name", ["scalar_intensity", "scalar_Intensity", "Intensity", "reflectance"])
-@pytest.mark.parametrize("factor", [255.0, 1.0])
-def test_intensities_of_other_programs_are_between_0_and_1(name, factor, tmp_path):
-    path = ply(tmp_path / "top.ply", **{name: VALUES * np.float32(factor / 255.0), "nx": VALUES})
-    np.testing.assert_allclose(read_file(path).intensity, VALUES / 255.0, atol=1e-6)
-    scaled = ", whose intensities are divided by 255" if factor == 255.0 else ""
-    assert columns_sentence(path) == f"has x, y, z, intensity ({name}){scaled}; not used: nx"
+def test_intensities_of_other_programs_are_between_0_and_1(name, tmp_path):
+    for factor, scaled in ((255.0, ", whose intensities are divided by 255"), (1.0, "")):
+        path = ply(tmp_path / "top.ply", **{name: VALUES * np.float32(factor / 255.0), "nx": VALUES})
+        np.testing.assert_allclose(read_file(path).intensity, VALUES / 255.0, atol=1e-6)
+        assert columns_sentence(path) == f"has x, y, z, intensity ({name}){scaled}; not used: nx"
+    path = ply(tmp_path / "top.ply", **{name: np.array([0, 0, 1, 1, 0], dtype=np.uint8)})
+    np.testing.assert_allclose(read_file(path).intensity.max(), 1.0 / 255.0), "8 bits count to 255, however dark"
 
 
-def test_intensities_of_8_bits_count_to_255_however_dark(tmp_path):
-    path = ply(tmp_path / "top.ply", scalar_intensity=np.array([0, 0, 1, 1, 0], dtype=np.uint8))
-    np.testing.assert_allclose(read_file(path).intensity.max(), 1.0 / 255.0)
-
-
-@pytest.mark.parametrize(
-    ("columns", "words"),
-    [
+def test_values_that_no_rule_covers_are_refused(tmp_path):
+    for columns, words in (
         ({"scalar_intensity": 300.0 * VALUES}, "divide them"),
         ({"intensity": VALUES}, "has intensities up to 255; divide them"),
         ({"ring": np.array([0.0, 1.0, 2.0, 3.0, 1e18])}, "has rings from 0 to 1e+18; they are indices of beams"),
         ({"ring": np.array([0.0, 1.0, 2.0, 3.0, np.nan])}, "they are indices of beams"),
-    ],
-)
-def test_values_that_no_rule_covers_are_refused(columns, words, tmp_path):
-    assert words in str(read_file(ply(tmp_path / "top.ply", **columns)))
+    ):
+        assert words in str(read_file(ply(tmp_path / "top.ply", **columns)))
+    np.savez(tmp_path / "top.npz", points=np.zeros((5, 3)))
+    assert "it has no x, y, z; its columns are points" in str(read_file(tmp_path / "top.npz"))
+    (tmp_path / "top.bin").write_bytes(bytes(160))
+    words = "is no sweep that can be read: sweeps are .npz, .ply, .pcd files (docs/own_data.md)"
+    assert read_file(tmp_path / "top.bin") == words
 
 
 def test_a_column_of_the_documented_name_counts_before_others(tmp_path):
     path = ply(tmp_path / "top.ply", scalar_intensity=VALUES, intensity=VALUES / np.float32(512.0))
     np.testing.assert_array_equal(read_file(path).intensity, VALUES / np.float32(512.0))
     assert columns_sentence(path) == "has x, y, z, intensity; not used: scalar_intensity"
-
-
-def test_a_file_without_coordinates_is_named_with_its_columns(tmp_path):
-    np.savez(tmp_path / "top.npz", points=np.zeros((5, 3)))
-    assert "it has no x, y, z; its columns are points" in str(read_file(tmp_path / "top.npz"))
-
-
-def test_a_file_of_another_kind_is_not_called_corrupt(tmp_path):
-    (tmp_path / "top.bin").write_bytes(bytes(160))
-    assert read_file(tmp_path / "top.bin") == (
-        "is no sweep that can be read: sweeps are .npz, .ply, .pcd files (docs/own_data.md)"
-    )
 
 
 def test_the_checker_names_the_columns_of_each_lidar(tmp_path, capsys):

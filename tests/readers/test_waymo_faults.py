@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers import drives
+from helpers.mutations import fresh
 from helpers.table_files import time_limit
 from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
 from helpers.waymo_files import tfrecord, write_v1, write_v2
@@ -127,53 +128,50 @@ def test_both_versions_of_a_segment_are_refused_unless_one_is_named(drive, tmp_p
         assert extracted(tmp_path / "data", tmp_path / "results", version=version).version == version
 
 
-def test_a_missing_component_is_named(roots, tmp_path):
-    root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
-    shutil.rmtree(root / "lidar_pose")
-    assert f"lidar_pose/{NAME}.parquet is missing in {root}; docs/waymo.md" in refusal(root, tmp_path)
-    (root / f"lidar_box/{NAME}.parquet").unlink()
-    assert f"lidar_pose/{NAME}.parquet, lidar_box/{NAME}.parquet are missing" in refusal(root, tmp_path)
+def drop_column(path: Path, name: str) -> None:
+    pq.write_table(pq.read_table(path).drop_columns([name]), path)
 
 
-def test_a_missing_column_is_named(roots, tmp_path):
-    root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
-    path = root / f"camera_image/{NAME}.parquet"
-    pq.write_table(pq.read_table(path).drop_columns(["[CameraImageComponent].pose.transform"]), path)
-    assert f"{path} has no column [CameraImageComponent].pose.transform" in refusal(root, tmp_path)
-
-
-def test_a_column_of_another_type_is_named(roots, tmp_path):
-    root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
-    path, name = root / f"lidar/{NAME}.parquet", "[LiDARComponent].range_image_return1.values"
+def retype_column(path: Path, name: str) -> None:
     table = pq.read_table(path)
     place = table.schema.get_field_index(name)
     pq.write_table(table.set_column(place, name, pa.array([0.5] * len(table))), path)
-    assert f"{path}: its column {name} is of type double" in refusal(root, tmp_path)
 
 
-@pytest.mark.parametrize("component", ["camera_image", "lidar", "vehicle_pose"])
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-def test_a_truncated_parquet_file_is_named(component, share, roots, tmp_path):
+POSE, VALUES = "[CameraImageComponent].pose.transform", "[LiDARComponent].range_image_return1.values"
+V2_FAULTS: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "missing": ("lidar_pose", Path.unlink, f"lidar_pose/{NAME}.parquet is missing in {{root}}; docs/waymo.md"),
+    "no column": ("camera_image", lambda path: drop_column(path, POSE), f"{{path}} has no column {POSE}"),
+    "another type": (
+        "lidar", lambda path: retype_column(path, VALUES), f"{{path}}: its column {VALUES} is of type double",
+    ),
+    "empty": ("camera_image", lambda path: os.truncate(path, 0), "{path} cannot be read ("),
+    "truncated": ("lidar", lambda path: os.truncate(path, path.stat().st_size // 2), "{path} cannot be read ("),
+    "cut": ("vehicle_pose", lambda path: os.truncate(path, path.stat().st_size - 1), "{path} cannot be read ("),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", V2_FAULTS)
+def test_missing_and_damaged_components_are_named(fault, roots, tmp_path):
+    component, change, words = V2_FAULTS[fault]
     root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
     path = root / f"{component}/{NAME}.parquet"
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    assert f"{path} cannot be read (" in refusal(root, tmp_path)
+    change(path)
+    assert words.format(root=root, path=path) in refusal(root, tmp_path)
 
 
-@pytest.mark.parametrize("cut", [1, 6, 14, 5000, -3])
-def test_a_truncated_tfrecord_is_named_with_its_record(cut, roots, tmp_path):
+def test_a_truncated_tfrecord_and_a_wrong_checksum_are_named_with_the_record(roots, tmp_path):
     whole = (roots["v1"] / V1_FILE).read_bytes()
-    (tmp_path / V1_FILE).write_bytes(whole[:cut])
-    assert re.search(r"record [02] of .* is truncated; download the file again", refusal(tmp_path, tmp_path / "out"))
-
-
-@pytest.mark.parametrize(("place", "part"), [(3, "length"), (9, "length"), (100, "data"), (-2, "data")])
-def test_a_wrong_checksum_is_named(place, part, roots, tmp_path):
-    content = bytearray((roots["v1"] / V1_FILE).read_bytes())
-    content[place] ^= 4
-    (tmp_path / V1_FILE).write_bytes(content)
-    sentence = refusal(tmp_path, tmp_path / "out")
-    assert f"the checksum (CRC-32C) of its {part} differs" in sentence and "record " in sentence
+    for cut in (1, 14, 5000, -3):
+        (tmp_path / V1_FILE).write_bytes(whole[:cut])
+        sentence = refusal(tmp_path, tmp_path / "out")
+        assert re.search(r"record [02] of .* is truncated; download the file again", sentence), cut
+    for place, part in ((3, "length"), (9, "length"), (100, "data"), (-2, "data")):
+        content = bytearray(whole)
+        content[place] ^= 4
+        (tmp_path / V1_FILE).write_bytes(content)
+        sentence = refusal(tmp_path, tmp_path / "out")
+        assert f"the checksum (CRC-32C) of its {part} differs" in sentence and "record " in sentence
 
 
 def test_the_mask_of_a_checksum_is_that_of_tensorflow():
@@ -192,11 +190,10 @@ def test_a_file_of_another_segment_is_named(drive, tmp_path):
 
 
 @pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize("absent", ["record", "content"])
-def test_a_frame_without_image_is_named_or_left_out(version, absent, drive, written, tmp_path):
+def test_a_frame_without_image_is_named_or_left_out(version, drive, written, tmp_path):
     lost = next(i for i, image in enumerate(drive.images) if image.camera == 1 and image.frame != drive.images[0].frame)
     images = list(drive.images)
-    images[lost : lost + 1] = [] if absent == "record" else [replace(images[lost], content=b"")]
+    images[lost : lost + 1] = [] if version == "v1" else [replace(images[lost], content=b"")]
     root = written(version, replace(drive, images=images))
     sentence = refusal(root, tmp_path / "results")
     assert f"key frame 1: frame {drive.images[lost].frame} has no image of camera FRONT" in sentence
@@ -211,119 +208,82 @@ def test_a_drive_without_boxes_or_lidar_is_a_static_one(version, drive, written,
     assert scene.tracks == scene.sweeps == scene.lidars == () and len(scene.frames) == 3
 
 
-@pytest.mark.parametrize("version", WRITERS)
-def test_a_range_image_of_another_size_than_the_inclinations_is_named(version, drive, written, tmp_path):
-    top = drive.sweeps[0]
-    fewer = first(drive.sweeps, values=top.values[:40], poses=top.poses[:40])
-    sentence = refusal(written(version, replace(drive, sweeps=fewer)), tmp_path / "results")
-    assert "laser TOP: its range image has 40 rows, and its laser 64 beam inclinations" in sentence
-    later = [*drive.sweeps]
-    later[2] = replace(later[2], values=later[2].values[:40], poses=later[2].poses[:40])
-    sentence = refusal(written(version, replace(drive, sweeps=later)), tmp_path / "results")
-    assert "40 rows, and its laser 64 beam inclinations" in sentence
+def wrong_values(d: Drive) -> dict[str, tuple[dict[str, Any], str]]:
+    """What replaces parts of a drive, and the words of the refusal."""
+    top, front = d.lasers
+    sweep, box, image = d.sweeps[0], d.boxes[0], d.images[0]
+    short = {"values": sweep.values[:40], "poses": sweep.poses[:40]}
+    later = [*d.sweeps[:2], replace(d.sweeps[2], values=d.sweeps[2].values[:40], poses=d.sweeps[2].poses[:40])]
+    rows = "its range image has 40 rows, and its laser 64 beam inclinations"
+    inclinations = np.degrees(top.inclinations)
+    return {
+        "an image pose that scales": (
+            {"images": first(d.images, pose=image.pose * np.array([2.0, 2.0, 2.0, 1.0])[:, None])},
+            r"image FRONT of frame \d+: its transform is not rigid",
+        ),
+        "a frame pose with NaN": (
+            {"frames": d.frames | {min(d.frames): np.full((4, 4), np.nan)}},
+            r"frame \d+: its transform is .* 4x4 matrix of finite numbers",
+        ),
+        "an image time of another clock": (
+            {"images": first(d.images, seconds=12.5)},
+            r"image FRONT of frame \d+: its time is 12\.5 s, more than a second from that of its frame",
+        ),
+        "a focal length of zero": (
+            {"cameras": first(d.cameras, intrinsic=[0.0] * 9)}, r"camera FRONT: its camera matrix is singular",
+        ),
+        "a camera without calibration": (
+            {"cameras": d.cameras[1:]}, r"camera FRONT: segment \w+ has no calibration of it",
+        ),
+        "a laser without calibration": (
+            {"lasers": [front]}, r"laser TOP: segment \w+ has range images of it, but no calibration",
+        ),
+        "inclinations from the top": (
+            {"lasers": [top, replace(front, lowest=0.5, highest=0.1)]},
+            r"laser FRONT: its least beam inclination 0\.5 is not below the greatest, 0\.1",
+        ),
+        "inclinations in degrees": (
+            {"lasers": [replace(top, inclinations=inclinations), front]}, r"laser TOP: its beam elevations .* radians",
+        ),
+        "two boxes of one object": ({"boxes": [*d.boxes, box]}, r"box .* it has two boxes in frame \d+"),
+        "a box without size": (
+            {"boxes": first(d.boxes, size=np.zeros(3))},
+            r"box .* in frame \d+: its size is .* three positive numbers",
+        ),
+        "a box at infinity": (
+            {"boxes": first(d.boxes, center=np.array([np.inf, 0.0, 0.0]))},
+            r"box .* in frame \d+: its centre .* not finite",
+        ),
+        "an image twice": ({"images": [*d.images, image]}, r"image FRONT of frame \d+: the segment has it twice"),
+        "a sweep twice": ({"sweeps": [*d.sweeps, sweep]}, r"sweep TOP/\d+: the segment has it twice"),
+        "fewer rows than inclinations": ({"sweeps": first(d.sweeps, **short)}, f"laser TOP: {rows}"),
+        "fewer rows later": ({"sweeps": [*later, *d.sweeps[3:]]}, rows),
+        "fewer poses of pixels": (
+            {"sweeps": first(d.sweeps, poses=sweep.poses[:, :50])},
+            r"sweep TOP/\d+: its range image is 64x120, and the poses of its pixels are 64x50",
+        ),
+        "no poses of pixels": (
+            {"sweeps": first(d.sweeps, poses=None)},
+            r"sweep TOP/\d+: (.*lidar_pose.* has no poses of its pixels|its range image has 0 values)",
+        ),
+        "a label that is no image": (
+            labelled(d, content=b"\x89PNG junk"), r"label FRONT/\d+: its panoptic label is corrupt",
+        ),
+        "a label of another divisor": (labelled(d, divisor=3), r"label FRONT/\d+: .* no classes from 0 to 28"),
+        "a label without divisor": (labelled(d, divisor=0), r"label FRONT/\d+: .* with the divisor 0"),
+    }  # fmt: skip
+
+
+def labelled(drive: Drive, **changes: Any) -> dict[str, Any]:
+    return {"labels": [replace(panoptic(drive.images[0].frame, 1, np.full((27, 48), 20)), **changes)]}
 
 
 @pytest.mark.parametrize("version", WRITERS)
-def test_poses_of_pixels_of_another_size_are_named(version, drive, written, tmp_path):
-    fewer = first(drive.sweeps, poses=drive.sweeps[0].poses[:, :50])
-    sentence = refusal(written(version, replace(drive, sweeps=fewer)), tmp_path / "results")
-    assert re.search(r"sweep TOP/\d+: its range image is 64x120, and the poses of its pixels are 64x50", sentence)
-
-
-def test_missing_poses_of_pixels_are_named(drive, written, tmp_path):
-    fewer = first(drive.sweeps, poses=None)
-    assert re.search(
-        r"sweep TOP/\d+: .*lidar_pose.* has no poses of its pixels",
-        refusal(written("v2", replace(drive, sweeps=fewer)), tmp_path),
-    )
-    assert re.search(
-        r"sweep TOP/\d+: its range image has 0 values", refusal(written("v1", replace(drive, sweeps=fewer)), tmp_path)
-    )
-
-
-def scaled(matrix: np.ndarray) -> np.ndarray:
-    return matrix * np.array([2.0, 2.0, 2.0, 1.0])[:, None]
-
-
-FAULTS: dict[str, tuple[Callable[[Drive], Drive], str]] = {
-    "an image pose that scales": (
-        lambda d: replace(d, images=first(d.images, pose=scaled(d.images[0].pose))),
-        r"image FRONT of frame \d+: its transform is not rigid",
-    ),
-    "a frame pose with NaN": (
-        lambda d: replace(d, frames=d.frames | {min(d.frames): np.full((4, 4), np.nan)}),
-        r"frame \d+: its transform is .* 4x4 matrix of finite numbers",
-    ),
-    "an image time of another clock": (
-        lambda d: replace(d, images=first(d.images, seconds=12.5)),
-        r"image FRONT of frame \d+: its time is 12\.5 s, more than a second from that of its frame",
-    ),
-    "a focal length of zero": (
-        lambda d: replace(d, cameras=first(d.cameras, intrinsic=[0.0] * 9)),
-        r"camera FRONT: its camera matrix is singular",
-    ),
-    "a camera without calibration": (
-        lambda d: replace(d, cameras=d.cameras[1:]),
-        r"camera FRONT: segment \w+ has no calibration of it",
-    ),
-    "a laser without calibration": (
-        lambda d: replace(d, lasers=d.lasers[1:]),
-        r"laser TOP: segment \w+ has range images of it, but no calibration",
-    ),
-    "inclinations from the top": (
-        lambda d: replace(d, lasers=[d.lasers[0], replace(d.lasers[1], lowest=0.5, highest=0.1)]),
-        r"laser FRONT: its least beam inclination 0\.5 is not below the greatest, 0\.1",
-    ),
-    "inclinations in degrees": (
-        lambda d: replace(d, lasers=first(d.lasers, inclinations=np.degrees(d.lasers[0].inclinations))),
-        r"laser TOP: its beam elevations .* radians",
-    ),
-    "two boxes of one object": (
-        lambda d: replace(d, boxes=[*d.boxes, d.boxes[0]]),
-        r"box .* it has two boxes in frame \d+",
-    ),
-    "a box without size": (
-        lambda d: replace(d, boxes=first(d.boxes, size=np.zeros(3))),
-        r"box .* in frame \d+: its size is .* three positive numbers",
-    ),
-    "a box at infinity": (
-        lambda d: replace(d, boxes=first(d.boxes, center=np.array([np.inf, 0.0, 0.0]))),
-        r"box .* in frame \d+: its centre .* not finite",
-    ),
-    "an image twice": (
-        lambda d: replace(d, images=[*d.images, d.images[0]]),
-        r"image FRONT of frame \d+: the segment has it twice",
-    ),
-    "a sweep twice": (
-        lambda d: replace(d, sweeps=[*d.sweeps, d.sweeps[0]]),
-        r"sweep TOP/\d+: the segment has it twice",
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_wrong_values_are_named_in_both_versions(fault, drive, written, tmp_path):
-    change, words = FAULTS[fault]
-    for version in WRITERS:
-        assert re.search(words, refusal(written(version, change(drive)), tmp_path / "results")), version
-
-
-LABELS = {
-    "no image": (
-        lambda label: replace(label, content=b"\x89PNG junk"),
-        r"label FRONT/\d+: its panoptic label is corrupt",
-    ),
-    "another divisor": (lambda label: replace(label, divisor=3), r"label FRONT/\d+: .* no classes from 0 to 28"),
-    "no divisor": (lambda label: replace(label, divisor=0), r"label FRONT/\d+: .* with the divisor 0"),
-}
-
-
-@pytest.mark.parametrize("fault", LABELS)
-def test_a_panoptic_label_that_cannot_be_is_named(fault, drive, written, tmp_path):
-    change, words = LABELS[fault]
-    label = change(panoptic(drive.images[0].frame, 1, np.full((27, 48), 20)))
-    for version in WRITERS:
-        assert re.search(words, refusal(written(version, replace(drive, labels=[label])), tmp_path / "results"))
+def test_wrong_values_are_named_in_both_versions(version, drive, tmp_path):
+    for fault, (change, words) in wrong_values(drive).items():
+        with fresh(tmp_path) as folder:
+            root = WRITERS[version](folder / "data", replace(drive, **change))
+            assert re.search(words, refusal(root, folder / "results")), fault
 
 
 @pytest.mark.parametrize("name", ["images", "sweeps"])

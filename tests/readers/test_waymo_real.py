@@ -11,6 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from google.protobuf.empty_pb2 import Empty
+from google.protobuf.unknown_fields import UnknownFieldSet
 from helpers import REPOSITORY, drives
 from PIL import Image
 
@@ -112,30 +114,12 @@ def waymos_rectangles() -> Iterator[tuple[int, str, list[float]]]:
         (camera,) = fields(labels, 1)
         for label in fields(labels, 2):
             (box,), (name,) = fields(label, 1), fields(label, 4)
-            x, y, height, width = (np.frombuffer(next(fields(box, field)), "<f8")[0] for field in (1, 2, 4, 5))
+            x, y, height, width = np.array([next(fields(box, i)) for i in (1, 2, 4, 5)], "<u8").view("<f8")
             yield camera, name.decode(), [x - width / 2, y - height / 2, x + width / 2, y + height / 2]
 
 
 def fields(message: bytes, wanted: int) -> Iterator[Any]:
-    """The values of a field of a message: numbers, and bytes of all other kinds."""
-    place = 0
-
-    def varint() -> int:
-        nonlocal place
-        value, shift = 0, 0
-        while True:
-            byte = message[place]
-            place, value, shift = place + 1, value | (byte & 127) << shift, shift + 7
-            if byte < 128:
-                return value
-
-    while place < len(message):
-        field, kind = divmod(varint(), 8)
-        length = {1: 8, 5: 4}.get(kind)
-        if kind == 0:
-            value = varint()
-        else:
-            length = varint() if length is None else length
-            value, place = message[place : place + length], place + length
-        if field == wanted:
-            yield value
+    """The values of a field of a message: numbers, and bytes of messages and texts."""
+    for field in UnknownFieldSet(Empty.FromString(message)):
+        if field.field_number == wanted:
+            yield field.data

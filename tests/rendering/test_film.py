@@ -1,4 +1,4 @@
-"""Films: what an independent reader finds in them, the cameras told beside them, and every way that ffmpeg can fail."""
+"""Films: what an independent reader finds in them, their cameras and parts, and every way that ffmpeg can fail."""
 
 import dataclasses
 import gc
@@ -6,6 +6,7 @@ import json
 import os
 import resource
 import subprocess
+import time
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,15 +15,17 @@ from typing import Any
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from helpers.hand_made_street import checkpoint_of
+from helpers.hand_made_street import Reels, a_format, checkpoint_of, street_actors, street_model, street_scene, views_of
 
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.io import video
+from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import Footage, read_footage, write_video
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rendering.film import film_size, render_film
+from drivesplat.rendering.film import BACKDROP, film_size, render_film, render_parts
+from drivesplat.rendering.frames import film_frame
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.images import ImageSettings
@@ -60,6 +63,14 @@ def decoded(path: Path) -> tuple[dict[str, Any], np.ndarray]:
     notes = next(reader)
     width, height = notes["size"]
     return notes, np.stack([np.frombuffer(data, np.uint8).reshape(height, width, 3) for data in reader])
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Where films go."""
+    path = tmp_path / "films"
+    path.mkdir()
+    return path
 
 
 @pytest.fixture
@@ -110,16 +121,8 @@ def failure(folder: Path, frames: Iterator[np.ndarray], crf: int = 18) -> str:
     return message
 
 
-@pytest.fixture
-def folder(tmp_path) -> Path:
-    """Where films go."""
-    path = tmp_path / "films"
-    path.mkdir()
-    return path
-
-
-@pytest.mark.parametrize(("count", "fps"), [(1, 30), (2, 30), (31, 24), (45, 7), (60, 240)])
-def test_a_film_has_every_frame_and_lasts_as_long(folder, count, fps):
+@pytest.mark.parametrize(("count", "fps"), [(1, 30), (31, 24), (45, 240)])
+def test_a_film_has_every_frame_lasts_as_long_and_can_be_played_before_it_is_loaded(folder, count, fps):
     path = folder / "street.mp4"
     write_video(path, noise(count), SIZE, fps, 30)
     notes, frames = decoded(path)
@@ -128,31 +131,23 @@ def test_a_film_has_every_frame_and_lasts_as_long(folder, count, fps):
     assert notes["duration"] == pytest.approx(count / fps, abs=0.006)  # ffmpeg prints hundredths of a second
     assert read_footage(path) == Footage(count, *SIZE, float(fps))
     assert list(folder.iterdir()) == [path]
+    content = path.read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
 
 
-def test_colours_and_orientation_survive_encoding(folder):
-    write_video(folder / "street.mp4", iter([quarters()] * 3), SIZE, FPS, 10)
-    notes, frames = decoded(folder / "street.mp4")
+def test_colours_and_orientation_survive_encoding_and_brightness_is_that_of_bt709(folder):
+    """ITU-R BT.709 in the narrow range: what a player assumes, whatever the tags say."""
+    path = folder / "street.mp4"
+    write_video(path, iter([quarters()] * 3), SIZE, FPS, 10)
+    notes, frames = decoded(path)
     assert notes["pix_fmt"].replace(" ", "").startswith("yuv420p(tv,bt709,")  # matrix, primaries and curve alike
     for frame in frames:
         np.testing.assert_allclose(in_quarters(frame), list(CORNERS.values()), atol=5)
-
-
-def test_brightness_is_that_of_bt709(folder):
-    """ITU-R BT.709 in the narrow range: what a player assumes, whatever the tags say."""
-    path = folder / "street.mp4"
-    write_video(path, iter([quarters()]), SIZE, FPS, 10)
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-f", "rawvideo", "-"]
     raw = subprocess.run(command, capture_output=True, check=True).stdout
     luma = np.frombuffer(raw[: WIDTH * HEIGHT], np.uint8).reshape(HEIGHT, WIDTH)
     expected = 16 + 219 * np.array(list(CORNERS.values())) / 255 @ [0.2126, 0.7152, 0.0722]
     np.testing.assert_allclose(in_quarters(luma), expected, atol=2)
-
-
-def test_a_film_can_be_played_before_it_is_loaded(folder):
-    write_video(folder / "street.mp4", noise(5), SIZE, FPS, 18)
-    content = (folder / "street.mp4").read_bytes()
-    assert 0 < content.index(b"moov") < content.index(b"mdat")
 
 
 def test_memory_does_not_grow_with_the_length_of_a_film(folder):
@@ -176,31 +171,24 @@ def test_memory_does_not_grow_with_the_length_of_a_film(folder):
     assert 1 <= most <= 3 and len(alive) == 0
 
 
-def test_an_earlier_film_is_replaced_only_by_a_whole_one(folder):
-    path = folder / "street.mp4"
-    write_video(path, noise(3), SIZE, FPS, 18)
-    before = path.read_bytes()
-
-    def broken() -> Iterator[np.ndarray]:
-        yield from noise(2)
-        raise ResultError("no more")
-
-    with pytest.raises(ResultError, match="no more"):
-        write_video(path, broken(), SIZE, FPS, 18)
-    assert path.read_bytes() == before and list(folder.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("error", [RuntimeError("lost"), KeyboardInterrupt()])
-@pytest.mark.parametrize("count", [0, 40])
-def test_frames_that_fail_leave_no_process_and_no_file(folder, started, error, count):
+@pytest.mark.parametrize(("count", "error"), [(0, RuntimeError("lost")), (40, KeyboardInterrupt())])
+def test_frames_that_fail_leave_no_process_no_file_and_an_earlier_film(folder, started, error, count):
     def broken() -> Iterator[np.ndarray]:
         yield from noise(count)
         raise error
 
-    with pytest.raises(type(error)) as raised:
-        write_video(folder / "street.mp4", broken(), SIZE, FPS, 18)
-    assert raised.value is error and len(started) == 1
-    assert_nothing_left(folder, started)
+    path = folder / "street.mp4"
+    for earlier in (None, b"the film before"):
+        if earlier:
+            path.write_bytes(earlier)
+        with pytest.raises(type(error)) as raised:
+            write_video(path, broken(), SIZE, FPS, 18)
+        assert raised.value is error and len(started) == 1
+        if earlier:
+            assert path.read_bytes() == earlier
+            path.unlink()
+        assert_nothing_left(folder, started)
+        started.clear()
 
 
 def test_a_missing_ffmpeg_is_reported(folder, monkeypatch):
@@ -222,26 +210,18 @@ def test_a_missing_ffmpeg_is_reported(folder, monkeypatch):
         ("head -c 100000 >/dev/null; kill -KILL $$", "ended by SIGKILL: it said nothing"),
         ("exec <&-; exec sleep 60", "took no more than"),
         ("head -c 1000000 /dev/zero | tr '\\0' x >&2; exit 3", "exit status 3: xxx"),
+        ("exec sleep 60", "took no more"),
+        ("cat >/dev/null; exec sleep 60 </dev/null", "an end"),
     ],
-    ids=["at once", "at the end", "midway with success", "killed", "closes its input", "wordy"],
+    ids=["at once", "at the end", "midway with success", "killed", "closes its input", "wordy", "hangs", "never ends"],
 )  # fmt: skip
-def test_a_crash_of_ffmpeg_is_reported_with_its_last_output(
+def test_a_crashing_or_hanging_ffmpeg_is_reported_with_its_last_output(
     folder, started, fake_ffmpeg, monkeypatch, script, fragment
 ):
-    monkeypatch.setattr(video, "PATIENCE", 1.0)
+    monkeypatch.setattr(video, "PATIENCE", 0.5)
     fake_ffmpeg(script)
     message = failure(folder, noise(40))
     assert "ffmpeg" in message and fragment in message and len(message) < 1200
-    assert_nothing_left(folder, started)
-
-
-@pytest.mark.parametrize(
-    ("script", "fragment"), [("exec sleep 60", "took no more"), ("cat >/dev/null; exec sleep 60 </dev/null", "an end")]
-)
-def test_a_hanging_ffmpeg_times_out(folder, started, fake_ffmpeg, monkeypatch, script, fragment):
-    monkeypatch.setattr(video, "PATIENCE", 0.5)
-    fake_ffmpeg(script)
-    assert fragment in failure(folder, noise(40))
     assert_nothing_left(folder, started)
 
 
@@ -281,13 +261,12 @@ BALL = np.array([30.0, 1.0, 1.5])
 """Where the models of these tests have their one white Gaussian: world coordinates, ahead of the tiny drive."""
 
 
-def a_checkpoint(**changes: Any) -> TrainedCheckpoint:
+def a_checkpoint() -> TrainedCheckpoint:
     """What a training leaves: one white ball in the dark."""
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1, init_opacity=0.9))
     part = Background.from_points(BALL[None].astype(np.float32), np.ones((1, 3)), settings.gaussians, 1.0)
     part.params["scales"].data.fill_(np.log(0.4))
-    content = checkpoint_of(SplatModel([part], None), settings)
-    return dataclasses.replace(content, model={**content.model, **changes})
+    return checkpoint_of(SplatModel([part], None), settings)
 
 
 def a_job(**changes: Any) -> FilmJob:
@@ -301,11 +280,10 @@ def a_job(**changes: Any) -> FilmJob:
 @pytest.mark.parametrize(
     ("recorded", "images", "given", "expected"),
     [
-        ((400, 225), None, {}, (400, 224)),
-        ((1600, 900), None, {}, (1600, 900)), ((1242, 375), None, {}, (1242, 376)),
+        ((400, 225), None, {}, (400, 224)), ((1242, 375), None, {}, (1242, 376)),
         ((3840, 2160), None, {}, (1920, 1080)), ((1080, 1920), None, {}, (1080, 1920)),
-        ((1600, 900), 400, {}, (400, 224)),
-        ((1600, 900), 400, {"width": 1920}, (1920, 1080)), ((1600, 900), None, {"height": 450}, (800, 450)),
+        ((1600, 900), 400, {}, (400, 224)), ((1600, 900), 400, {"width": 1920}, (1920, 1080)),
+        ((1600, 900), None, {"height": 450}, (800, 450)),
         ((400, 225), None, {"width": 576, "height": 324}, (576, 324)), ((4000, 20), 200, {}, (200, 16)),
     ],
 )  # fmt: skip
@@ -331,29 +309,23 @@ def middle_of_light(frame: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     "changes",
     [
-        {},
         {"trajectory": TrajectorySettings(lateral=2.0, vertical=0.5)},
         {"trajectory": TrajectorySettings(yaw=-8.0), "horizontal_fov": 50.0},
     ],
-    ids=["recorded", "aside", "turned"],
+    ids=["aside", "turned"],
 )
-def test_the_record_of_a_film_has_the_cameras_it_was_rendered_with(folder, tiny_scene, changes):
+def test_the_record_of_a_film_has_its_duration_and_the_cameras_it_was_rendered_with(folder, tiny_scene, changes):
     """The ball is where pinhole, K and pose of the record put it, in every frame."""
-    record = json.loads(json.dumps(filmed(tiny_scene, folder / "street.mp4", a_job(**changes))))
-    _, frames = decoded(folder / "street.mp4")
+    path, job = folder / "street.mp4", a_job(**changes)
+    record = json.loads(json.dumps(filmed(tiny_scene, path, job)))
+    notes, frames = decoded(path)
     assert len(frames) == record["frames"] == len(record["camera_to_world"])
     for frame, camera_to_world in zip(frames, record["camera_to_world"], strict=True):
         x, y, z, _ = np.linalg.inv(camera_to_world) @ [*BALL, 1.0]
         expected = np.array(record["K"]) @ [x / z, y / z, 1.0]
         np.testing.assert_allclose(middle_of_light(frame), expected[:2], atol=0.3)
-
-
-def test_a_film_lasts_as_long_as_the_drive_and_has_a_record(folder, tiny_scene):
-    offset = TrajectorySettings(lateral=2.0)
-    record = filmed(tiny_scene, folder / "street.mp4", a_job(trajectory=offset))
     times = [frame.timestamp for frame in tiny_scene.frames]
     assert (max(times) - min(times)) == 4_500_000
-    notes, _ = decoded(folder / "street.mp4")
     assert notes["duration"] == pytest.approx(4.5 + 1 / 10, abs=0.01)
     plain = {key: record[key] for key in ("schema", "camera", "fps", "width", "height", "frames", "duration_s")}
     assert plain == {
@@ -361,12 +333,73 @@ def test_a_film_lasts_as_long_as_the_drive_and_has_a_record(folder, tiny_scene):
     }  # fmt: skip
     assert record["timestamps"] == [min(times) + 100_000 * k for k in range(46)]
     assert record["origin"] == tiny_scene.origin.tolist()
-    assert record["offset"] == {"lateral": 2.0, "vertical": 0.0, "yaw": 0.0}
-    assert record["bytes"] == (folder / "street.mp4").stat().st_size
-    assert record["render_seconds"] > 0
+    asked = job.trajectory
+    assert record["offset"] == {"lateral": asked.lateral, "vertical": asked.vertical, "yaw": asked.yaw}
+    assert record["bytes"] == path.stat().st_size and record["render_seconds"] > 0
 
 
 def test_a_camera_that_the_scene_lacks_is_refused_before_any_output(folder, tiny_scene):
     with pytest.raises(DatasetError, match="CAM_BACK"):
         filmed(tiny_scene, folder / "street.mp4", a_job(camera="CAM_BACK"))
     assert not list(folder.iterdir())
+
+
+CPU = DeviceSettings(kind="cpu")
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene) -> Scene:
+    return street_scene(tiny_scene)
+
+
+@pytest.fixture
+def reels(monkeypatch) -> Reels:
+    made = Reels()
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", made)
+    return made
+
+
+def parts_film(scene: Scene, folder: Path, checkpoint: TrainedCheckpoint, **changes: Any) -> dict[str, Any]:
+    return render_parts(scene, checkpoint, a_format(**changes), CPU, folder / "parts.mp4")
+
+
+def test_scene_static_and_dynamic_parts_are_side_by_side(scene, tmp_path, reels):
+    """Each third is what a model of these parts alone shows, and a film of them; dynamic parts stand before grey
+    instead of the sky."""
+    whole = street_model()
+    still, actors = street_model(whole.parts[0]), SplatModel([street_actors()], None).requires_grad_(False)
+    checkpoint = checkpoint_of(whole)
+    record = parts_film(scene, tmp_path, checkpoint)
+    views = views_of(record, scene)
+    assert (record["shows"], len(reels["parts"])) == (["all", "still", "moving"], len(views))
+    thirds = np.split(reels["parts"], 3, axis=2)
+    for everything, without, alone, view in zip(*thirds, views, strict=True):
+        np.testing.assert_array_equal(everything, film_frame(whole, view))
+        np.testing.assert_array_equal(without, film_frame(still, view))
+        shown = actors.render(view)
+        expected = shown.splats + BACKDROP * (1 - shown.alpha[..., None])
+        np.testing.assert_allclose(alone, 255 * expected.clamp(max=1.0), atol=0.51)
+    assert 0.3 < (thirds[2] == round(255 * BACKDROP)).all(axis=-1).mean() < 0.9
+    for parts, panel in zip(("all", "static", "moving"), thirds, strict=True):
+        job = FilmJob(**a_format().model_dump(), trajectory=TrajectorySettings(parts=parts))
+        some = render_film(scene, checkpoint, job, CPU, tmp_path / "some.mp4")
+        np.testing.assert_array_equal(reels["some"], panel)
+        assert some["parts"] == parts and "parts" not in some["offset"]
+
+
+def test_rendering_does_not_run_far_ahead_of_the_encoder(scene, tmp_path, monkeypatch):
+    rendered = []
+    monkeypatch.setattr(
+        "drivesplat.rendering.film.film_frame", lambda *_: rendered.append(1) or np.zeros((36, 64, 3), np.uint8)
+    )
+
+    def encoder(path, frames, size, fps, crf, threads):
+        frames = iter(frames)
+        next(frames)
+        time.sleep(0.05)
+        assert 2 <= len(rendered) <= 2 * (1 + THREADS + 1)
+        assert len([*frames]) > 2 * THREADS
+        path.write_bytes(b"")
+
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", encoder)
+    parts_film(scene, tmp_path, checkpoint_of(street_model()))

@@ -51,11 +51,8 @@ def test_a_frame_is_submitted_before_the_one_before_it_is_waited_for():
     assert frames(FakeGpu(), 1) == [0] and frames(FakeGpu(), 0) == []
 
 
-def test_a_frame_whose_lists_overflowed_is_rendered_again():
+def test_a_frame_whose_lists_overflowed_is_rendered_again_and_one_with_nan_an_error_at_its_turn():
     assert frames(FakeGpu({1: (True, CAPACITY + 1), 2: (False, CAPACITY + 1)}), 4) == [0, 101, 102, 3]
-
-
-def test_a_frame_with_nan_is_an_error_at_its_turn():
     frames_of_film = _pipelined(FakeGpu({1: (False, CAPACITY)}).submit, range(3))
     np.testing.assert_array_equal(next(frames_of_film), np.zeros((1, 1, 3)))
     with pytest.raises(ResultError, match="NaN or Inf"):
@@ -125,9 +122,12 @@ def needing(entries: int):
     return looking_at([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], time=float(entries))
 
 
-def test_all_frames_but_the_first_replay_one_graph(film):
+def test_all_frames_of_an_image_size_but_the_first_replay_one_graph(film):
     assert film.made(*map(needing, (100, 90, 150, 100))) == [RENDERED] + [REPLAYED] * 3
     assert film.captured == [[100]]
+    wider = replace(needing(100), width=needing(100).width + 1)
+    assert film.made(needing(100), wider, needing(100)) == [REPLAYED] * 3
+    assert len(film.captured) == 3
 
 
 def test_a_film_whose_lists_overflow_is_captured_anew_once(film):
@@ -136,12 +136,6 @@ def test_a_film_whose_lists_overflow_is_captured_anew_once(film):
         RENDERED, REPLAYED, RENDERED, RENDERED, REPLAYED, REPLAYED, REPLAYED
     ]  # fmt: skip
     assert film.captured == [[100], [160]]
-
-
-def test_a_graph_has_one_image_size(film):
-    wider = replace(needing(100), width=needing(100).width + 1)
-    assert film.made(needing(100), needing(100), wider, needing(100)) == [RENDERED] + [REPLAYED] * 3
-    assert len(film.captured) == 3
 
 
 def test_frames_with_own_gaussians_or_of_a_rig_camera_are_not_captured(film):

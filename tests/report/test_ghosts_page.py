@@ -26,13 +26,10 @@ def test_pictures_are_part_of_the_page(tmp_path):
     assert 'alt="two cars"' in page and "lost" not in page
 
 
-def test_without_the_document_the_page_names_the_fixes_and_it(tmp_path):
-    page = render_ghosts_page(tmp_path / "ghosts.md")
-    assert "docs/ghosts.md" in page and all(fix.adds in page for fix in PUBLISHED_FIXES)
-
-
-def test_links_and_markup_of_the_document(tmp_path):
+def test_links_and_markup_of_the_document_or_without_it_the_fixes(tmp_path):
     document = tmp_path / "ghosts.md"
+    page = render_ghosts_page(document)
+    assert "docs/ghosts.md" in page and all(fix.adds in page for fix in PUBLISHED_FIXES)
     document.write_text("[`street`](street.md#a) and [paper](https://x.org/1)\n\n| a | b |\n|---|---|\n| 1 | 2 |\n")
     page = render_ghosts_page(document)
     assert "<code>street</code> and" in page and "street.md" not in page and "<td>2</td>" in page

@@ -38,9 +38,8 @@ def results(tmp_path_factory) -> Path:
         write_json(folder / scene / "metrics.json", metrics(scene, measured, stages(METHODS)))
     log = folder / "logs/1100/street/train.log"
     log.parent.mkdir(parents=True)
-    log.write_text(
-        "2026-11-21 23:32:06,793 ERROR drivesplat.workflow.job: street/train 1100: <b>no memory</b> & more\n"
-    )
+    error = "ERROR drivesplat.workflow.job: street/train 1100: <b>no memory</b> & more"
+    log.write_text(f"2026-11-21 23:32:06,793 {error}\n")
     return folder
 
 
@@ -59,8 +58,13 @@ def page_of(results: Path) -> str:
     return report_page(made(results), collect_media(files, results))
 
 
-def test_a_page_requests_nothing(results):
-    page = page_of(results)
+@pytest.fixture(scope="module")
+def page(results) -> str:
+    return page_of(results)
+
+
+def test_a_page_requests_nothing_and_is_deterministic(results, page):
+    assert page == page_of(results)
     assert "default-src 'none'" in page and "<script src" not in page and '<link rel="stylesheet' not in page
     addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert len(addresses) > 20
@@ -74,16 +78,14 @@ NAMESPACES = {
 }  # fmt: skip
 
 
-def test_a_page_lists_missing_scenes_with_reasons(results):
-    page = page_of(results)
+def test_a_page_lists_missing_scenes_with_reasons(results, page):
     assert "Partial: 4 of 5 configured scenes" in page
     assert "<b>1100</b>: street/train: &lt;b&gt;no memory&lt;/b&gt; &amp; more" in page
     whole = {**made(results), "partial": False, "missing": []}
     assert "Partial" not in report_page(whole, {}) and "Not in the table" not in report_page(whole, {})
 
 
-def test_a_page_has_the_images_and_links_of_its_methods(results):
-    page = page_of(results)
+def test_a_page_has_the_images_and_links_of_its_methods(results, page):
     assert page.count("data:image/jpeg") == len(GAPS) * len(METHODS) * len(PICTURES)
     assert 'href="0061/vanilla/original.mp4"' in page and "key frame 12, held out between training frames" in page
     film = report_page(made(results), collect_media([results / "0061/compare.mp4"], results))
@@ -92,9 +94,8 @@ def test_a_page_has_the_images_and_links_of_its_methods(results):
     assert "data:image/jpeg" not in bare and ".mp4" not in bare and 'id="scene-0061"' in bare
 
 
-def test_a_page_has_the_metrics_of_whole_images_and_a_glossary(results):
+def test_a_page_has_the_metrics_of_whole_images_and_a_glossary(page):
     """PSNR, SSIM, LPIPS, Gaussians and training time of every scene and method, and which way each is better."""
-    page = page_of(results)
     tables = re.findall(r"<h3>([^<]*)</h3>\s*<div class=\"card wide\">(<table.*?</table>)", page, re.S)
     titles = [title for title, _ in tables]
     assert titles == ["Moving vehicles and static pixels: PSNR in dB", "Whole images, with the cost of training"]
@@ -113,20 +114,13 @@ def test_a_page_has_the_metrics_of_whole_images_and_a_glossary(results):
     assert "Higher is better" in dict(explained)["PSNR"] and "Lower is better" in dict(explained)["LPIPS"]
 
 
-def test_a_page_is_deterministic(results):
-    assert page_of(results) == page_of(results)
-
-
 def test_large_images_are_reduced(tmp_path):
-    paint(tmp_path / "wide.png", 100, (2000, 500))
-    paint(tmp_path / "small.png", 100, (160, 90))
-    sizes = []
-    for name in ("wide", "small"):
-        address = data_url(read_image(tmp_path / f"{name}.png"))
+    for size, expected in (((2000, 500), (MAX_WIDTH, MAX_WIDTH // 4)), ((160, 90), (160, 90))):
+        paint(tmp_path / "a.png", 100, size)
+        address = data_url(read_image(tmp_path / "a.png"))
         picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
-        sizes.append(picture.size)
+        assert picture.size == expected
         np.testing.assert_allclose(np.asarray(picture)[5, 5], [100, 200, 155], atol=4)
-    assert sizes == [(MAX_WIDTH, MAX_WIDTH // 4), (160, 90)]
 
 
 def test_media_are_collected_by_scene_and_method(tmp_path):
@@ -151,9 +145,9 @@ def test_the_plot_has_a_dot_for_every_scene_with_moving_vehicles(results):
 
 
 @in_a_browser
-def test_in_a_browser_sorting_and_sliders_work_without_requests(results, tmp_path):
+def test_in_a_browser_sorting_and_sliders_work_without_requests(page, tmp_path):
     file = tmp_path / "gap_report.html"
-    file.write_text(page_of(results), encoding="utf-8")
+    file.write_text(page, encoding="utf-8")
     cells = "[...document.querySelector('table.sortable').tBodies[0].rows].map((row) => row.cells[5].dataset.value)"
     head = "document.querySelectorAll('th[data-column]')[5]"
     with chromium(tmp_path / "profile") as tab:

@@ -24,7 +24,7 @@ def test_far_points_around_the_horizon_are_on_their_side(angles):
     """Points a kilometre away, a little more and a little less than the margin below the camera's height."""
     pose = camera(**angles)
     mask = below_horizon(K, pose, SIZE)
-    assert mask.any() and not mask.all()
+    assert mask.shape == (48, 64) and mask.any() and not mask.all()
     seen = 0
     for azimuth in np.radians(np.arange(0.0, 360.0, 2.0)):
         for elevation, expected in ((-HORIZON_MARGIN - 0.02, True), (-HORIZON_MARGIN + 0.02, False)):
@@ -42,7 +42,3 @@ def test_far_points_around_the_horizon_are_on_their_side(angles):
 def test_a_camera_that_looks_up_sees_nothing_below_and_one_that_looks_down_nothing_else():
     assert not below_horizon(K, camera(pitch=-60.0), SIZE).any()
     assert below_horizon(K, camera(pitch=60.0), SIZE).all()
-
-
-def test_the_mask_has_the_images_size():
-    assert below_horizon(K, camera(), SIZE).shape == (48, 64)

@@ -35,9 +35,12 @@ def test_images_keep_their_aspect_ratio(recorded, width, size):
     assert target_size(frame(*recorded), ImageSettings(width=width)) == size
 
 
-def test_at_recorded_size_the_centre_of_the_first_pixel_is_at_half_a_pixel():
+def test_intrinsics_count_from_the_images_corner_and_scale_each_axis_separately():
     k = continuous_intrinsics(frame(cx=10.0, cy=20.0), (1600, 900))
     np.testing.assert_allclose(k, [[1000.0, 0.0, 10.5], [0.0, 1100.0, 20.5], [0.0, 0.0, 1.0]])
+    k = continuous_intrinsics(frame(1600, 900), (100, 56))
+    np.testing.assert_allclose(k[0], [1000.0 / 16, 0.0, 800.0 / 16])
+    np.testing.assert_allclose(k[1], [0.0, 1100.0 * 56 / 900, 450.0 * 56 / 900])
 
 
 def test_halving_maps_the_corner_between_four_pixels_to_the_centre_of_their_merged_pixel():
@@ -47,12 +50,6 @@ def test_halving_maps_the_corner_between_four_pixels_to_the_centre_of_their_merg
     ray = np.linalg.inv(source.intrinsics) @ [*corner, 1.0]
     x, y, _ = continuous_intrinsics(source, (8, 5)) @ ray
     np.testing.assert_allclose([x, y], [3.5, 2.5], atol=1e-12)
-
-
-def test_another_aspect_ratio_scales_each_axis_separately():
-    k = continuous_intrinsics(frame(1600, 900), (100, 56))
-    np.testing.assert_allclose(k[0], [1000.0 / 16, 0.0, 800.0 / 16])
-    np.testing.assert_allclose(k[1], [0.0, 1100.0 * 56 / 900, 450.0 * 56 / 900])
 
 
 def test_resizing_to_a_half_averages_blocks_of_four(tmp_path):
@@ -69,35 +66,31 @@ def encoded(format: str) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("format", ["JPEG", "PNG"])
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.05, 0.3, 0.6, 0.9])
+BROKEN = [
+    *(whole[: int(share * len(whole))] for whole in map(encoded, ("JPEG", "PNG")) for share in (0.0, 0.01, 0.3, 0.9)),
+    b"not an image", b"\0" * 1000, b"\xff\xd8\xff\xe0" + b"\1" * 100, b"\x89PNG\r\n\x1a\n",
+]  # fmt: skip
+"""Truncated and foreign files."""
+
+
 @pytest.mark.parametrize("read", [read_image, lambda path: read_mask(path, (64, 64))], ids=["image", "mask"])
-def test_a_truncated_image_is_refused_naming_it(tmp_path, format, share, read):
-    whole = encoded(format)
-    (tmp_path / "cut.jpg").write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(DatasetError, match=r"cut\.jpg"):
-        read(tmp_path / "cut.jpg")
+def test_a_truncated_or_foreign_file_is_refused_naming_it(tmp_path, read):
+    for content in BROKEN:
+        (tmp_path / "cut.jpg").write_bytes(content)
+        with pytest.raises(DatasetError, match=r"cut\.jpg"):
+            read(tmp_path / "cut.jpg")
 
 
-@pytest.mark.parametrize(
-    "content", [b"not an image", b"\0" * 1000, b"\xff\xd8\xff\xe0" + b"\1" * 100, b"\x89PNG\r\n\x1a\n"]
-)
-@pytest.mark.parametrize("read", [read_image, lambda path: read_mask(path, (64, 64))], ids=["image", "mask"])
-def test_a_foreign_file_is_refused_naming_it(tmp_path, content, read):
-    (tmp_path / "foreign.jpg").write_bytes(content)
-    with pytest.raises(DatasetError, match=r"foreign\.jpg"):
-        read(tmp_path / "foreign.jpg")
-
-
-@pytest.mark.parametrize("position", range(8, 60))
-def test_a_damaged_png_is_read_or_refused_naming_it(tmp_path, position):
-    content = bytearray(encoded("PNG"))
-    content[position] ^= 0xFF
-    (tmp_path / "damaged.png").write_bytes(content)
-    try:
-        assert read_image(tmp_path / "damaged.png").dtype == np.uint8
-    except DatasetError as error:
-        assert "damaged.png" in str(error)
+def test_a_damaged_png_is_read_or_refused_naming_it(tmp_path):
+    whole = encoded("PNG")
+    for position in range(8, 60):
+        content = bytearray(whole)
+        content[position] ^= 0xFF
+        (tmp_path / "damaged.png").write_bytes(content)
+        try:
+            assert read_image(tmp_path / "damaged.png").dtype == np.uint8
+        except DatasetError as error:
+            assert "damaged.png" in str(error)
 
 
 def test_labels_keep_their_values_when_a_mask_is_resized(tmp_path):
@@ -105,11 +98,16 @@ def test_labels_keep_their_values_when_a_mask_is_resized(tmp_path):
     Image.fromarray(np.kron(labels, np.ones((3, 3), dtype=np.uint8))).save(tmp_path / "labels.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "labels.png", (8, 6)), labels)
     np.testing.assert_array_equal(np.unique(read_mask(tmp_path / "labels.png", (11, 7))), [0, 3, 9])
-
-
-def test_a_black_and_white_mask_reads_as_0_and_255(tmp_path):
     Image.fromarray(np.array([[True, False]])).save(tmp_path / "sky.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "sky.png", (2, 1)), [[255, 0]])
+    np.testing.assert_array_equal(read_mask(tmp_path / "sky.png", (2, 1)), [[255, 0]]), "black and white"
+
+
+def test_a_mask_of_colours_or_more_than_8_bits_is_refused(tmp_path):
+    for mode in ("RGB", "RGBA", "I;16", "I", "F", "CMYK"):
+        content = np.random.default_rng(0).bytes(8 * 6 * {"RGB": 3, "I;16": 2}.get(mode, 4))
+        Image.frombytes(mode, (8, 6), content).save(tmp_path / "mask.tif")
+        with pytest.raises(DatasetError, match=r"mask\.tif has colours or more than 8 bits"):
+            read_mask(tmp_path / "mask.tif", (8, 6))
 
 
 def camera() -> np.ndarray:

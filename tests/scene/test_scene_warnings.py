@@ -37,16 +37,13 @@ PATHS = {
 
 
 @pytest.mark.parametrize(("path", "metres", "stands"), PATHS.values(), ids=PATHS)
-@pytest.mark.parametrize("between", [True, False])
-def test_displacement_and_standing_time_of_a_path(tiny_scene, path, metres, stands, between):
-    scene = at(tiny_scene, path, between)
-    assert max_displacement(scene) == pytest.approx(metres, abs=0.11 if metres else 1e-9)
-    assert standing_time(scene) == pytest.approx(stands) and duration(scene) == pytest.approx(4.5)
-
-
-def test_a_single_image_has_no_displacement_and_no_duration(tiny_scene):
-    scene = dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:1])
-    assert (max_displacement(scene), standing_time(scene), duration(scene)) == (0.0, 0.0, 0.0)
+def test_displacement_and_standing_time_of_a_path(tiny_scene, path, metres, stands):
+    for between in (True, False):
+        scene = at(tiny_scene, path, between)
+        assert max_displacement(scene) == pytest.approx(metres, abs=0.11 if metres else 1e-9)
+        assert standing_time(scene) == pytest.approx(stands) and duration(scene) == pytest.approx(4.5)
+    scene = dataclasses.replace(scene, frames=scene.frames[:1])
+    assert (max_displacement(scene), standing_time(scene), duration(scene)) == (0.0, 0.0, 0.0), "a single image"
 
 
 def still(scene: Scene, *categories: str) -> Scene:
@@ -91,11 +88,7 @@ def test_each_warning_is_one_sentence_and_ordinary_drives_have_none(tiny_scene, 
     found = scene_warnings(change(tiny_scene), brightness)
     assert [sentence[: len(start)] for sentence, start in zip(found, expected, strict=True)] == expected
     assert not any("\n" in sentence for sentence in found)
-
-
-def test_without_boxes_street_is_said_to_have_the_parts_of_vanilla(tiny_scene):
-    (found,) = scene_warnings(dataclasses.replace(tiny_scene, tracks=()), DAY)
-    assert "; street has the parts of vanilla and differs in its losses alone (methods: {street: null} leaves" in found
+    assert expected != [BARE] or "; street has the parts of vanilla and differs in its losses alone (meth" in found[0]
 
 
 def test_luminance_is_averaged_over_the_whole_drive(tiny_scene, tmp_path):
@@ -107,20 +100,10 @@ def test_luminance_is_averaged_over_the_whole_drive(tiny_scene, tmp_path):
     assert luminance(dataclasses.replace(tiny_scene, frames=tuple(frames))) == pytest.approx(0.4, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("world", "expected"),
-    [
-        (World(key_frames=2), []),
-        (World(key_frames=2, speed=0.0), ["the car hardly moves"]),
-        (World(key_frames=2, light=0.2), ["the images are dark"]),
-        (World(key_frames=2, things=World().things[1:2]), ["no vehicle moves"]),
-    ],
-    ids=["ordinary", "stands", "dark", "nothing moves"],
-)
-def test_the_extraction_logs_one_line_per_warning(tmp_path, caplog, world, expected):
+def test_the_extraction_logs_one_line_per_warning(tmp_path, caplog):
+    world = World(key_frames=2, speed=0.0, light=0.2, things=World().things[1:2])
     with caplog.at_level(logging.WARNING, logger="drivesplat.preprocess.extract"):
         scene_at(write_world(tmp_path, world))
-    messages = [record.getMessage() for record in caplog.records]
-    assert [message.startswith(f"scene 0001: {start}") for message, start in zip(messages, expected, strict=True)] == [
-        True for _ in expected
-    ]
+    expected = "the car hardly moves", "the images are dark", "no vehicle moves"
+    for record, start in zip(caplog.records, expected, strict=True):
+        assert record.getMessage().startswith(f"scene 0001: {start}")

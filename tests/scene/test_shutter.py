@@ -92,8 +92,8 @@ def test_a_shutter_needs_a_readout_and_two_poses_near_in_time(cameras, times, kn
     assert [shutter is not None for shutter in shutters(scene_of(*cameras, times=times))] == known
 
 
-@pytest.mark.parametrize("readout", [(0.0, 0.04, 0.0), (0.044, 0.0, 0.004), (-0.044, 0.0, -0.003), (0.0, -0.03, 0.0)])
-@pytest.mark.parametrize("velocity", [(0, 0, 10, 0, 0.3, 0), (10, 0, 0, 0, 0, 0), (1, 0, 12, 0.05, 0.4, 0.05)])
+@pytest.mark.parametrize("readout", [(0.0, 0.04, 0.0), (-0.044, 0.0, -0.003)])
+@pytest.mark.parametrize("velocity", [(10, 0, 0, 0, 0, 0), (1, 0, 12, 0.05, 0.4, 0.05)])
 @pytest.mark.parametrize("moves", [False, True])
 def test_points_are_seen_where_they_are_at_the_time_of_their_line(readout, velocity, moves):
     random = np.random.default_rng(0)

@@ -26,22 +26,20 @@ def refusal(methods: dict[str, Any]) -> str:
     return str(error.value)
 
 
-def test_a_method_inherits_what_it_does_not_give():
-    mine = methods_of({"mine": {"of": "street"}})["mine"]
-    assert (mine.parts, mine.tracks, mine.overrides) == (("background", "actors"), "annotated", STREET)
-
-
-def test_parts_and_tracks_replace_those_of_the_base():
-    made = methods_of({"mine": {"of": "street", "parts": ["background"], "tracks": "none"}})["mine"]
-    assert (made.parts, made.tracks, made.overrides) == (("background",), "none", STREET)
-
-
-def test_overrides_are_laid_over_the_bases_key_by_key():
+def test_a_method_inherits_what_it_does_not_give_and_replaces_or_merges_what_it_gives():
     overrides = {"sky": "none", "train": {"road": {"reach": 0.2}, "dropout": 0.0}}
-    made = methods_of({"mine": {"of": "street", "overrides": overrides}})
-    road = {"surface": "lidar", "reach": 0.2}
-    assert made["mine"].overrides == {"sky": "none", "train": {**STREET["train"], "road": road, "dropout": 0.0}}
-    assert made["street"].overrides == STREET, "the base stays as it is"
+    given = {
+        "same": {"of": "street"},
+        "static": {"of": "street", "parts": ["background"], "tracks": "none"},
+        "merged": {"of": "street", "overrides": overrides},
+    }
+    made = methods_of(given)
+    found = {name: (made[name].parts, made[name].tracks, made[name].overrides) for name in (*given, "street")}
+    base, road = (("background", "actors"), "annotated", STREET), {"surface": "lidar", "reach": 0.2}
+    over = {"sky": "none", "train": {**STREET["train"], "road": road, "dropout": 0.0}}
+    assert found == {
+        "same": base, "static": (("background",), "none", STREET), "merged": (*base[:2], over), "street": base
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("order", [["a", "b", "c"], ["c", "b", "a"]])
@@ -68,15 +66,16 @@ def test_a_method_can_be_of_a_shipped_one_that_is_dropped():
     assert list(made) == ["mine"] and made["mine"].overrides == STREET
 
 
-def test_a_dropped_method_of_a_user_cannot_be_built_on():
-    message = refusal({"first": None, "mine": {"of": "first"}})
-    assert message == "method 'mine' is of 'first', which is no method of the config; there are: vanilla, street, mine"
-
-
-def test_a_method_of_an_unknown_one_is_refused_with_what_was_meant():
-    message = refusal({"mine": {"of": "stret"}})
-    assert message.startswith("method 'mine' is of 'stret', which is no method of the config; did you mean street? ")
-    assert message.endswith("there are: vanilla, street, mine")
+@pytest.mark.parametrize(
+    ("methods", "message"),
+    [
+        ({"first": None, "mine": {"of": "first"}}, "'first', which is no method of the config; "),
+        ({"mine": {"of": "stret"}}, "'stret', which is no method of the config; did you mean street? "),
+    ],
+    ids=["dropped", "misspelled"],
+)
+def test_a_method_of_one_that_there_is_none_of_is_refused_with_those_there_are(methods, message):
+    assert refusal(methods) == f"method 'mine' is of {message}there are: vanilla, street, mine"
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,6 @@ def test_figures_of_whole_images_between_training_images_are_the_default():
     (found,) = load({"published": [ENTRY]}).published
     assert (found.group, found.region, found.scenes, found.ssim) == ("interpolation", "all", None, None)
     assert load({}).published == ()
-
-
-def test_groups_and_regions_are_those_of_metrics_json():
     fields = PublishedFigures.model_fields
     assert get_args(fields["group"].annotation) == HELD_OUT_GROUPS
     assert get_args(fields["region"].annotation) == tuple(REGIONS)

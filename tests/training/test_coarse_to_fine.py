@@ -92,15 +92,10 @@ def images_of(height: int, count: int = 3, **changes: float) -> TrainingImages:
     return TrainingImages([a_view(16, height) for _ in range(count)], Schedule.of(settings, count), seed=7)
 
 
-def test_images_are_not_reduced_by_default():
-    images = images_of(4 * MIN_HEIGHT)
-    assert {images.factor(step) for step in range(100)} == {1}
-    assert images.at(5) is images.views[view_index(3, 5, 7)] is images.views[images.number(5)]
-
-
 @pytest.mark.parametrize(
     ("height", "changes", "expected"),
     [
+        (4 * MIN_HEIGHT, {}, [1] * 100),
         (4 * MIN_HEIGHT, {"quarter_until": 0.2, "half_until": 0.5}, [4] * 20 + [2] * 30 + [1] * 50),
         (4 * MIN_HEIGHT, {"half_until": 0.3}, [2] * 30 + [1] * 70),
         (4 * MIN_HEIGHT, {"quarter_until": 0.3}, [4] * 30 + [1] * 70),
@@ -112,6 +107,7 @@ def test_images_are_reduced_as_long_as_the_settings_say_and_never_to_few_rows(he
     images = images_of(height, **changes)
     assert [images.factor(step) for step in range(100)] == expected
     assert [images.at(step).pixels.shape[0] for step in (0, 99)] == [height // expected[0], height]
+    assert images.at(99) is images.views[view_index(3, 99, 7)] is images.views[images.number(99)]
 
 
 def test_reduced_images_come_in_the_order_of_whole_ones_and_once_each_is_made(monkeypatch):

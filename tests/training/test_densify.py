@@ -31,13 +31,7 @@ BINOMS = MCMCStrategy().initialize_state()["binoms"]
 N_MAX = len(BINOMS)
 SIZES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
 """Of a Gaussian's parameters."""
-
-
-def relocated(opacity: float, ratio: int, scale: float = 1.0) -> tuple[float, float]:
-    """`relocation` of one isotropic Gaussian."""
-    opacities, scales = relocation(torch.tensor([opacity]), torch.full((1, 3), scale), torch.tensor([ratio]), BINOMS)
-    assert scales[0, 0] == scales[0, 1] == scales[0, 2]
-    return float(opacities[0]), float(scales[0, 0])
+"""Of a Gaussian's parameters."""
 
 
 def equation_9(opacity: float, ratio: int) -> float:
@@ -51,38 +45,16 @@ def equation_9(opacity: float, ratio: int) -> float:
     return opacity / math.fsum(terms)
 
 
-@pytest.mark.parametrize("ratio", [1, 2, 3, 7, 20, N_MAX])
-@pytest.mark.parametrize("opacity", [0.02, 0.3, 0.9, 0.999])
-def test_copies_at_one_place_are_together_as_opaque_as_the_original(opacity, ratio):
-    new_opacity, _ = relocated(opacity, ratio)
-    assert 1.0 - (1.0 - new_opacity) ** ratio == pytest.approx(opacity, rel=5e-4)
-
-
-@pytest.mark.parametrize("ratio", [1, 2, 3, 7, 20, N_MAX])
-@pytest.mark.parametrize("opacity", [0.02, 0.3, 0.9, 0.999])
-def test_copies_are_scaled_by_equation_9(opacity, ratio):
-    _, new_scale = relocated(opacity, ratio, scale=2.5)
-    assert new_scale == pytest.approx(2.5 * equation_9(opacity, ratio), rel=5e-4)
-
-
-def test_one_copy_is_the_original():
-    opacities, scales = torch.tensor([0.1, 0.5, 0.98]), torch.tensor([[1.0, 2.0, 3.0]] * 3)
-    new_opacities, new_scales = relocation(opacities, scales, torch.ones(3, dtype=torch.long), BINOMS)
-    torch.testing.assert_close(new_opacities, opacities)
-    torch.testing.assert_close(new_scales, scales)
-
-
-@pytest.mark.parametrize(("ratio", "taken_for"), [(0, 1), (N_MAX + 1, N_MAX), (10_000, N_MAX)])
-def test_ratios_beyond_the_table_are_held_at_its_ends(ratio, taken_for):
-    assert relocated(0.7, ratio) == relocated(0.7, taken_for)
-
-
-def test_every_gaussian_is_relocated_by_its_own_ratio():
-    opacities, ratios = torch.linspace(0.05, 0.95, 12), torch.arange(1, 13)
-    scales = torch.rand(12, 3, generator=torch.Generator().manual_seed(0)) + 0.1
-    _, new_scales = relocation(opacities, scales, ratios, BINOMS)
-    factors = [equation_9(float(o), int(n)) for o, n in zip(opacities, ratios, strict=True)]
-    torch.testing.assert_close(new_scales, scales * torch.tensor(factors)[:, None], rtol=1e-4, atol=0)
+def test_copies_are_together_as_opaque_as_the_original_and_scaled_by_equation_9():
+    """Every Gaussian by its own ratio; those beyond the table are held at its ends."""
+    pairs = [(o, n) for o in (0.02, 0.3, 0.9, 0.999) for n in (0, 1, 2, 3, 7, 20, N_MAX, N_MAX + 1, 10_000)]
+    opacities, ratios = torch.tensor([o for o, _ in pairs]), torch.tensor([n for _, n in pairs])
+    scales = torch.rand(len(pairs), 3, generator=torch.Generator().manual_seed(0)) + 0.1
+    new_opacities, new_scales = relocation(opacities, scales, ratios, BINOMS)
+    held = ratios.clamp(1, N_MAX)
+    torch.testing.assert_close(1.0 - (1.0 - new_opacities.double()) ** held, opacities.double(), rtol=5e-4, atol=0)
+    factors = torch.tensor([equation_9(o, int(n)) for (o, _), n in zip(pairs, held, strict=True)])
+    torch.testing.assert_close(new_scales, scales * factors[:, None], rtol=5e-4, atol=0)
 
 
 def test_gsplats_own_functions_are_restored_after_cpu_strategies():
@@ -133,14 +105,15 @@ def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
     assert counts == [100, 100, 105, 105, 110, 110, 115, 115, 118, 118, 118, 118]
 
 
-def test_there_are_coarse_cap_in_time_to_become_all():
+@pytest.mark.parametrize(
+    ("strategy", "fraction", "expected"),
+    [("mcmc", 0.75, (750, 800 - 7 * 20)), ("mcmc", 1.0, (1000, 0)), ("default", 0.75, (1000, 0))],
+)
+def test_there_are_coarse_cap_in_time_to_become_all(strategy, fraction, expected):
     """A third more needs six times a twentieth, and another for what is rounded away."""
-    coarse = CoarseToFineSettings(fraction=0.75)
-    overrides = {"coarse_to_fine": coarse, "refine_stop": 0.8, "mcmc": McmcSettings(refine_every=20)}
-    assert coarse_cap(1000, Schedule.of(settings_of("mcmc", **overrides), 1)) == (750, 800 - 7 * 20)
-    alike = {**overrides, "coarse_to_fine": CoarseToFineSettings(fraction=1.0)}
-    assert coarse_cap(1000, Schedule.of(settings_of("mcmc", **alike), 1)) == (1000, 0)
-    assert coarse_cap(1000, Schedule.of(settings_of("default", **overrides), 1)) == (1000, 0)
+    coarse = CoarseToFineSettings(fraction=fraction)
+    settings = settings_of(strategy, coarse_to_fine=coarse, refine_stop=0.8, mcmc=McmcSettings(refine_every=20))
+    assert coarse_cap(1000, Schedule.of(settings, 1)) == expected
 
 
 def test_while_images_are_reduced_the_cap_is_lower(monkeypatch):
@@ -148,21 +121,25 @@ def test_while_images_are_reduced_the_cap_is_lower(monkeypatch):
     model, settings = a_model(100), settings_of("mcmc", cap_max=200, mcmc=McmcSettings(refine_every=1))
     densifier, (optimizers,) = Densifier(model.parts[0], Schedule.of(settings, 1)), make_optimizers(model).parts
     counts = []
-    for step, coarse in enumerate([True, True, True, False, False], start=2):
+    for step, coarse in enumerate([True, True, False, False], start=2):
         train_step(model, densifier, step, optimizers, coarse)
         counts.append(len(model))
-    assert counts == [120, 120, 120, 180, 200]
+    assert counts == [120, 120, 180, 200]
+
+
+def after_mcmc(model: SplatModel, step: int, cap_max: int, noise_lr: float = 0.0) -> None:
+    """Densifies a model once, or between densifications adds noise alone."""
+    settings = settings_of("mcmc", cap_max=cap_max, mcmc=McmcSettings(refine_every=2, noise_lr=noise_lr))
+    (optimizers,) = make_optimizers(model).parts
+    torch.manual_seed(0)
+    Densifier(model.parts[0], Schedule.of(settings, 1)).after_step(step, optimizers, {}, ALL)
 
 
 def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
-    model, settings = a_model(), settings_of("mcmc", cap_max=100)
-    part = model.parts[0]
-    densifier, (optimizers,) = Densifier(part, Schedule.of(settings, 1)), make_optimizers(model).parts
-    with torch.no_grad():
-        part.params["opacities"][:30] = -9.0
+    part = (model := a_model()).parts[0]
+    part.params["opacities"].data[:30] = -9.0
     living = part.params["means"].detach()[30:].clone()
-    torch.manual_seed(0)
-    densifier.after_step(2, optimizers, {}, ALL)
+    after_mcmc(model, 2, 100)
     assert len(model) == 100
     moved = part.params["means"].detach()[:30]
     assert ((moved[:, None] - living).abs().amax(dim=2).amin(dim=1) == 0).all()
@@ -171,44 +148,35 @@ def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
 
 def test_relocation_hardly_changes_what_is_seen():
     """Copies of a Gaussian look like the one that was there, which the formula is made for."""
-    model, settings = a_model(size=0.12), settings_of("mcmc", cap_max=105)
-    densifier, (optimizers,) = Densifier(model.parts[0], Schedule.of(settings, 1)), make_optimizers(model).parts
+    model = a_model(size=0.12)
     with torch.no_grad():
         before = model.render(a_view(), 0).image
-        torch.manual_seed(0)
-        densifier.after_step(2, optimizers, {}, ALL)
-        after = model.render(a_view(), 0).image
+        after_mcmc(model, 2, 105)
+        change = (model.render(a_view(), 0).image - before).abs()
     assert len(model) == 105
-    change = (after - before).abs()
     assert float(change.max()) < 0.05 and float(change.mean()) < 0.002
 
 
 def test_mcmc_noise_moves_faint_gaussians_more_than_opaque_ones():
-    model, settings = a_model(size=0.2), settings_of("mcmc", cap_max=100, mcmc=McmcSettings(noise_lr=5e5))
-    part = model.parts[0]
-    with torch.no_grad():
-        part.params["opacities"][:50], part.params["opacities"][50:] = -5.2, 6.0
-    before = part.params["means"].detach().clone()
-    densifier, (optimizers,) = Densifier(part, Schedule.of(settings, 1)), make_optimizers(model).parts
-    torch.manual_seed(0)
-    densifier.after_step(1, optimizers, {}, ALL)
-    moved = (part.params["means"].detach() - before).norm(dim=1)
+    params = (model := a_model(size=0.2)).parts[0].params
+    params["opacities"].data[:50], params["opacities"].data[50:] = -5.2, 6.0
+    before = params["means"].detach().clone()
+    after_mcmc(model, 1, 100, noise_lr=5e5)
+    moved = (params["means"].detach() - before).norm(dim=1)
     assert float(moved[:50].mean()) > 1e-2 and float(moved[50:].max()) < 1e-6
 
 
-def test_the_default_strategy_grows_where_the_image_pulls():
-    counts = densified("default", 5, default=DefaultSettings(refine_every=2, grow_grad2d=1e-7, prune_opacity=1e-3))
-    assert counts[0] == counts[1] == 100
-    assert counts[2] > 150
+@pytest.mark.parametrize("grows", [True, False])
+def test_the_default_strategy_grows_where_the_image_pulls_more_than_its_threshold(grows):
+    threshold = DefaultSettings(refine_every=2, grow_grad2d=1e-7 if grows else 1e3, prune_opacity=1e-3)
+    counts = densified("default", 3, default=threshold)
+    assert counts[:2] == [100, 100] and (counts[2] > 150 if grows else counts[2] == 100)
 
 
-def test_the_default_strategy_grows_nothing_under_its_threshold():
-    counts = densified("default", 5, default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=1e-3))
-    assert counts == [100] * 5
-
-
-@pytest.mark.parametrize("size", [pytest.param(0.005, id="duplicated"), pytest.param(0.05, id="split")])
-@pytest.mark.parametrize("cap_max", [100, 117, 250])
+@pytest.mark.parametrize(
+    ("cap_max", "size"),
+    [(100, 0.05), pytest.param(117, 0.005, id="duplicated"), pytest.param(117, 0.05, id="split"), (250, 0.05)],
+)
 def test_the_default_strategy_never_exceeds_the_cap(cap_max, size):
     greedy = DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3)
     counts = densified("default", 9, size=size, cap_max=cap_max, default=greedy)
@@ -216,58 +184,48 @@ def test_the_default_strategy_never_exceeds_the_cap(cap_max, size):
     assert counts[-1] > 0.95 * cap_max, "it fills the cap, since all want to grow"
 
 
+def screen_gradients(strengths: torch.Tensor) -> dict[str, Any]:
+    """What a rendering would tell of Gaussians that pull so strongly across the screen."""
+    centers = torch.zeros(1, len(strengths), 2, requires_grad=True)
+    centers.grad = torch.stack([strengths, torch.zeros(len(strengths))], dim=1)[None]
+    radii = torch.ones(1, len(strengths), 2, dtype=torch.int32)
+    return {"means2d": centers, "radii": radii, "width": 32, "height": 24, "n_cameras": 1, "gaussian_ids": None}
+
+
 def test_at_the_cap_the_default_strategy_prefers_the_largest_gradients():
     model = a_model(size=0.005)
     part, settings = model.parts[0], settings_of("default", cap_max=110)
     densifier, (optimizers,) = Densifier(part, Schedule.of(settings, 1)), make_optimizers(model).parts
     strength = torch.from_numpy(np.random.default_rng(2).permutation(100)).float() + 1.0
-    centers = torch.zeros(1, 100, 2, requires_grad=True)
-    centers.grad = torch.stack([strength, torch.zeros(100)], dim=1)[None]
-    info = {
-        "means2d": centers, "radii": torch.ones(1, 100, 2, dtype=torch.int32), "width": 32, "height": 24,
-        "n_cameras": 1, "gaussian_ids": None,
-    }  # fmt: skip
     before = part.params["means"].detach().clone()
-    densifier.after_step(2, optimizers, info, ALL)
+    densifier.after_step(2, optimizers, screen_gradients(strength), ALL)
     assert len(part) == 110
     copies = torch.cdist(part.params["means"].detach()[100:], before).argmin(dim=1)
     assert set(copies.tolist()) == set(strength.topk(10).indices.tolist())
 
 
-def test_the_default_strategy_removes_what_is_too_faint():
+def test_the_default_strategy_removes_what_is_too_faint_and_resets_opacities_every_so_many_iterations():
     model = a_model()
     with torch.no_grad():
         model.parts[0].params["opacities"][:25] = math.log(0.004 / 0.996)
-    settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=0.005))
-    densifier, (optimizers,) = Densifier(model.parts[0], Schedule.of(settings, 1)), make_optimizers(model).parts
-    for optimizer in optimizers.values():
-        optimizer.param_groups[0]["lr"] = 0.0
-    for step in (1, 2):
-        train_step(model, densifier, step, optimizers)
-    assert len(model) == 75
-
-
-def test_the_default_strategy_resets_opacities_every_so_many_iterations():
-    model = a_model()
-    default = DefaultSettings(refine_every=1000, reset_every=3, prune_opacity=0.005)
+    default = DefaultSettings(refine_every=2, reset_every=3, grow_grad2d=1e3, prune_opacity=0.005)
     densifier = Densifier(model.parts[0], Schedule.of(settings_of("default", default=default), 1))
     (optimizers,) = make_optimizers(model).parts
+    for optimizer in optimizers.values():
+        optimizer.param_groups[0]["lr"] = 0.0
     brightest = []
     for step in range(1, 4):
         train_step(model, densifier, step, optimizers)
         brightest.append(float(sampled(model.parts[0], 0.0).opacities.detach().max()))
-    assert min(brightest[:2]) > 0.05
+    assert len(model) == 75 and min(brightest[:2]) > 0.05
     assert brightest[2] == pytest.approx(0.01, rel=1e-3), "twice prune_opacity, as in 3DGS"
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
 @pytest.mark.parametrize(("start", "stop"), [(0.5, 1.0), (0.0, 0.002)])
 def test_nothing_is_densified_outside_its_span_of_iterations(strategy, start, stop):
-    counts = densified(
-        strategy, 8, refine_start=start, refine_stop=stop,
-        default=DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3),
-    )  # fmt: skip
-    assert counts == [100] * 8
+    greedy = DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3)
+    assert densified(strategy, 5, refine_start=start, refine_stop=stop, default=greedy) == [100] * 5
 
 
 # ---- a model of several parts
@@ -303,14 +261,6 @@ def test_mcmc_gives_what_it_adds_and_moves_the_owner_of_where_it_goes():
     assert sum(counts) == len(actors) == 84 and counts[1] > 60, "most of the dead went over to the second car"
     assert owners_fit(actors)
     assert actors.params["owner"].dtype == torch.int64 and not actors.params["owner"].requires_grad
-
-
-def screen_gradients(strengths: torch.Tensor) -> dict[str, Any]:
-    """What a rendering would tell of Gaussians that pull so strongly across the screen."""
-    centers = torch.zeros(1, len(strengths), 2, requires_grad=True)
-    centers.grad = torch.stack([strengths, torch.zeros(len(strengths))], dim=1)[None]
-    radii = torch.ones(1, len(strengths), 2, dtype=torch.int32)
-    return {"means2d": centers, "radii": radii, "width": 32, "height": 24, "n_cameras": 1, "gaussian_ids": None}
 
 
 @pytest.mark.parametrize("size", [pytest.param(0.005, id="duplicated"), pytest.param(0.1, id="split")])

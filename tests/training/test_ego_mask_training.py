@@ -14,6 +14,7 @@ from helpers.trainings import (
     HEIGHT,
     PROVENANCE,
     WIDTH,
+    EndedError,
     files_in,
     inputs_in,
     job_of,
@@ -96,9 +97,6 @@ def views_given(monkeypatch, folder: Path, inputs: TrainingInputs, job: TrainJob
     """The views with which a training begins; it ends there."""
     given: list[TrainingView] = []
 
-    class EndedError(Exception):
-        pass
-
     def begin(model: SplatModel, views: list[TrainingView], *rest: Any, **named: Any) -> None:
         given.extend(views)
         raise EndedError
@@ -109,20 +107,13 @@ def views_given(monkeypatch, folder: Path, inputs: TrainingInputs, job: TrainJob
     return given
 
 
-@pytest.mark.parametrize(
-    ("sky", "changes", "held"),
-    [
-        ("cubemap", {}, False),
-        ("mask", {}, True),
-        ("cubemap", {"sky_bce_weight": 0.1}, True),
-        ("none", {"sky_bce_weight": 0.1}, True),
-    ],
-)
-def test_the_device_holds_sky_masks_where_a_loss_looks_at_them(tmp_path, monkeypatch, sky, changes, held):
-    inputs = inputs_in(tmp_path, actors=True)
-    assert inputs.supervision(job_of(sky=sky, **changes)).sky
-    views = views_given(monkeypatch, tmp_path, inputs, job_of(sky=sky, **changes))
-    assert [view.sky is not None for view in views] == [held] * 4
+def test_the_device_holds_sky_masks_where_a_loss_looks_at_them(tmp_path, monkeypatch):
+    inputs, looks = inputs_in(tmp_path, actors=True), {"sky_bce_weight": 0.1}
+    for sky, changes in (("cubemap", {}), ("mask", {}), ("cubemap", looks), ("none", looks)):
+        job = job_of(sky=sky, **changes)
+        assert inputs.supervision(job).sky
+        views = views_given(monkeypatch, tmp_path, inputs, job)
+        assert [view.sky is not None for view in views] == [(sky, changes) != ("cubemap", {})] * 4
 
 
 def test_only_cameras_that_see_the_body_are_asked_for_it(tmp_path):

@@ -23,6 +23,8 @@ from drivesplat.training.optimizers import Optimizers, make_optimizers
 from drivesplat.training.road import driven_road
 from drivesplat.training.schedule import Schedule
 
+SURFACES = {"flatness_weight": 1.0, "road_weight": 1.0}
+
 
 @pytest.fixture(autouse=True)
 def half_at_a_time(monkeypatch):
@@ -101,58 +103,39 @@ def test_dead_gaussians_are_relocated_and_preallocated_rows_are_not(monkeypatch)
     assert part.preallocated and not opacities[len(part) :].any()
 
 
-def test_no_preallocated_row_is_left_when_densification_stops():
-    model, densifier, optimizers, _ = grown(True, 4)
-    part = model.parts[0]
-    kept = part.params["means"][: len(part)].detach().clone()
-    densifier.after_step(1000, optimizers, {}, ALL)
-    assert part.preallocated == 0 and part.row_count == len(part) == len(kept) and active_fraction([part]) == 1.0
-    torch.testing.assert_close(part.params["means"].detach(), kept)
-    train_step(model, densifier, 1001, optimizers)
-
-
-def test_growth_continues_when_preallocation_is_switched_off():
-    """As where a training goes on without a GPU."""
+@pytest.mark.parametrize("stops", [True, False])
+def test_no_preallocated_row_is_left_when_densification_stops_or_preallocation_is_switched_off(stops):
+    """As where a training goes on without a GPU; growth continues then."""
     model, densifier, optimizers, _ = grown(True, 4)
     part, count = model.parts[0], len(model)
+    kept = part.params["means"][:count].detach().clone()
     assert part.preallocated
-    densifier._strategy.preallocates = lambda: False
-    densifier.after_step(4, optimizers, {}, ALL)
-    assert part.preallocated == 0 and part.row_count == len(part) == count * 3 // 2
-    train_step(model, densifier, 5, optimizers)
-
-
-def test_preallocated_rows_have_no_weight_in_the_road_loss():
-    model, _, _, _ = grown(True, 4)
-    part = model.parts[0]
-    with torch.no_grad():
-        part.params["means"][len(part) :] = torch.tensor([0.0, 0.0, 0.2])
-    road = driven_road(np.tile(np.eye(4), (1, 1, 1)), RoadSettings())
-    shown, settings = sampled(part, 0.0), TrainSettings(road_weight=1.0)
-    there = shown[torch.arange(part.row_count) < len(part)]
-    with_them, alone = (float(surface_terms([own], model, road, settings)["road"].detach()) for own in (shown, there))
-    assert with_them == pytest.approx(alone)
+    densifier._strategy.preallocates = lambda: stops
+    densifier.after_step(1000 if stops else 4, optimizers, {}, ALL)
+    assert part.preallocated == 0 and part.row_count == len(part) == (count if stops else count * 3 // 2)
+    assert active_fraction([part]) == 1.0
+    if stops:
+        torch.testing.assert_close(part.params["means"].detach(), kept)
+    train_step(model, densifier, 1001 if stops else 5, optimizers)
 
 
 def test_preallocated_rows_do_not_change_the_loss():
+    """Neither that of images nor those about surfaces, though they lie on the road."""
     model, densifier, optimizers, _ = grown(True, 4)
-    (view, *_), settings = guided_views(), TrainSettings()
-    found, preallocated = [], model.parts[0].preallocated
+    part, (view, *_), found = model.parts[0], guided_views(), []
+    with torch.no_grad():
+        part.params["means"][len(part) :] = torch.tensor([0.0, 0.0, 0.2])
+    assert part.preallocated
+    road, settings = driven_road(np.tile(np.eye(4), (1, 1, 1)), RoadSettings()), TrainSettings(**SURFACES)
     for _ in range(2):
         with torch.no_grad():
-            found.append(loss_terms(model.render(view.view), view, model, settings))
+            picture = model.render(view.view)
+            terms = loss_terms(picture, view, model, settings), surface_terms(picture.sets, model, road, settings)
+        found.append({**terms[0], **terms[1]})
         densifier.end(optimizers)
-    assert preallocated and not model.parts[0].preallocated and found[0].keys() == found[1].keys() >= {"opacity_reg"}
+    assert not part.preallocated and found[0].keys() == found[1].keys() >= {"opacity_reg", "flatness", "road"}
     for name, term in found[0].items():
         assert float(term) == pytest.approx(float(found[1][name])), name
-
-
-def test_preallocated_rows_do_not_change_flatness():
-    model, _, _, _ = grown(True, 4)
-    part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
-    found = surface_terms(model.render(a_view()).sets, model, None, settings)
-    expected = sampled(part, 0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
-    assert part.preallocated and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
 
 
 def test_a_training_with_preallocated_rows_resumes_and_leaves_none(tmp_path, monkeypatch):

@@ -61,23 +61,16 @@ ROADS = [{}, {"pitch": 0.08}, {"roll": 0.05, "heading": 0.7}, {"pitch": -0.05, "
 
 
 @pytest.mark.parametrize("lie", ROADS, ids=str)
-def test_the_road_is_the_plane_that_the_car_stood_on(lie):
-    random, poses = np.random.default_rng(0), straight(**lie)
-    along, aside, above = random.uniform(0, 20, 500), random.uniform(-1.0, 1.0, 500), random.uniform(-0.2, 0.2, 500)
-    found = distance(driven_road(poses, WIDE), on_road(poses, along, aside, above))
-    np.testing.assert_allclose(found.numpy(), above, atol=1e-4)
-
-
-@pytest.mark.parametrize("lie", ROADS, ids=str)
-def test_the_road_has_the_configured_width_and_weighs_less_farther_out(lie):
+def test_the_road_is_the_plane_that_the_car_stood_on_and_weighs_less_farther_out(lie):
+    """Up to the configured width."""
     random, poses = np.random.default_rng(1), straight(**lie)
-    along, aside = random.uniform(0, 20, 4000), random.uniform(-2.0, 2.0, 4000)
-    road = driven_road(poses, WIDE)
-    place, found = road.cells.lookup(on_road(poses, along, aside, np.zeros(4000))[:, :2])
-    width = np.abs(aside)
-    assert found.numpy()[width < 1.2 - CELL].all() and not found.numpy()[width > 1.2 + CELL].any()
-    off = np.abs(road.weights[place].numpy() - (1.0 - (width / 1.2) ** 2))[found.numpy()]
+    along, aside, above = (random.uniform(*limits, 2000) for limits in ((0, 20), (-2.0, 2.0), (-0.2, 0.2)))
+    road, points, width = driven_road(poses, WIDE), on_road(poses, along, aside, above), np.abs(aside)
+    place, found = (values.numpy() for values in road.cells.lookup(points[:, :2]))
+    assert found[width < 1.2 - CELL].all() and not found[width > 1.2 + CELL].any()
+    off = np.abs(road.weights[place].numpy() - (1.0 - (width / 1.2) ** 2))[found]
     assert off.max() < 2.0 * CELL / 1.2 and float(road.weights.min()) >= 0.0
+    np.testing.assert_allclose(distance(road, points[found]).numpy(), above[found], atol=1e-4)
 
 
 def test_along_a_bend_the_road_turns_evenly_from_pose_to_pose():
@@ -111,7 +104,7 @@ def test_the_loss_is_the_pseudo_huber_norm_of_how_far_the_mass_lies_off():
     """By its definition: mean square distances of samples drawn from each Gaussian."""
     random, poses = np.random.default_rng(2), straight(pitch=0.05, roll=0.03)
     road = driven_road(poses, WIDE)
-    n, samples = 6, 200_000
+    n, samples = 6, 50_000
     means = on_road(
         poses, random.uniform(3, 15, n), np.array([0.0, 0.3, -0.3, 0.7, -1.0, 0.9]), np.linspace(-0.2, 0.25, n)
     )
@@ -125,7 +118,7 @@ def test_the_loss_is_the_pseudo_huber_norm_of_how_far_the_mass_lies_off():
     square = (((mass * normals).sum(axis=2) - offsets) ** 2).mean(axis=0)
     weights = road.weights[place].numpy()
     expected = (weights * (np.sqrt(square + ROUGHNESS**2) - ROUGHNESS)).sum() / weights.sum()
-    assert float(road_loss(gaussians_at(means, scales, quats), road)) == pytest.approx(expected, rel=5e-3)
+    assert float(road_loss(gaussians_at(means, scales, quats), road)) == pytest.approx(expected, rel=1e-2)
 
 
 def test_gaussians_of_the_road_come_to_lie_in_it_flat_and_the_others_stay():
@@ -154,28 +147,12 @@ def test_gaussians_of_the_road_come_to_lie_in_it_flat_and_the_others_stay():
         assert before is None or torch.equal(value[40:].detach(), before[40:])
 
 
-def test_centres_are_pulled_straight_onto_the_road():
-    """Along its normal, the harder the farther off, up to a bound."""
-    poses = straight(pitch=0.06, roll=-0.04)
-    means = on_road(poses, np.full(5, 9.0), np.zeros(5), np.array([-0.28, -0.02, 0.0, 0.05, 0.2])).requires_grad_()
-    road_loss(round_at(means), driven_road(poses, WIDE)).backward()
-    along = means.grad @ torch.from_numpy(poses[0, :3, 2]).float()
-    torch.testing.assert_close(means.grad, torch.outer(along, torch.from_numpy(poses[0, :3, 2]).float()))
-    assert along[0] < along[1] < -1e-3 and along[2].abs() < 1e-3 < along[3] < along[4] < 0.2
-
-
 @pytest.mark.parametrize("place", [(50.0, 0.0, 0.0), (5.0, 3.0, 0.0), (5.0, 0.0, 1.0)])
 def test_where_there_is_no_gaussian_of_the_road_it_costs_nothing(place):
     road, means = driven_road(straight(), WIDE), torch.tensor([place], requires_grad=True)
     loss = road_loss(round_at(means), road)
     loss.backward()
     assert float(loss.detach()) == 0.0 and not means.grad.any()
-
-
-def test_far_ones_count_no_more_than_linearly_and_near_ones_less():
-    road = driven_road(straight(), WIDE)
-    at = [float(road_loss(round_at(torch.tensor([[5.0, 0.0, z]])), road)) for z in (0.005, 0.01, 0.14, 0.28)]
-    assert at[1] / at[0] == pytest.approx(4.0, rel=0.05) and at[3] / at[2] == pytest.approx(2.35, rel=0.05)
 
 
 def test_the_road_is_that_of_training_images_in_time_order():
@@ -310,8 +287,11 @@ def known() -> Road:
 
 def test_terms_are_weighted_and_apply_to_static_parts_only():
     model = a_street()
-    picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
-    terms = surface_terms(picture.sets, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
+    sets = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5])).sets
+    assert surface_terms(sets, model, None, TrainSettings()) == {}
+    assert surface_terms(sets, model, None, TrainSettings(flatness_weight=0.1)).keys() == {"flatness"}
+    assert surface_terms(sets, model, known(), TrainSettings(road_weight=0.1)).keys() == {"road"}
+    terms = surface_terms(sets, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
     still = sampled(model.parts[0], 0.0)
     torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
     torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known()))
@@ -320,14 +300,6 @@ def test_terms_are_weighted_and_apply_to_static_parts_only():
     moving = [*model.parts[1].params.values(), *model.parts[1].shared.values()]
     assert not any(value.grad is not None and value.grad.any() for value in moving)
     assert model.parts[0].params["scales"].grad.any() and model.parts[0].params["means"].grad.any()
-
-
-def test_without_their_weights_there_are_no_terms():
-    model = a_street()
-    picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
-    assert surface_terms(picture.sets, model, None, TrainSettings()) == {}
-    assert surface_terms(picture.sets, model, None, TrainSettings(flatness_weight=0.1)).keys() == {"flatness"}
-    assert surface_terms(picture.sets, model, known(), TrainSettings(road_weight=0.1)).keys() == {"road"}
 
 
 def test_flatness_makes_the_shortest_axis_shorter_and_no_other():

@@ -26,7 +26,6 @@ from drivesplat.model.background import Background
 from drivesplat.model.build import definitions, gaussian_cap, rebuild_model
 from drivesplat.model.gaussians import GaussianSets
 from drivesplat.model.parameters import OFFSETS
-from drivesplat.model.part import Part
 from drivesplat.model.scans import ScanPicture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan
@@ -69,7 +68,7 @@ def scheduled(per_image: float, fine_tune: float = 0.0, images: int = 4, scans: 
     return Schedule.of(settings, images, scans)
 
 
-@pytest.mark.parametrize("per_image", [0.0, 0.1, 0.25, 1 / 3, 1.0, 2.5])
+@pytest.mark.parametrize("per_image", [0.0, 0.1, 1 / 3, 2.5])
 def test_scans_are_spread_evenly_among_all_iterations_with_images(per_image):
     schedule = scheduled(per_image)
     steps = 300 + round(300 * per_image)
@@ -83,19 +82,14 @@ def test_scans_are_spread_evenly_among_all_iterations_with_images(per_image):
 
 
 def test_the_last_iterations_fine_tune_the_lidar():
+    """Of 435 steps; learning rates, degrees, densification and averages end with the last image, step 375."""
     schedule = scheduled(0.25, fine_tune=0.2)
-    assert schedule.steps == 300 + 75 + 60
+    assert schedule.steps == 300 + 75 + 60 and schedule.settings.iterations == 300, "settings keep their meaning"
     assert [schedule.fine_tunes(step) for step in (0, 374, 375, 434, 435)] == [False, False, True, True, False]
     assert sum(schedule.fits_scan(step) for step in range(375)) == 75 and schedule.images_before(375) == 300
     assert all(schedule.fits_scan(step) for step in range(375, 435))
     assert (schedule.scans_before(435), schedule.images_before(435), schedule.iterations_before(435)) == (135, 300, 300)
     assert not schedule.fits_scan(435), "beyond the end only images are fitted"
-
-
-def test_fractions_of_a_training_count_its_scans_and_not_its_fine_tuning():
-    """Of 435 steps: learning rates, degrees, densification and averages end with the last image, step 375."""
-    schedule = scheduled(0.25, fine_tune=0.2)
-    assert schedule.settings.iterations == 300, "settings keep their meaning"
     assert [schedule.progress(step) for step in (0, 75, 375)] == [0.0, 0.2, 1.0]
     assert [schedule.step_at(fraction) for fraction in (0.0, 0.5, 1.0)] == [0, 187, 375]
     assert [schedule.fine_tuned(step) for step in (375, 405)] == [0.0, 0.5]
@@ -103,18 +97,15 @@ def test_fractions_of_a_training_count_its_scans_and_not_its_fine_tuning():
     assert [schedule.sh_degree(step, 2) for step in (every - 1, every, 2 * every, 400)] == [0, 1, 2, 2]
 
 
-def test_nothing_is_fine_tuned_without_scans():
-    for changes in ({"scans": 0}, {"per_image": 0.0}):
-        schedule = scheduled(**{"per_image": 0.25, "fine_tune": 0.2, **changes})
-        assert schedule.steps == 300 and not any(schedule.fine_tunes(step) for step in range(300))
-        assert schedule.scans_before(300) == 0
-
-
-def test_without_images_every_iteration_fits_a_scan_and_counts():
-    schedule = scheduled(0.25, fine_tune=0.2, images=0)
-    assert schedule.steps == 300 and all(schedule.fits_scan(step) for step in range(300))
-    assert not any(schedule.fine_tunes(step) for step in range(300))
-    assert (schedule.images_before(300), schedule.iterations_before(300)) == (0, 300) and schedule.fits_scan(300)
+@pytest.mark.parametrize("changes", [{"scans": 0}, {"per_image": 0.0}, {"images": 0}])
+def test_nothing_is_fine_tuned_without_scans_or_images(changes):
+    """Without images every iteration fits a scan and counts."""
+    schedule = scheduled(**{"per_image": 0.25, "fine_tune": 0.2, **changes})
+    assert schedule.steps == 300 and not any(schedule.fine_tunes(step) for step in range(300))
+    images = changes.get("images", 300)
+    assert all(schedule.fits_scan(step) == (images == 0) for step in range(301))
+    assert (schedule.images_before(300), schedule.scans_before(300)) == (images, 300 - images)
+    assert schedule.iterations_before(300) == 300
 
 
 def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
@@ -125,44 +116,41 @@ def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
     assert taken != [scan_index(5, before, seed=4) for before in range(20)]
 
 
-def test_every_image_is_taken_once_an_epoch_whatever_the_share():
-    settings = settings_of(scans=SCANS)
-    trainer = Trainer.begin(
-        with_logits(settings), recorded_views(4), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
-    )
-    numbers = []
-    for step in range(16):
-        if not trainer.schedule.fits_scan(step):
-            numbers.append(trainer.images.number(step))
+def scan_trainer(iterations: int, street: bool = False, **scans: float) -> Trainer:
+    """As many iterations with images as with scans, and some that fine-tune."""
+    settings = settings_of(iterations=iterations, scans=ScanTrainingSettings(per_image=1.0, **scans))
+    still = with_logits(settings, offsets=settings.scans.fine_tune > 0)
+    model = untrained_street(settings, lidar_logits=(0.0, 2.0)) if street else still
+    recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
+    return Trainer.begin(model, guided_views()[:4], settings, 0, CPU, scans=recorded)
+
+
+def test_every_image_is_taken_once_an_epoch_whatever_the_share_and_wanted_pictures_come_of_images():
+    trainer = scan_trainer(60)
+    numbers = [trainer.images.number(step) for step in range(16) if not trainer.schedule.fits_scan(step)]
     assert len(numbers) == 8 and sorted(numbers[:4]) == sorted(numbers[4:]) == [0, 1, 2, 3]
-
-
-def test_an_exact_scan_has_no_loss():
-    (scan,) = load_scans([scan_of_a_wall()], SCANS, CPU)
-    terms = terms_of(picture_of(scan), scan)
-    assert set(terms) == {"scan_range", "scan_drop", "scan_intensity", "scan_sight"}
-    assert terms["scan_drop"] < 2e-5 and all(terms[name] == 0.0 for name in terms if name != "scan_drop")
+    trainer.state.step = 1
+    terms, picture, view = trainer.training_step(with_picture=True)
+    assert picture is not None and view is not None and "l1" in terms
 
 
 def test_each_term_measures_its_own_error():
-    (scan,) = load_scans([scan_of_a_wall()], SCANS, CPU)
-    weights = {"range_weight": 2.0, "intensity_weight": 3.0, "drop_weight": 5.0, "sight_weight": 7.0}
-    half, returns = 0.5 * torch.ones_like(scan.range), float(scan.returned.float().mean())
-    far = terms_of(picture_of(scan, range=scan.range + 0.25), scan, **weights)
-    assert far["scan_range"] == pytest.approx(0.5, rel=1e-5)
-    bright = terms_of(picture_of(scan, intensity=scan.intensity + 0.2), scan, **weights)
-    assert bright["scan_intensity"] == pytest.approx(3.0 * 0.04, rel=1e-5)
-    unsure = terms_of(picture_of(scan, returned=half), scan, **weights)
-    assert unsure["scan_drop"] == pytest.approx(5.0 * math.log(2.0), rel=1e-5)
-    veiled = terms_of(picture_of(scan, alpha_before=half), scan, **weights)
-    assert veiled["scan_sight"] == pytest.approx(3.5, rel=1e-5) and 0.7 < returns < 0.9
-
-
-def test_the_worst_ranges_are_ignored():
+    """The worst ranges are ignored."""
     (scan,) = load_scans([scan_of_a_wall()], SCANS, CPU)
     wild = scan.range.clone()
     wild[0, 1:4] += 1000.0
-    assert terms_of(picture_of(scan, range=wild), scan)["scan_range"] == 0.0
+    exact = terms_of(picture_of(scan, range=wild), scan)
+    assert set(exact) == {"scan_range", "scan_drop", "scan_intensity", "scan_sight"}
+    assert exact["scan_drop"] < 2e-5 and all(exact[name] == 0.0 for name in exact if name != "scan_drop")
+    weights = {"range_weight": 2.0, "intensity_weight": 3.0, "drop_weight": 5.0, "sight_weight": 7.0}
+    half = torch.full_like(scan.range, 0.5)
+    for term, wrong, expected in (
+        ("scan_range", {"range": scan.range + 0.25}, 0.5),
+        ("scan_intensity", {"intensity": scan.intensity + 0.2}, 3.0 * 0.04),
+        ("scan_drop", {"returned": half}, 5.0 * math.log(2.0)),
+        ("scan_sight", {"alpha_before": half}, 3.5),
+    ):
+        assert terms_of(picture_of(scan, **wrong), scan, **weights)[term] == pytest.approx(expected, rel=1e-5), term
 
 
 def test_rays_that_were_not_measured_have_no_effect():
@@ -176,16 +164,12 @@ def test_rays_that_were_not_measured_have_no_effect():
 
 
 def test_a_scan_without_returns_or_intensity_has_a_finite_loss():
-    empty = scan_of_a_wall()
-    nothing = np.zeros((12, 30), dtype=np.float32)
+    empty, nothing = scan_of_a_wall(), np.zeros((12, 30), dtype=np.float32)
     (scan,) = load_scans([dataclasses.replace(empty, scan=Scan(empty.scan.rays, nothing > 0, nothing))], SCANS, CPU)
-    terms = terms_of(picture_of(scan, returned=nothing_met(scan), intensity=nothing_met(scan)), scan)
+    none_met = torch.zeros_like(scan.range)
+    terms = terms_of(picture_of(scan, returned=none_met, intensity=none_met), scan)
     assert "scan_intensity" not in terms and all(math.isfinite(value) for value in terms.values())
     assert load_scans([dataclasses.replace(empty, measured=nothing > 0)], SCANS, CPU) == []
-
-
-def nothing_met(scan) -> torch.Tensor:
-    return torch.zeros_like(scan.range)
 
 
 def with_logits(settings: TrainSettings, offsets: bool = False) -> SplatModel:
@@ -210,7 +194,7 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
     model, recorded = with_logits(settings), [scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)]
     scans = load_scans(recorded, settings.scans, CPU)
 
-    summary = train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "a"), scans=scans)
+    summary = train(model, recorded_views(2), settings, 0, CPU, folders_of(tmp_path, "a"), scans=scans)
     with torch.no_grad():
         picture = model.scan(scans[1].view)
     known = scans[1].returned & (picture.alpha > 0.5)
@@ -220,46 +204,35 @@ def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
     assert picture.returned[scans[1].returned].median() > 0.7 > 0.5 > picture.returned[~scans[1].returned].median()
 
 
-def learnable(part: Part) -> dict[str, torch.Tensor]:
-    """The parameters of its Gaussians, and those that they share."""
-    return {**part.params, **part.shared}
+SHAPE = {"means", "quats", "scales", "opacities"}
 
 
-def changed_by_a_scan(step: int, street: bool = False, **scans: float) -> tuple[Trainer, dict[str, set[str]]]:
-    """A trainer after one of 8 iterations, or with `fine_tune` one of those that follow, which fitted a scan; and the
-    names of the parameters that it changed, by part."""
-    settings = settings_of(iterations=4, scans=ScanTrainingSettings(per_image=1.0, **scans))
-    still = with_logits(settings, offsets=settings.scans.fine_tune > 0)
-    model = untrained_street(settings, lidar_logits=(0.0, 2.0)) if street else still
-    recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
-    trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=recorded)
-    before = {part.name: {k: v.detach().clone() for k, v in learnable(part).items()} for part in model.parts}
+@pytest.mark.parametrize(
+    ("step", "scans", "learned"),
+    [
+        pytest.param(0, {}, {*SHAPE, "sh0"}, id="an image"),
+        pytest.param(1, {}, {*SHAPE, "lidar_logits"}, id="a scan"),
+        pytest.param(1, {"geometry": 0.0}, {"means", "lidar_logits"}, id="a scan that leaves shapes alone"),
+        pytest.param(1, {"geometry": 0.0, "fine_tune": 0.5}, {"means", "lidar_logits"}, id="also before fine-tuning"),
+        pytest.param(7, {"fine_tune": 0.5}, {*SHAPE, "lidar_logits"}, id="the last before fine-tuning"),
+        pytest.param(8, {"fine_tune": 0.5}, {"lidar_logits", *OFFSETS.values()}, id="fine-tuning"),
+    ],
+)
+def test_each_kind_of_iteration_learns_its_own_parameters(step, scans, learned):
+    """The noise of MCMC moves Gaussians until fine-tuning. Tracks are corrected by scans until then, too."""
+    trainer = scan_trainer(4, street=True, **scans)
+    model, fine_tunes = trainer.state.model, trainer.schedule.fine_tunes(step)
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
     trainer.state.step = step
-    assert trainer.schedule.fits_scan(step)
-    terms, picture, view = trainer.training_step(with_picture=trainer.schedule.fine_tunes(step))
-    assert picture is None and view is None and "scan_range" in terms
+    assert trainer.schedule.fits_scan(step) == (step > 0) and fine_tunes == (step == 8)
+    terms, picture, view = trainer.training_step(with_picture=fine_tunes)
+    assert "l1" in terms if step == 0 else picture is None and view is None and "scan_range" in terms
     trainer.densify(picture)
-    changed = {
-        part.name: {k for k, v in learnable(part).items() if not torch.equal(v, before[part.name][k])}
-        for part in model.parts
-    }
-    return trainer, changed
-
-
-@pytest.mark.parametrize("fine_tune", [0.0, 0.5])
-def test_scans_leave_the_geometry_alone_where_they_are_told_to(fine_tune):
-    """The noise of MCMC moves Gaussians in any case."""
-    _, changed = changed_by_a_scan(1, geometry=0.0, fine_tune=fine_tune)
-    assert changed["background"] - {"means"} == {"lidar_logits"}
-
-
-def test_fine_tuning_changes_what_the_lidar_alone_sees():
-    trainer, changed = changed_by_a_scan(8, street=True, fine_tune=0.5)
-    assert changed == {"background": {"lidar_logits", *OFFSETS.values()}, "actors": {"lidar_logits"}}
-    assert trainer.state.step == 9 and trainer.schedule.fine_tunes(9)
-    _, before = changed_by_a_scan(7, street=True, fine_tune=0.5)
-    assert {"translation", "yaw"} & before["actors"], "tracks are corrected by scans until then"
-    assert not before["background"] & {*OFFSETS.values()} and "scales" in before["background"]
+    changed = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
+    still, actors = ({name.split(".")[-1] for name in changed if name.startswith(f"parts.{i}.")} for i in (0, 1))
+    assert still == learned and ("lidar_logits" in actors) == (step > 0)
+    if step >= 7:
+        assert actors == {"lidar_logits"} if fine_tunes else {"translation", "yaw"} & actors
 
 
 def test_checks_go_on_during_fine_tuning_and_densification_does_not(tmp_path, monkeypatch):
@@ -279,9 +252,7 @@ def test_checks_go_on_during_fine_tuning_and_densification_does_not(tmp_path, mo
 
 
 def test_the_rates_of_fine_tuning_decay():
-    settings = settings_of(iterations=40, scans=ScanTrainingSettings(per_image=1.0, fine_tune=0.5))
-    recorded = load_scans([scan_of_a_wall()], settings.scans, CPU)
-    trainer = Trainer.begin(with_logits(settings, offsets=True), recorded_views(4), settings, 0, CPU, scans=recorded)
+    trainer = scan_trainer(40, fine_tune=0.5)
     (group,) = trainer.state.optimizers.parts
     rates = trainer.state.model.parts[0].learning_rates()
 
@@ -299,7 +270,7 @@ def test_the_rates_of_fine_tuning_decay():
 def test_fine_tuning_renders_scans_better_and_images_as_before():
     """Before and after the last iterations of a training, which fine-tune."""
     scans = ScanTrainingSettings(per_image=1 / 3, geometry=0.0, fine_tune=4 / 3, range_weight=1.0)
-    settings = settings_of(iterations=60, scans=scans)
+    settings = settings_of(iterations=30, scans=scans)
     recorded = load_scans([scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)], scans, CPU)
     model, views = with_logits(settings, offsets=True), recorded_views(4)
     trainer = Trainer.begin(model, views, settings, 0, CPU, scans=recorded)
@@ -320,45 +291,19 @@ def test_fine_tuning_renders_scans_better_and_images_as_before():
     assert torch.equal(again, image) and better < 0.7 * error
 
 
-def scan_trainer(factor: float = 0.25) -> Trainer:
-    """300 iterations with images and as many with scans, and 60 that fine-tune."""
-    of_scans = ScanTrainingSettings(per_image=1.0, fine_tune=0.2, geometry=factor)
-    settings = settings_of(iterations=300, scans=of_scans)
-    scans, views = load_scans([scan_of_a_wall()], settings.scans, CPU), recorded_views(2)
-    return Trainer.begin(with_logits(settings, offsets=True), views, settings, 0, CPU, scans=scans)
-
-
 @pytest.mark.parametrize("factor", [0.25, 0.0])
 def test_a_factor_scales_the_gradients_of_what_images_show(factor):
-    trainer = scan_trainer(factor)
-    params = trainer.state.model.parts[0].params
+    model = with_logits(settings_of())
+    params = model.parts[0].params
     for parameter in params.values():
         parameter.grad = torch.ones_like(parameter)
-    limit_geometry(trainer.state.model, factor)
-    for name in ("means", "quats", "scales", "opacities"):
+    limit_geometry(model, factor)
+    for name in SHAPE:
         if factor:
             assert (params[name].grad == factor).all(), name
         else:
             assert params[name].grad is None, "a step of Adam would move it on"
     assert (params["lidar_logits"].grad == 1.0).all()
-
-
-@pytest.mark.parametrize(
-    ("step", "learned"),
-    [
-        pytest.param(0, {"means", "quats", "scales", "opacities", "sh0"}, id="an image"),
-        pytest.param(1, {"means", "quats", "scales", "opacities", "lidar_logits"}, id="a scan"),
-        pytest.param(600, {"lidar_logits", *OFFSETS.values()}, id="fine-tuning"),
-    ],
-)
-def test_each_kind_of_iteration_learns_its_own_parameters(step, learned):
-    trainer = scan_trainer()
-    params = trainer.state.model.parts[0].params
-    before = {name: parameter.detach().clone() for name, parameter in params.items()}
-    trainer.state.step = step
-    assert trainer.schedule.fits_scan(step) == (step > 0) and trainer.schedule.fine_tunes(step) == (step == 600)
-    trainer.training_step(with_picture=False)
-    assert {name for name, parameter in params.items() if not torch.equal(parameter, before[name])} == learned
 
 
 def test_another_training_of_the_same_model_learns_everything_again(tmp_path):
@@ -386,16 +331,6 @@ def test_cameras_do_not_see_what_lidar_sees_elsewhere():
     with torch.no_grad():
         model.parts[0].params["lidar_opacities"].fill_(-20.0)
     assert model.scan(scan.view).alpha.max() < 1e-3 and torch.equal(model.render(view.view).image, image)
-
-
-def test_an_iteration_whose_picture_is_wanted_fits_an_image():
-    settings = settings_of(scans=SCANS)
-    trainer = Trainer.begin(
-        with_logits(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SCANS, CPU)
-    )
-    trainer.state.step = 1
-    terms, picture, view = trainer.training_step(with_picture=True)
-    assert picture is not None and view is not None and "l1" in terms
 
 
 def test_scans_need_densification_by_mcmc():

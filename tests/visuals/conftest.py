@@ -1,4 +1,4 @@
-"""A trained LiDAR, without a training."""
+"""A trained LiDAR without a training, and a car ahead of the ego vehicle."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -6,11 +6,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import torch
+from helpers.classed import classed
 from helpers.scan_drives import KEY_FRAME_US, room, scene_of, track_of
 
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.scene.scene import Scene, Track
 from drivesplat.visuals import trained_lidar
 from drivesplat.visuals.trained_lidar import TrainedLidar
 
@@ -27,5 +30,20 @@ def lidar_of(monkeypatch) -> Callable[..., TrainedLidar]:
         found = rendered or RenderedScan(room(12.1), np.zeros(shape), np.full(shape, 0.4))
         monkeypatch.setattr(trained_lidar, "rendered_scan", lambda *_: found)
         return TrainedLidar(SplatModel([], None), LIDAR_SCENE, list(scans), (1e-3, 1e-3), torch.device("cpu"))
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def one_car(tiny_scene) -> Callable[..., Scene]:
+    """The tiny drive with a single car, whose centre is at (x, y, 0.8) at the first key frame."""
+
+    def made(speed: float, x: float, y: float) -> Scene:
+        times = tiny_scene.key_frame_timestamps
+        seconds = (times - times[0]) * 1e-6
+        places = np.stack([rigid(np.eye(3), np.array([x + speed * second, y, 0.8])) for second in seconds])
+        size, seen = np.array([4.0, 2.0, 1.6]), np.full(len(times), 4)
+        it = Track("it", *classed("vehicle.car"), size, times, np.arange(len(times)), places, seen)
+        return dataclasses.replace(tiny_scene, tracks=(it,))
 
     return made

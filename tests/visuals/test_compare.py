@@ -61,21 +61,16 @@ def panel(made: tuple[dict[str, Any], np.ndarray], name: str) -> np.ndarray:
     return pictures[:, place["top"] :, place["left"] :][:, :22, :40]
 
 
-def test_each_recorded_image_is_beside_the_rendering_of_each_method(made, recording, models):
-    assert made[1].shape == (10, 44, 80, 3)
+def test_each_recorded_image_is_beside_the_rendering_of_each_method_with_its_psnr(made, recording, models):
+    record, pictures = made
+    assert pictures.shape == (10, 44, 80, 3)
     for index in range(10):
         image = read_image(recording.frame(index).image_path, (41, 23))[:22, :40]
         np.testing.assert_array_equal(panel(made, "ground truth")[index], image)
         for name, model in models.items():
-            rendering = uint8_image(
-                model.render(view_of(recording.record, index, model.parts[0].params["means"].device)).image
-            )
-            difference = panel(made, name)[index].astype(int) - rendering[:22, :40]
+            view = view_of(recording.record, index, model.parts[0].params["means"].device)
+            difference = panel(made, name)[index].astype(int) - uint8_image(model.render(view).image)[:22, :40]
             assert np.abs(difference).max() <= 1
-
-
-def test_the_record_holds_time_split_and_psnr_of_each_image(made, recording, models):
-    record = made[0]
     assert [image["split"] for image in record["images"]] == [
         *["train"] * 3, "interpolation", *["train"] * 4, "extrapolation", "extrapolation"
     ]  # fmt: skip

@@ -1,6 +1,5 @@
 """The ghost panel and the figure of a removal: images, figures and drawing."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.classed import classed
 from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
 from matplotlib.figure import Figure
 from PIL import Image
@@ -20,8 +18,7 @@ from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.regions import LABELS
-from drivesplat.scene.rigid import rigid
-from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.visuals import GhostSettings, PanelJob, RemovalJob, RemovalSettings, SubjectSettings
 from drivesplat.visuals.drawing import draw_panel, draw_removal
 from drivesplat.visuals.figures import save_figure
@@ -29,8 +26,6 @@ from drivesplat.visuals.ghost_panel import GhostPanel, ghost_panel
 from drivesplat.visuals.removal import RemovalPair, remove_actor
 from drivesplat.visuals.rendered_view import ModelWithRecording
 
-SIZE = np.array([4.0, 2.0, 1.6])
-SPEED = 6.0
 SKY = torch.tensor([0.3, 0.5, 0.8])
 HELD_OUT = 2
 """A key frame of the group interpolation."""
@@ -42,27 +37,16 @@ ROAD_AT = np.array([9.0, -2.5, 0.5])
 """Beside the car's path."""
 
 
-def one_car(scene: Scene, speed: float = SPEED) -> Scene:
-    """A car ahead, its centre at (6, 0.4, 0.8) at the first key frame."""
-    times = scene.key_frame_timestamps
-    places = [rigid(np.eye(3), np.array([6.0 + speed * (time - times[0]) * 1e-6, 0.4, 0.8])) for time in times]
-    it = Track(
-        "it", *classed("vehicle.car"), SIZE, times, np.arange(len(times)), np.stack(places), np.full(len(times), 4)
-    )
-    return dataclasses.replace(scene, tracks=(it,))
+@pytest.fixture(scope="module")
+def moving(one_car) -> Scene:
+    return one_car(6.0, 6.0, 0.4)
 
 
 def drive_of(
-    scene: Scene,
-    masks: Path | None = None,
-    *parts: Part,
-    places=(GHOST_AT, ROAD_AT),
-    opacities=0.6,
-    colors=(0.9, 0.1, 0.1),
+    scene: Scene, masks: Path | None, *parts: Part, places=(GHOST_AT, ROAD_AT), colors=(0.9, 0.1, 0.1)
 ) -> ModelWithRecording:
     """A background of Gaussians at `places`, and `parts`. Every fourth key frame, from HELD_OUT on, is held out."""
-    background = round_gaussians(places, 0.1, opacities, colors)
-    model = SplatModel([background, *parts], ConstantSky(SKY, 1e-2))
+    model = SplatModel([round_gaussians(places, 0.1, 0.6, colors), *parts], ConstantSky(SKY, 1e-2))
     recording = recording_of(scene, masks, every_nth=4, offset=HELD_OUT)
     return ModelWithRecording(model.requires_grad_(False), recording, torch.device("cpu"))
 
@@ -75,14 +59,38 @@ def masks(tiny_scene, tmp_path_factory) -> Path:
     return write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
 
 
+@pytest.fixture(scope="module")
+def panel_of_car(moving, masks) -> tuple[GhostPanel, dict[str, Any], ModelWithRecording]:
+    drive = drive_of(moving, masks)
+    return *ghost_panel(drive, job_of()), drive
+
+
+def near_face(key_frame: int) -> np.ndarray:
+    """The corners (2, 2) of the car's rear face in the image. The camera looks along x, between the car's sides and at
+    a height between floor and roof, so that it hides the rest: both numbers are closed forms of the tiny drive."""
+    seconds = 0.5 * key_frame - 0.035
+    ahead = (6.0 + 6.0 * seconds - 2.0) - (4.0 * seconds + 1.7)
+    focal = 0.62 * 96
+    x, y = 48.0 - focal * np.array([1.4, -0.6]) / ahead, 27.0 - focal * (np.array([1.6, 0.0]) - 1.5) / ahead
+    return np.stack([x, y], axis=1)
+
+
+def test_the_outline_is_the_box_in_the_image_and_psnr_of_it_and_of_static_pixels_equal_skimage(panel_of_car):
+    panel, record, _ = panel_of_car
+    found = np.stack([panel.outline.min(axis=0), panel.outline.max(axis=0)])
+    np.testing.assert_allclose(found, near_face(HELD_OUT), atol=1e-3)
+    static, box = np.zeros((2, 54, 96), dtype=bool)
+    static[10:EGO_FROM_ROW] = True
+    (left, top), (right, bottom) = np.ceil(near_face(HELD_OUT) - 0.5).astype(int)
+    box[top:EGO_FROM_ROW, left:right] = True
+    assert bottom > EGO_FROM_ROW and record["subject"]["pixels"] == box.sum()
+    for name, pixels in (("static", static), ("vehicle", box)):
+        expected = peak_signal_noise_ratio(panel.truth[pixels], panel.render[pixels], data_range=1.0)
+        assert record[name]["psnr"] == pytest.approx(expected) and record[name]["pixels"] == pixels.sum()
+
+
 def job_of(key_frame: int | None = HELD_OUT) -> PanelJob:
     return PanelJob(eval_camera="CAM_FRONT", subject=SubjectSettings(key_frame=key_frame), ghosts=GhostSettings())
-
-
-@pytest.fixture(scope="module")
-def panel_of_car(tiny_scene, masks) -> tuple[GhostPanel, dict[str, Any], ModelWithRecording]:
-    drive = drive_of(one_car(tiny_scene), masks)
-    return *ghost_panel(drive, job_of()), drive
 
 
 def seen_at(drive: ModelWithRecording, key_frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -96,42 +104,6 @@ def seen_at(drive: ModelWithRecording, key_frame: int, points: np.ndarray) -> tu
 def near(pixel: np.ndarray, radius: float) -> np.ndarray:
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
     return np.hypot(x - pixel[0], y - pixel[1]) < radius
-
-
-def test_psnr_of_vehicle_and_static_pixels_equals_skimage(panel_of_car, masks):
-    panel, record, _ = panel_of_car
-    static = np.zeros((54, 96), dtype=bool)
-    static[10:EGO_FROM_ROW] = True
-    assert record["static"]["psnr"] == pytest.approx(
-        peak_signal_noise_ratio(panel.truth[static], panel.render[static], data_range=1.0)
-    )
-    assert record["static"]["pixels"] == static.sum()
-    box = np.zeros((54, 96), dtype=bool)
-    (left, top), (right, bottom) = np.ceil(near_face(HELD_OUT) - 0.5).astype(int)
-    box[top:bottom, left:right] = True
-    assert bottom > EGO_FROM_ROW
-    box[EGO_FROM_ROW:] = False
-    assert record["subject"]["pixels"] == box.sum()
-    assert record["vehicle"]["psnr"] == pytest.approx(
-        peak_signal_noise_ratio(panel.truth[box], panel.render[box], data_range=1.0)
-    )
-    assert record["vehicle"]["pixels"] == box.sum()
-
-
-def near_face(key_frame: int) -> np.ndarray:
-    """The corners (2, 2) of the car's rear face in the image. The camera looks along x, between the car's sides and at
-    a height between floor and roof, so that it hides the rest: both numbers are closed forms of the tiny drive."""
-    seconds = 0.5 * key_frame - 0.035
-    ahead = (6.0 + SPEED * seconds - 2.0) - (4.0 * seconds + 1.7)
-    focal = 0.62 * 96
-    x, y = 48.0 - focal * np.array([1.4, -0.6]) / ahead, 27.0 - focal * (np.array([1.6, 0.0]) - 1.5) / ahead
-    return np.stack([x, y], axis=1)
-
-
-def test_the_outline_is_the_box_in_the_image(panel_of_car):
-    panel, _, _ = panel_of_car
-    found = np.stack([panel.outline.min(axis=0), panel.outline.max(axis=0)])
-    np.testing.assert_allclose(found, near_face(HELD_OUT), atol=1e-3)
 
 
 def test_the_path_is_that_of_the_box_centre_on_the_ground(panel_of_car):
@@ -169,11 +141,11 @@ def test_the_ghost_image_is_the_pale_image_except_for_the_ghost(panel_of_car):
 
 
 @pytest.fixture(scope="module")
-def still(tiny_scene, masks) -> tuple[GhostPanel, dict[str, Any]]:
-    return ghost_panel(drive_of(one_car(tiny_scene, speed=0.0), masks), job_of(None))
+def still(one_car, masks) -> tuple[GhostPanel, dict[str, Any]]:
+    return ghost_panel(drive_of(one_car(0.0, 6.0, 0.4), masks), job_of(None))
 
 
-def test_without_a_moving_vehicle_the_middle_key_frame_is_shown_and_figures_are_null(still, tiny_scene):
+def test_without_a_moving_vehicle_the_middle_key_frame_is_shown_and_figures_are_null(still, panel_of_car, tiny_scene):
     panel, record = still
     recorded = np.asarray(Image.open(tiny_scene.frames[10].image_path).convert("RGB"))
     np.testing.assert_allclose(panel.truth * 255.0, recorded)
@@ -183,33 +155,24 @@ def test_without_a_moving_vehicle_the_middle_key_frame_is_shown_and_figures_are_
     assert record["subject"] is None and record["vehicle"] is None and record["ghosts"] is None
     assert record["why_null"] == "no moving vehicle is visible from CAM_FRONT in this scene"
     json.dumps(record, allow_nan=False)
-
-
-def test_the_record_always_has_the_same_fields(panel_of_car, still):
-    assert panel_of_car[1].keys() == still[1].keys()
+    assert record.keys() == panel_of_car[1].keys()
 
 
 def titles(figure: Figure) -> list[str]:
     return [axis.get_title(loc="left") for axis in figure.axes]
 
 
-def shown(figure: Figure, index: int) -> np.ndarray:
-    return np.asarray(figure.axes[index].images[0].get_array())
+def shown(figure: Figure, count: int) -> list[np.ndarray]:
+    return [np.asarray(axis.images[0].get_array()) for axis in figure.axes[:count]]
 
 
-def test_the_four_images_are_truth_rendering_error_and_ghosts(panel_of_car):
+def test_the_four_images_are_drawn_with_outline_path_and_published_fixes(panel_of_car):
+    """Truth, rendering, error and ghosts. matplotlib's pixel centres are integers, the panel's are halves."""
     panel, record, _ = panel_of_car
     figure = draw_panel(panel, record, "vanilla")
-    np.testing.assert_array_equal(shown(figure, 0), panel.truth)
-    np.testing.assert_array_equal(shown(figure, 1), panel.render)
-    np.testing.assert_allclose(shown(figure, 2), np.abs(panel.render - panel.truth).mean(axis=2))
-    np.testing.assert_array_equal(shown(figure, 3), panel.ghosts)
-
-
-def test_outline_and_path_are_drawn_at_their_pixels(panel_of_car):
-    """matplotlib's pixel centres are integers, the panel's are halves."""
-    panel, record, _ = panel_of_car
-    figure = draw_panel(panel, record, "vanilla")
+    error = np.abs(panel.render - panel.truth).mean(axis=2)
+    for found, expected in zip(shown(figure, 4), (panel.truth, panel.render, error, panel.ghosts), strict=True):
+        np.testing.assert_allclose(found, expected)
     for axis in figure.axes:
         (polygon,) = axis.patches
         np.testing.assert_allclose(polygon.get_xy()[:-1], panel.outline - 0.5, atol=1e-6)
@@ -218,70 +181,61 @@ def test_outline_and_path_are_drawn_at_their_pixels(panel_of_car):
     inside = ((panel.path >= 0) & (panel.path <= [96, 54])).all(axis=1)
     np.testing.assert_allclose(drawn[inside], panel.path[inside] - 0.5)
     assert np.isnan(drawn[~inside]).all() and inside.any() and not inside.all()
+    text = figure.get_supxlabel()
+    assert "docs/ghosts.md" in text and all(f"{fix.method}: {fix.adds}" in text for fix in PUBLISHED_FIXES)
+    figure.canvas.draw()
+    below = figure._supxlabel.get_window_extent()
+    assert below.x1 < figure.bbox.x1, "it fits into the figure"
+    assert all(below.y1 <= axis.get_window_extent().y0 for axis in figure.axes[:4])
 
 
-def test_a_training_image_is_named_in_the_title(tiny_scene, masks):
-    panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks), job_of(3))
-    assert "(training image)" in draw_panel(panel, record, "vanilla").get_suptitle()
+def test_a_training_image_and_an_image_without_ghosts_are_named_in_titles(moving, masks):
+    panel, record = ghost_panel(drive_of(moving, masks, places=[ROAD_AT]), job_of(3))
+    figure = draw_panel(panel, record, "vanilla")
+    assert "(training image)" in figure.get_suptitle() and titles(figure)[3].startswith("Ghosts: none")
 
 
-def test_without_ghosts_the_figure_says_so(tiny_scene, masks):
-    panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[ROAD_AT]), job_of())
-    assert titles(draw_panel(panel, record, "vanilla"))[3].startswith("Ghosts: none")
-
-
-def removal(scene: Scene, key_frame: int | None, *parts: Part) -> tuple[RemovalPair, dict[str, Any]]:
+def removal(scene: Scene, *parts: Part) -> tuple[RemovalPair, dict[str, Any]]:
     job = RemovalJob(
         eval_camera="CAM_FRONT",
-        subject=SubjectSettings(key_frame=key_frame),
+        subject=SubjectSettings(key_frame=0),
         ghosts=GhostSettings(),
         removal=RemovalSettings(),
     )
     return remove_actor(drive_of(scene, None, *parts, places=[[7.0, 0.4, 0.8], ROAD_AT]), job)
 
 
-def test_a_removal_is_drawn_with_without_and_difference(tiny_scene):
-    pair, record = removal(one_car(tiny_scene), 0)
+def test_a_removal_is_drawn_with_without_and_difference(moving):
+    pair, record = removal(moving)
     figure = draw_removal(pair, record, "street")
     assert titles(figure)[:2] == ["Rendering", "Without the Gaussians in the box"]
     assert titles(figure)[2].startswith("Absolute difference")
-    np.testing.assert_array_equal(shown(figure, 0), pair.with_car)
-    np.testing.assert_array_equal(shown(figure, 1), pair.without_car)
-    np.testing.assert_allclose(shown(figure, 2), np.abs(pair.with_car - pair.without_car).mean(axis=2))
-    assert shown(figure, 2).max() > 0.01
-    heading = figure.get_suptitle()
-    assert "street" in heading
-    assert (
-        f"1 Gaussians removed: the vehicle is still there, {record['box']['changed_share']:.0%} of the pixel" in heading
-    )
-    assert 0.01 < record["box"]["changed_share"] < 0.5
+    difference = np.abs(pair.with_car - pair.without_car).mean(axis=2)
+    for found, expected in zip(shown(figure, 3), (pair.with_car, pair.without_car, difference), strict=True):
+        np.testing.assert_allclose(found, expected)
+    assert difference.max() > 0.01 and 0.01 < record["box"]["changed_share"] < 0.5
+    said = f"1 Gaussians removed: the vehicle is still there, {record['box']['changed_share']:.0%} of the pixel"
+    assert "street" in figure.get_suptitle() and said in figure.get_suptitle()
 
 
-@pytest.mark.parametrize(
-    ("changed", "holes", "verdict"),
-    [
-        (0.07, 0.0, "the vehicle is still there, 7% of the pixels of the box changed (gone: 50% or more)"),
-        (0.91, 0.17, "the vehicle is gone, 91% of the pixels of the box changed, holes in 17% of the box"),
-        (0.91, 0.0, "the vehicle is gone, 91% of the pixels of the box changed, no holes"),
-    ],
-)
-def test_the_title_of_a_removal_says_whether_the_vehicle_is_gone(changed, holes, verdict, tiny_scene):
-    pair, record = removal(one_car(tiny_scene), 0, round_gaussians([[7.0, 0.4, 0.8]]))
-    record |= {"box": {"changed_share": changed}, "holes": {"share_of_box": holes}}
-    assert draw_removal(pair, record, "street").get_suptitle().endswith(verdict)
-
-
-def test_the_title_names_a_removal_of_the_actors_gaussians(tiny_scene):
-    pair, record = removal(one_car(tiny_scene), 0, Own(round_gaussians([[7.0, 0.4, 0.8]]), "it"))
+def test_titles_of_a_removal_say_whose_gaussians_are_removed_and_whether_the_vehicle_is_gone(moving):
+    pair, record = removal(moving, Own(round_gaussians([[7.0, 0.4, 0.8]]), "it"))
     assert record["removed_by"] == "actor"
-    assert titles(draw_removal(pair, record, "street"))[1] == "Without the vehicle's Gaussians"
+    gone = "the vehicle is gone, 91% of the pixels of the box changed, "
+    still_there = "the vehicle is still there, 7% of the pixels of the box changed (gone: 50% or more)"
+    for changed, holes, verdict in (
+        (0.07, 0.0, still_there), (0.91, 0.17, f"{gone}holes in 17% of the box"), (0.91, 0.0, f"{gone}no holes"),
+    ):  # fmt: skip
+        record |= {"box": {"changed_share": changed}, "holes": {"share_of_box": holes}}
+        figure = draw_removal(pair, record, "street")
+        assert figure.get_suptitle().endswith(verdict)
+        assert titles(figure)[1] == "Without the vehicle's Gaussians"
 
 
-def test_saved_figures_are_landscape_pngs_1600_pixels_wide(panel_of_car, still, tiny_scene, tmp_path):
+def test_saved_figures_are_landscape_pngs_1600_pixels_wide(still, moving, tmp_path):
     figures = {
-        "panel.png": draw_panel(*panel_of_car[:2], "vanilla"),
         "still.png": draw_panel(*still, "vanilla"),
-        "removal.png": draw_removal(*removal(one_car(tiny_scene), 0), "vanilla"),
+        "removal.png": draw_removal(*removal(moving), "vanilla"),
     }
     for name, figure in figures.items():
         save_figure(tmp_path / name, figure)
@@ -305,13 +259,3 @@ def test_a_failed_write_keeps_the_previous_figure(still, tmp_path, monkeypatch):
         save_figure(path, draw_panel(*still, "vanilla"))
     assert str(path) in str(refusal.value)
     assert path.read_bytes() == b"older" and list(tmp_path.iterdir()) == [path]
-
-
-def test_the_panel_names_published_fixes_below_its_images(panel_of_car):
-    figure = draw_panel(*panel_of_car[:2], "vanilla")
-    text = figure.get_supxlabel()
-    assert "docs/ghosts.md" in text and all(f"{fix.method}: {fix.adds}" in text for fix in PUBLISHED_FIXES)
-    figure.canvas.draw()
-    below = figure._supxlabel.get_window_extent()
-    assert below.x1 < figure.bbox.x1, "it fits into the figure"
-    assert all(below.y1 <= axis.get_window_extent().y0 for axis in figure.axes[:4])

@@ -1,7 +1,5 @@
 """What a moving box sweeps, and which Gaussians are its ghosts: against closed forms and dense sampling in time."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -52,14 +50,7 @@ def around(place: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ place[:3, :3].T + place[:3, 3]
 
 
-def grid(size=SIZE, shrunk: float = 0.05) -> np.ndarray:
-    """Points (n, 3) all over a box of `size`, `shrunk` metres within its faces, in its frame."""
-    axes = [np.linspace(-s / 2 + shrunk, s / 2 - shrunk, 7) for s in size]
-    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-
-
-@pytest.mark.parametrize("heading", [0.0, 1.1, -2.5])
-@pytest.mark.parametrize("speed", [0.0, 1.5, 10.0, 30.0, 60.0])
+@pytest.mark.parametrize(("speed", "heading"), [(0.0, 1.1), (1.5, -2.5), (10.0, 0.0), (60.0, 1.1)])
 def test_a_straight_path_sweeps_a_long_box(speed, heading):
     """From half a key-frame interval before the first box to as long after the last: length + 3.5 s of way."""
     it = straight(speed, heading=heading)
@@ -74,10 +65,10 @@ def test_a_straight_path_sweeps_a_long_box(speed, heading):
     assert certain.sum() > 1000 and found[certain].all()
 
 
-@pytest.mark.parametrize("speed", [3.0, 12.0, 30.0])
-@pytest.mark.parametrize("size", [SIZE, np.array([0.6, 0.5, 1.7]), np.array([12.0, 2.6, 3.4])])
-@pytest.mark.parametrize("turn", [0.0, 0.4, -0.8])
-def test_the_swept_volume_is_complete_between_annotations(speed, size, turn):
+@pytest.mark.parametrize(
+    ("speed", "turn", "size"), [(3.0, -0.8, (12.0, 2.6, 3.4)), (12.0, 0.4, SIZE), (30.0, 0.0, (0.6, 0.5, 1.7))]
+)
+def test_the_swept_volume_is_complete_between_annotations(speed, turn, size):
     """Points moving with the box, within its faces, at every 4 ms; `turn` in radians a key frame.
 
     Half a step of the way and half a step of turning may be missed at the faces.
@@ -87,8 +78,9 @@ def test_the_swept_volume_is_complete_between_annotations(speed, size, turn):
         places.append(places[-1] + 0.5 * speed * np.array([np.cos(turn * i), np.sin(turn * i)]))
     it = track_of([pose(*place, angle=turn * i) for i, place in enumerate(places)], size=size)
     swing = min(0.125, 0.125 / speed) * abs(turn) / 0.5 * np.linalg.norm(size) / 2
-    inner = grid(size, shrunk=min(0.13 + swing, 0.24))
-    points = []
+    shrunk = min(0.13 + swing, 0.24)
+    axes = [np.linspace(-s / 2 + shrunk, s / 2 - shrunk, 7) for s in size]
+    inner, points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3), []
     for step, seconds in enumerate(np.arange(0.0, 2.5, 0.004)):
         i = min(int(seconds / 0.5), 4)
         share = seconds / 0.5 - i
@@ -97,8 +89,7 @@ def test_the_swept_volume_is_complete_between_annotations(speed, size, turn):
     assert in_swept_volume(it, INTERVAL, np.concatenate(points)).all()
 
 
-@pytest.mark.parametrize("turn", [0.4, -0.8])
-def test_a_turning_box_sweeps_nothing_beside_its_path(turn):
+def test_a_turning_box_sweeps_nothing_beside_its_path(turn=-0.8):
     """Random points against boxes every 10 ms, posed by the protocol's interpolation."""
     it = track_of([pose(8.0 * np.cos(turn * i), 8.0 * np.sin(turn * i), 0.0, turn * i) for i in range(6)])
     points = np.random.default_rng(1).uniform([-14, -14, -2], [14, 14, 2], (20_000, 3))
@@ -129,48 +120,33 @@ def test_clearance_is_above_the_floor_of_the_box_on_a_slope():
     np.testing.assert_array_equal(found, [True, False, True, False])
 
 
-def axis_points(start: float, end: float) -> np.ndarray:
-    """Points (n, 3) every 5 cm along the way of `straight`."""
-    x = np.arange(start, end, 0.05)
-    return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-
-
-@pytest.mark.parametrize("speed", [2.0, 10.0, 30.0])
+@pytest.mark.parametrize("speed", [2.0, 30.0])
 def test_nothing_is_swept_in_a_gap_of_the_annotation(speed):
     """Key frames 3 to 6 do not hold it; it reaches a quarter of a second into the gap at both ends."""
     indices = [0, 1, 2, 7, 8, 9]
     it = track_of([pose(0.5 * i * speed, 0.0) for i in indices], indices=indices)
-    points = axis_points(-20.0, 5.0 * speed + 20.0)
-    x = points[:, 0]
-    found = in_swept_volume(it, INTERVAL, points)
-    margins = []
-    for first, last in ((0.0, 1.0), (3.5, 4.5)):
-        margins.append(np.maximum((first - 0.25) * speed - 2.0 - x, x - (last + 0.25) * speed - 2.0))
+    x = np.arange(-20.0, 5.0 * speed + 20.0, 0.05)
+    found = in_swept_volume(it, INTERVAL, np.outer(x, [1.0, 0.0, 0.0]))
+    margins = [
+        np.maximum((first - 0.25) * speed - 2.0 - x, x - (last + 0.25) * speed - 2.0)
+        for first, last in ((0.0, 1.0), (3.5, 4.5))
+    ]
     nearest = np.minimum(*margins)
     assert not found[nearest > 1e-6].any()
     assert found[nearest < -SLACK].all()
+    assert in_swept_volume(it, INTERVAL, np.zeros((0, 3))).shape == (0,)
 
 
-def test_without_points_the_result_is_empty():
-    assert in_swept_volume(straight(5.0), INTERVAL, np.zeros((0, 3))).shape == (0,)
-    assert not in_swept_volume(straight(5.0), INTERVAL, np.full((3, 3), 1e4)).any()
-
-
-def render_image(scene: Scene, *parts: Part, index: int = 0) -> RenderedView:
-    model = SplatModel(parts, None).requires_grad_(False)
-    return RenderedView(ModelWithRecording(model, recording_of(scene), torch.device("cpu")), index)
-
-
-def drive_ahead(tiny_scene: Scene) -> Scene:
+@pytest.fixture(scope="module")
+def scene(one_car) -> Scene:
     """One car at 10 m/s along y = 0.5, its centre 0.8 m over the road, its first box at x = 5."""
-    times = tiny_scene.key_frame_timestamps
-    poses = np.stack([pose(5.0 + 10.0 * (time - times[0]) * 1e-6, 0.5, 0.8) for time in times])
-    it = Track("it", *classed("vehicle.car"), SIZE, times, np.arange(10), poses, np.full(10, 4))
-    return dataclasses.replace(tiny_scene, tracks=(it,))
+    return one_car(10.0, 5.0, 0.5)
 
 
 LATER = 8
 """The image of key frame 4, at x = 5 + 10 (2.0 - 0.035) = 24.65."""
+
+
 PLACES = np.array(
     [
         [10.0, 0.5, 0.8],  # where it was
@@ -187,53 +163,47 @@ PLACES = np.array(
 GHOSTS = np.array([True, True, False, False, False, False, False, False, True])
 
 
+def render_image(scene: Scene, *parts: Part, index: int = LATER) -> RenderedView:
+    model = SplatModel(parts, None).requires_grad_(False)
+    return RenderedView(ModelWithRecording(model, recording_of(scene), torch.device("cpu")), index)
+
+
+LATER = 8
+"""The image of key frame 4, at x = 5 + 10 (2.0 - 0.035) = 24.65."""
+
+
 def ghosts_at(rendered: RenderedView, clearance: float = 0.2) -> torch.Tensor:
     scene = rendered.drive.recording.scene
     box = box_at(scene.tracks[0], rendered.frame.timestamp, scene.key_frame_interval)
     return ghosts_of(rendered, box, GhostSettings(clearance=clearance))
 
 
-def test_ghosts_lie_on_the_path_but_not_in_the_present_box(tiny_scene):
-    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER))
-    np.testing.assert_array_equal(found, GHOSTS)
+def test_ghosts_lie_on_the_path_but_not_in_the_present_box(scene):
+    """Without a clearance the road counts as ghosts."""
+    rendered = render_image(scene, round_gaussians(PLACES))
+    np.testing.assert_array_equal(ghosts_at(rendered), GHOSTS)
+    without = ghosts_at(rendered, clearance=0.0)
+    np.testing.assert_array_equal(np.flatnonzero(without & ~torch.from_numpy(GHOSTS)), [4])
+    earlier = ghosts_at(render_image(scene, round_gaussians(PLACES[:4]), index=1))
+    np.testing.assert_array_equal(earlier, [True, True, True, False])
 
 
-def test_ghosts_depend_on_the_time(tiny_scene):
-    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES[:4]), index=1))
-    np.testing.assert_array_equal(found, [True, True, True, False])
+@pytest.mark.parametrize(("whose", "moves"), [("it", True), ("another", True), ("it", False)])
+def test_gaussians_of_parts_that_move_are_no_ghosts(scene, whose, moves, monkeypatch):
+    """Two parts of the same Gaussians: those that go where their object goes are no ghosts wherever they lie. That the
+    object is known does not make it go: the part has to move."""
+    monkeypatch.setattr(Own, "moves", moves)
+    found = ghosts_at(render_image(scene, round_gaussians(PLACES), Own(round_gaussians(PLACES), whose)))
+    np.testing.assert_array_equal(found, [*GHOSTS, *(GHOSTS & (not moves))])
 
 
-def test_without_clearance_the_road_counts_as_ghosts(tiny_scene):
-    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER), clearance=0.0)
-    np.testing.assert_array_equal(np.flatnonzero(found & ~torch.from_numpy(GHOSTS)), [4])
-
-
-@pytest.mark.parametrize("whose", ["it", "another"])
-def test_gaussians_of_dynamic_parts_are_no_ghosts(tiny_scene, whose):
-    """Two parts of the same Gaussians: those that go where their object goes are no ghosts wherever they lie."""
-    parts = round_gaussians(PLACES), Own(round_gaussians(PLACES), whose)
-    found = ghosts_at(render_image(drive_ahead(tiny_scene), *parts, index=LATER))
-    np.testing.assert_array_equal(found, [*GHOSTS, *np.zeros_like(GHOSTS)])
-
-
-def test_gaussians_of_the_object_in_a_static_part_can_be_ghosts(tiny_scene, monkeypatch):
-    """That it is known does not make it go: the part has to move."""
-    monkeypatch.setattr(Own, "moves", False)
-    parts = Own(round_gaussians(PLACES), "it"), round_gaussians(PLACES)
-    found = ghosts_at(render_image(drive_ahead(tiny_scene), *parts, index=LATER))
-    np.testing.assert_array_equal(found, [*GHOSTS, *GHOSTS])
-
-
-def test_figures_of_ghosts(tiny_scene):
+def test_figures_of_ghosts(scene):
+    """The median of two is their mean."""
     opacities = [0.1, 0.4, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9, 0.7]
-    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(PLACES, opacities=opacities), index=LATER)
+    rendered = render_image(scene, round_gaussians(PLACES, opacities=opacities))
     figures = ghost_figures(rendered.gaussians, ghosts_at(rendered))
-    assert figures["gaussians"] == 3
-    assert figures["opacity_sum"] == pytest.approx(1.2, abs=1e-6)
-    assert figures["opacity_mean"] == pytest.approx(0.4, abs=1e-6)
-    assert figures["opacity_median"] == pytest.approx(0.4, abs=1e-6)
-
-
-def test_the_median_of_two_is_their_mean(tiny_scene):
-    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(PLACES[:2], opacities=[0.2, 0.6]), index=LATER)
-    assert ghost_figures(rendered.gaussians, ghosts_at(rendered))["opacity_median"] == pytest.approx(0.4, abs=1e-6)
+    expected = {"gaussians": 3, "opacity_sum": 1.2, "opacity_mean": 0.4, "opacity_median": 0.4}
+    assert {name: figures[name] for name in expected} == pytest.approx(expected, abs=1e-6)
+    rendered = render_image(scene, round_gaussians(PLACES[:2], opacities=[0.2, 0.6]))
+    median = ghost_figures(rendered.gaussians, ghosts_at(rendered))["opacity_median"]
+    assert median == pytest.approx(0.4, abs=1e-6)

@@ -55,8 +55,20 @@ def shown(view: np.ndarray, color) -> np.ndarray:
     return found.mean(axis=0)
 
 
-def frame_of(scan, found, ahead=0.0, scans=None) -> np.ndarray:
-    return LidarFrames(scans or [recorded(room())], ahead, "a film").frame(scan, found)
+def frame_of(scan, found) -> np.ndarray:
+    return LidarFrames([recorded(room())], 0.0, "a film").frame(scan, found)
+
+
+def test_errors_misses_and_false_returns_have_their_colours():
+    scan = recorded(alone((LEVEL, AHEAD), (LEVEL, LEFT)))
+    found = rendered(alone((LEVEL, AHEAD), (LEVEL, 0), radius=13.0))
+    view = VIEWS[2].inside(frame_of(scan, found))
+    off_by_a_metre = ERROR_COLORS(ERRORS(1.0))
+    colors = {off_by_a_metre: (-13.0, 0.0), ONLY_RECORDED: (0.0, -12.0), ONLY_RENDERED: (13.0, 0.0)}
+    for color, place in colors.items():
+        near = VIEW_SIZE / 2 + VIEW_SIZE / 40.0 * np.array(place)
+        rows, columns = (slice(int(at) - 6, int(at) + 7) for at in near)
+        np.testing.assert_allclose(shown(view[rows, columns], color), [6.0, 6.0], atol=1.5)
 
 
 def test_range_images_show_what_returned_and_which_rays_say_nothing():
@@ -88,19 +100,6 @@ def test_a_return_is_at_its_place_from_above(ahead, row, column):
     for view, metres in ((VIEWS[0], 12.0), (VIEWS[1], 6.0)):
         expected = VIEW_SIZE / 2 + metres * pixels * np.array([row, column])
         np.testing.assert_allclose(shown(view.inside(frame), color), expected, atol=1.5)
-
-
-def test_errors_misses_and_false_returns_have_their_colours():
-    scan = recorded(alone((LEVEL, AHEAD), (LEVEL, LEFT)))
-    found = rendered(alone((LEVEL, AHEAD), (LEVEL, 0), radius=13.0))
-    view = VIEWS[2].inside(frame_of(scan, found))
-    pixels = VIEW_SIZE / 40.0
-    for color, place in (
-        (ERROR_COLORS(ERRORS(1.0)), (-13.0, 0.0)), (ONLY_RECORDED, (0.0, -12.0)), (ONLY_RENDERED, (13.0, 0.0))
-    ):  # fmt: skip
-        near = VIEW_SIZE / 2 + pixels * np.array(place)
-        rows, columns = (slice(int(at) - 6, int(at) + 7) for at in near)
-        np.testing.assert_allclose(shown(view[rows, columns], color), [6.0, 6.0], atol=1.5)
 
 
 def test_all_frames_have_the_scales_of_the_drive():

@@ -13,10 +13,34 @@ from drivesplat.scene.scan_record import NO_OBJECT, ScanRecords
 from drivesplat.visuals.lidar_picture import draw_held_out_scans, figures_label, sample_scans, scan_label
 from drivesplat.visuals.trained_lidar import heading, main_scans
 
-SCENE = dataclasses.replace(
-    scene_of([], track_of("car", [(5.0 * i, 0.0, 0.0) for i in range(8)])),
-    key_frame_timestamps=np.arange(8) * KEY_FRAME_US,
-)
+TRACK = track_of("car", [(5.0 * i, 0.0, 0.0) for i in range(8)])
+SCENE = dataclasses.replace(scene_of([], TRACK), key_frame_timestamps=np.arange(8) * KEY_FRAME_US)
+
+
+def test_the_picture_has_a_scan_of_each_group_with_its_figures(lidar_of):
+    lidar = lidar_of(drive())
+    figure = draw_held_out_scans(lidar, "mine")
+    assert figure.get_suptitle() == "Scene hand · mine · top"
+    titles = [part.get_suptitle() for part in figure.subfigs]
+    expected = [scan_label(one) for one in sample_scans(SCENE, lidar.scans)]
+    assert [title.split(": ")[0] for title in titles] == expected and len(titles) == 2
+    assert all("range off by 10.0 cm" in title for title in titles)
+    lidar = lidar_of(drive(), RenderedScan(room(np.nan), np.zeros(room().shape)))
+    with pytest.raises(ResultError, match=r"LiDAR scan contains NaN or Inf; delete checkpoint\.npz"):
+        draw_held_out_scans(lidar, "mine")
+
+
+def test_the_lidar_with_most_rays_is_shown_in_order_of_time_and_its_heading_is_that_of_travel():
+    """The mean direction of travel in the sensor's frame: nuScenes' LiDAR has its y axis ahead."""
+    small = [scan(i, "train", lidar="side") for i in range(2)]
+    large = [scan(i, "train", linear=np.array([0.1 * (-1) ** i, 8.0, 0.0])) for i in (3, 1, 2, 0)]
+    main = main_scans(ScanRecords([*small, *large], []))
+    assert [one.sample_index for one in main] == [0, 1, 2, 3]
+    standing = scan(5, "train", linear=np.array([-0.3, 0.0, 0.0]))
+    assert heading([*main, standing]) == pytest.approx(np.pi / 2)
+    assert heading([standing]) is None
+
+
 GROUPS = ("train", "interpolation", "train", "interpolation", "interpolation", "extrapolation", "extrapolation")
 
 
@@ -55,33 +79,3 @@ def test_labels_say_what_is_held_out_and_the_figures_that_exist():
     )
     few = recorded(room(), measured=np.zeros(room().shape, dtype=bool))
     assert figures_label(scan_metrics(SCENE, [(few, rendered)])["all"]) == "no figures, fewer than 100 measured rays"
-
-
-def test_the_heading_is_the_mean_direction_of_travel_in_the_sensors_frame():
-    """nuScenes' LiDAR has its y axis ahead."""
-    ahead = [scan(i, "train", linear=np.array([0.1 * (-1) ** i, 8.0, 0.0])) for i in range(4)]
-    standing = scan(5, "train", linear=np.array([-0.3, 0.0, 0.0]))
-    assert heading([*ahead, standing]) == pytest.approx(np.pi / 2)
-    assert heading([standing]) is None
-
-
-def test_the_lidar_with_most_rays_is_shown_in_order_of_time():
-    small = [scan(i, "train", lidar="side") for i in range(2)]
-    large = [scan(i, "train", lidar="top") for i in (3, 1, 2)]
-    assert [one.sample_index for one in main_scans(ScanRecords([*small, *large], []))] == [1, 2, 3]
-
-
-def test_the_picture_has_a_scan_of_each_group_with_its_figures(lidar_of):
-    lidar = lidar_of(drive())
-    figure = draw_held_out_scans(lidar, "mine")
-    assert figure.get_suptitle() == "Scene hand · mine · top"
-    titles = [part.get_suptitle() for part in figure.subfigs]
-    expected = [scan_label(one) for one in sample_scans(SCENE, lidar.scans)]
-    assert [title.split(": ")[0] for title in titles] == expected and len(titles) == 2
-    assert all("range off by 10.0 cm" in title for title in titles)
-
-
-def test_a_rendering_with_nan_is_refused(lidar_of):
-    lidar = lidar_of(drive(), RenderedScan(room(np.nan), np.zeros(room().shape)))
-    with pytest.raises(ResultError, match=r"LiDAR scan contains NaN or Inf; delete checkpoint\.npz"):
-        draw_held_out_scans(lidar, "mine")

@@ -100,19 +100,11 @@ PARKED = Actor("parked", (11.0, -4.0, 1.3), size=(6.0, 2.4, 2.6), category="vehi
 WALKER = Actor("walker", (7.0, 2.0, 0.9), (4.0, 0.0), size=(0.8, 0.8, 1.8), category="human.pedestrian.adult")
 
 
-def test_of_the_tiny_drive_the_car_ahead_is_chosen_at_its_nearest(tiny_scene):
-    """It drives off slowly: nearest in the first key frame. The parked truck is passed much nearer."""
-    subject = chosen(tiny_scene, width=96)
-    assert (subject.box.category, subject.frame.sample_index, subject.index) == ("vehicle.car", 0, 0)
-
-
 @pytest.mark.parametrize(
     "actors",
     [
-        pytest.param([LEADING], id="one"),
         pytest.param([LEADING, ONCOMING], id="two"),
-        pytest.param([ONCOMING, LEADING], id="the order of tracks does not matter"),
-        pytest.param([LEADING, ONCOMING, PARKED, WALKER], id="with what is no moving vehicle"),
+        pytest.param([ONCOMING, LEADING, PARKED, WALKER], id="with what is no moving vehicle"),
         pytest.param([dataclasses.replace(LEADING, size=(1.8, 0.6, 1.2)), ONCOMING], id="nearest is not largest"),
         pytest.param([dataclasses.replace(LEADING, velocity=(2.0, 0.0))], id="nearer and nearer"),
         pytest.param([dataclasses.replace(LEADING, seen=range(3, 6))], id="there for a while"),
@@ -126,63 +118,38 @@ def test_the_moving_vehicle_with_the_most_pixels_is_chosen(tiny_scene, actors):
     assert subject.pixels == pytest.approx(counts[found(subject)], abs=2)
 
 
-@pytest.mark.parametrize(
-    "still",
-    [
-        pytest.param(PARKED, id="parked"),
-        pytest.param(dataclasses.replace(LEADING, velocity=(0.9, 0.0)), id="slower than the threshold of motion"),
-        pytest.param(WALKER, id="a person"),
-        pytest.param(dataclasses.replace(LEADING, visibility=1), id="hardly visible"),
-        pytest.param(dataclasses.replace(LEADING, position=(95.0, 0.0, 0.8)), id="too far"),
-        pytest.param(dataclasses.replace(LEADING, size=(0.3, 0.3, 0.3)), id="too small"),
-        pytest.param(dataclasses.replace(LEADING, position=(-20.0, 0.0, 0.8)), id="behind the camera"),
-        pytest.param(dataclasses.replace(LEADING, position=(9.0, 90.0, 0.8)), id="beside the image"),
-    ],
-)
-def test_only_moving_vehicles_of_the_protocol_are_chosen(tiny_scene, still):
-    assert chosen(with_actors(tiny_scene, still)) is None
-
-
-def test_a_drive_without_tracks_has_no_subject(tiny_scene):
-    assert chosen(with_actors(tiny_scene)) is None
-
-
-def ego_vehicle_below(scene: Scene, row: int, folder: Path) -> Path:
-    """Masks (108, 192) of which the ego vehicle's body fills the rows from `row` on."""
-    labels = np.full((108, WIDTH), LABELS["static"], dtype=np.uint8)
-    labels[row:] = LABELS["own_car"]
-    return write_labels(folder, scene, labels)
+def test_only_moving_vehicles_of_the_protocol_are_chosen(tiny_scene):
+    """Not one that is slower than the threshold of motion, hardly visible, too far, too small, behind the camera, or
+    beside or completely hidden in the image."""
+    wall = Actor("wall", (7.0, 0.0, 1.5), (4.0, 0.0), size=(0.5, 7.0, 7.0), category="animal")
+    changes = (
+        {"velocity": (0.9, 0.0)}, {"visibility": 1}, {"position": (95.0, 0.0, 0.8)}, {"size": (0.3, 0.3, 0.3)},
+        {"position": (-20.0, 0.0, 0.8)}, {"position": (9.0, 90.0, 0.8)},
+    )  # fmt: skip
+    others = ([dataclasses.replace(LEADING, **change)] for change in changes)
+    for actors in ([], [PARKED], [WALKER], [LEADING, wall], *others):
+        assert chosen(with_actors(tiny_scene, *actors)) is None, actors
 
 
 def test_pixels_of_the_ego_mask_do_not_count(tiny_scene, tmp_path):
-    scene = with_actors(tiny_scene, LEADING)
-    free = chosen(scene, SubjectSettings(key_frame=0))
-    recording = recorded(scene, masks=ego_vehicle_below(scene, 70, tmp_path))
-    subject = choose_subject(recording, "CAM_FRONT", SubjectSettings(key_frame=0))
+    """The ego vehicle's body fills the rows from 70 on, or all."""
+    scene, settings = with_actors(tiny_scene, LEADING), SubjectSettings(key_frame=0)
+    labels = np.full((108, WIDTH), LABELS["static"], dtype=np.uint8)
+    labels[70:] = LABELS["own_car"]
+    masks = write_labels(tmp_path / "part", scene, labels)
+    free, subject = chosen(scene, settings), choose_subject(recorded(scene, masks=masks), "CAM_FRONT", settings)
     assert free.visible[70:].any() and free.visible[:70].any()
     np.testing.assert_array_equal(subject.visible[:70], free.visible[:70])
     assert not subject.visible[70:].any() and subject.pixels == free.visible[:70].sum()
+    masks = write_labels(tmp_path / "whole", scene, np.full_like(labels, LABELS["own_car"]))
+    assert choose_subject(recorded(scene, masks=masks), "CAM_FRONT", ANY) is None
 
 
-def test_a_vehicle_completely_behind_the_ego_mask_is_not_chosen(tiny_scene, tmp_path):
-    scene = with_actors(tiny_scene, LEADING)
-    assert choose_subject(recorded(scene, masks=ego_vehicle_below(scene, 0, tmp_path)), "CAM_FRONT", ANY) is None
-
-
-def test_a_completely_hidden_vehicle_is_not_chosen(tiny_scene):
-    wall = Actor("wall", (7.0, 0.0, 1.5), (4.0, 0.0), size=(0.5, 7.0, 7.0), category="animal")
-    assert chosen(with_actors(tiny_scene, LEADING, wall)) is None
-
-
-def test_a_requested_track_is_chosen_at_its_largest_even_if_parked(tiny_scene):
-    scene = with_actors(tiny_scene, LEADING, PARKED)
+def test_a_requested_track_is_chosen_at_its_largest_even_if_parked_or_at_a_requested_key_frame(tiny_scene):
+    scene = with_actors(tiny_scene, LEADING, PARKED, ONCOMING)
     subject = chosen(scene, SubjectSettings(track="parked"))
-    assert found(subject) == largest(pixels_of(scene, LEADING, PARKED), "parked")
+    assert found(subject) == largest(pixels_of(scene, LEADING, PARKED, ONCOMING), "parked")
     assert subject.label == "parked_other_vehicle"
-
-
-def test_track_and_key_frame_can_be_requested_together(tiny_scene):
-    scene = with_actors(tiny_scene, LEADING, ONCOMING)
     assert found(chosen(scene, SubjectSettings(track="oncoming", key_frame=6))) == ("oncoming", 6)
 
 
@@ -214,9 +181,7 @@ def test_without_moving_vehicles_a_request_is_refused(tiny_scene):
         chosen(with_actors(tiny_scene, PARKED), SubjectSettings(key_frame=3, track="nobody"))
 
 
-@pytest.mark.parametrize(
-    ("key_frame", "split"), [(0, "train"), (2, "interpolation"), (6, "interpolation"), (9, "extrapolation")]
-)
+@pytest.mark.parametrize(("key_frame", "split"), [(0, "train"), (6, "interpolation"), (9, "extrapolation")])
 def test_the_record_of_a_subject(tiny_scene, key_frame, split):
     actor = dataclasses.replace(LEADING, velocity=(4.0, 0.5))
     scene = with_actors(tiny_scene, actor)
@@ -229,15 +194,7 @@ def test_the_record_of_a_subject(tiny_scene, key_frame, split):
     assert record.pop("speed_m_s") == pytest.approx(np.hypot(4.0, 0.5))
     np.testing.assert_allclose(record.pop("object_to_world"), rigid(np.eye(3), place), atol=1e-9)
     assert record == {
-        "track": "leading",
-        "category": "vehicle.car",
-        "label": "moving_car",
-        "label_value": LABELS["moving_car"],
-        "key_frame": key_frame,
-        "timestamp": frame.timestamp,
-        "image": frame.image_path.rsplit("/", 1)[1],
-        "split": split,
-        "size_m": [4.0, 2.0, 1.6],
-        "pixels": subject.pixels,
-        "origin": scene.origin.tolist(),
-    }
+        "track": "leading", "category": "vehicle.car", "label": "moving_car", "label_value": LABELS["moving_car"],
+        "key_frame": key_frame, "timestamp": frame.timestamp, "image": frame.image_path.rsplit("/", 1)[1],
+        "split": split, "size_m": [4.0, 2.0, 1.6], "pixels": subject.pixels, "origin": scene.origin.tolist(),
+    }  # fmt: skip

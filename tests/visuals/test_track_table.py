@@ -7,13 +7,11 @@ from collections.abc import Collection
 import numpy as np
 import pytest
 from helpers.hand_made import actor_record, recording_of
-from matplotlib.figure import Figure
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.evaluation_data import EvaluationData
-from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import MIN_ID_LENGTH, short_ids
 from drivesplat.settings.actor_seed import ActorSeedSettings
 from drivesplat.trajectories.actor_record import ActorRecords
@@ -38,23 +36,14 @@ def rows_of(recording: EvaluationData, editable: Collection[str] = ()) -> list:
     return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"), editable, ActorSeedSettings())
 
 
-def drawn(recording: EvaluationData, editable: Collection[str] = ()) -> Figure:
-    subjects = subjects_by_image(recording, "CAM_FRONT")
-    rows = track_rows(recording, subjects, editable, ActorSeedSettings())
-    return draw_tracks(recording, subjects, rows, "CAM_FRONT")
-
-
-def texts(figure: Figure) -> list[str]:
-    return [text.get_text() for axis in figure.axes for text in axis.texts]
-
-
 def test_every_dynamic_object_has_a_row_and_moving_ones_come_first(recording):
     """The tiny street: a car at 4.2 m/s, a walker at 1.2 m/s, a parked truck; a cone cannot move."""
     rows = rows_of(recording)
-    assert {row.category for row in rows[:2]} == {"vehicle.car", "human.pedestrian.adult"}
-    assert [row.category for row in rows[2:]] == ["vehicle.truck"]
     by_class = {row.category: row for row in rows}
-    assert [row.moves for row in rows] == [True, True, False]
+    assert {row.category: row.moves for row in rows} == {
+        "vehicle.car": True, "human.pedestrian.adult": True, "vehicle.truck": False
+    }  # fmt: skip
+    assert rows[2].category == "vehicle.truck" and len(rows) == 3
     assert by_class["vehicle.car"].speed_mean == pytest.approx(4.2, abs=0.01)
     assert by_class["human.pedestrian.adult"].speed_max == pytest.approx(1.2, abs=0.01)
     truck = by_class["vehicle.truck"]
@@ -123,46 +112,35 @@ def test_a_track_that_cannot_be_edited_says_why(actors, walker, car, recording):
     assert {row.not_editable for row in track_rows(recording, subjects, ids, actors)} == {""}
 
 
-@pytest.mark.parametrize(
-    ("ids", "length"),
-    [
+def test_labels_are_short_and_unique():
+    for ids, length in (
         ([], 0),
         (["a" * 32], MIN_ID_LENGTH),
         (["12345678aa", "12345678ab"], 10),
         (["0123456789", "9123456789"], MIN_ID_LENGTH),
         (["a"], 1),
-    ],
-)
-def test_labels_are_short_and_unique(ids, length):
-    names = short_ids(ids)
-    assert list(names) == ids and len(set(names.values())) == len(ids)
-    assert all(name == names[name] or name.startswith(names[name]) for name in ids)
-    assert {len(name) for name in names.values()} <= {length}
+    ):
+        names = short_ids(ids)
+        assert list(names) == ids and len(set(names.values())) == len(ids)
+        assert all(name.startswith(short) for name, short in names.items())
+        assert {len(name) for name in names.values()} <= {length}
 
 
 def test_without_moving_objects_the_title_says_so(tiny_scene):
-    figure = drawn(recording_of(standing(tiny_scene)))
-    assert "nothing moves" in figure.get_suptitle() and texts(figure) == [] and len(figure.axes) == 1
+    places = (np.repeat(track.object_to_world[:1], len(track.timestamps), axis=0) for track in tiny_scene.tracks)
+    tracks = (dataclasses.replace(t, object_to_world=p) for t, p in zip(tiny_scene.tracks, places, strict=True))
+    recording = recording_of(dataclasses.replace(tiny_scene, tracks=tuple(tracks)))
+    figure = draw_tracks(recording, subjects_by_image(recording, "CAM_FRONT"), rows_of(recording), "CAM_FRONT")
+    assert "nothing moves" in figure.get_suptitle() and len(figure.axes) == 1 and not figure.axes[0].texts
 
 
-def standing(scene: Scene) -> Scene:
-    tracks = (
-        dataclasses.replace(track, object_to_world=np.repeat(track.object_to_world[:1], len(track.timestamps), axis=0))
-        for track in scene.tracks
-    )
-    return dataclasses.replace(scene, tracks=tuple(tracks))
-
-
-@pytest.mark.parametrize(
-    ("pixels", "expected"),
-    [
+def test_few_images_cover_all_objects():
+    for pixels, expected in (
         ({}, []),
         ({4: {}}, []),
         ({0: {"a": 5}, 1: {"a": 9}}, [1]),
         ({0: {"a": 5, "b": 5}, 1: {"a": 900}}, [0]),
         ({0: {"a": 1}, 1: {"b": 1}, 2: {"a": 1, "c": 1}}, [1, 2]),
         ({i: {str(i): 1} for i in range(9)}, list(range(MAX_IMAGES))),
-    ],
-)
-def test_few_images_cover_all_objects(pixels, expected):
-    assert covering_images(pixels) == expected
+    ):
+        assert covering_images(pixels) == expected

@@ -30,10 +30,8 @@ def training(scene: str, method: str, seconds: float, iterations: int = TrainSet
 
 
 def test_the_nearest_that_was_measured_counts():
-    own, peers = (
-        Cost(JobId("masks", "0061"), 7.0, ""),
-        [Cost(JobId("masks", s), t, "") for s, t in (("0103", 3.0), ("0553", 5.0))],
-    )
+    own = Cost(JobId("masks", "0061"), 7.0, "")
+    peers = [Cost(JobId("masks", scene), seconds, "") for scene, seconds in (("0103", 3.0), ("0553", 5.0))]
     demo = Cost(JobId("masks", "demo"), 100.0, "")
     assert expectations(own, *peers, demo).of(JobId("masks", "0061")) == (7.0, {own.job})
     found = expectations(*peers, demo).of(JobId("masks", "0061"))
@@ -42,9 +40,8 @@ def test_the_nearest_that_was_measured_counts():
 
 
 def test_scenes_and_methods_share_cores_and_gpus():
-    work = [
-        PlannedJob(JobId("train", scene, m), 8, True, seconds=100.0) for scene in "abcd" for m in ("vanilla", "street")
-    ]
+    methods = [(scene, method) for scene in "abcd" for method in ("vanilla", "street")]
+    work = [PlannedJob(JobId("train", *method), 8, True, seconds=100.0) for method in methods]
     work += [PlannedJob(JobId("masks", scene), 1, False, seconds=10.0) for scene in "abcd"]
     assert wall_seconds(work, Machine(1, 1)) == 840.0
     assert wall_seconds(work, Machine(4, 8)) == 810.0, "a training takes all four"
@@ -110,8 +107,5 @@ def test_a_run_is_estimated_before_and_accounted_for_after_it(tmp_path):
     again = copy.run("costs")
     assert again.returncode == 0 and costs.exists() and "0001: " in again.stdout and "under 90" in again.stdout
     refused = copy.run("estimate", flags=("--no-hooks",))
-    assert (
-        refused.returncode != 0
-        and "--no-hooks" in refused.stdout
-        and not (copy.folder / "results/0001/vanilla").exists()
-    )
+    assert refused.returncode != 0 and "--no-hooks" in refused.stdout
+    assert not (copy.folder / "results/0001/vanilla").exists()

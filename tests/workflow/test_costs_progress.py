@@ -17,11 +17,8 @@ from drivesplat.workflow.costs.measured import Cost, JobId
 from drivesplat.workflow.costs.progress import RunProgress, watch
 
 CONFIG = load(yaml.safe_load((REPOSITORY / "config.yaml").read_text()))
-MASKS, TRAIN, FILM = (
-    JobId("masks", "0103"),
-    JobId("train", "0103", "street"),
-    JobId("film", "0103", "street", "original"),
-)
+MASKS, TRAIN = JobId("masks", "0103"), JobId("train", "0103", "street")
+FILM = JobId("film", "0103", "street", "original")
 COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=CONFIG.train.iterations), Cost(FILM, 100.0, "")]
 BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
 AT_HALF = "(iteration 3500 of 7000, loss 0.04, 7 min left)"
@@ -33,12 +30,10 @@ def at(step: int, rest: str) -> str:
     return LOGGED.format(f"iteration {step} of 7000, loss 0.04, {rest}")
 
 
-def progress(
-    folder: Path, finished: set[JobId], began: float = 0.0, costs: Sequence[Cost] = tuple(COSTS)
-) -> RunProgress:
+def progress(folder: Path, finished: set[JobId], costs: Sequence[Cost] = tuple(COSTS)) -> RunProgress:
     planned = [PlannedJob(job, 1, job is not MASKS) for job in (MASKS, TRAIN, FILM)]
     logs = {job: folder / f"{job.stage}.log" for job in (MASKS, TRAIN, FILM)}
-    return RunProgress(planned, logs, lambda: Expectations(CONFIG, costs), lambda: finished, Machine(1, 1), began)
+    return RunProgress(planned, logs, lambda: Expectations(CONFIG, costs), lambda: finished, Machine(1, 1), 0.0)
 
 
 def test_trainings_weigh_in_proportion_to_their_seconds(tmp_path):
@@ -47,10 +42,11 @@ def test_trainings_weigh_in_proportion_to_their_seconds(tmp_path):
     assert progress(tmp_path, {MASKS, TRAIN}).line(0.0) == "90 % of the work, 2 of 3 jobs, about 2 min left"
 
 
-def test_a_running_training_reports_its_progress(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + at(700, "9 it/s, 999 s left"))
-    with open(tmp_path / "train.log", "a") as log:
-        log.write(at(3500, "18.8 it/s, 400 s left"))
+def test_a_running_training_reports_its_progress_from_its_first_iteration_on(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("iteration 1 of 120, loss 0.31"))
+    line = progress(tmp_path, {MASKS}).line(0.0)
+    assert line.endswith("about 15 min left; at work: 0103 street train (iteration 1 of 120, loss 0.31)")
+    (tmp_path / "train.log").write_text(BEGINS + at(700, "9 it/s, 999 s left") + at(3500, "18.8 it/s, 400 s left"))
     line = progress(tmp_path, {MASKS}).line(0.0)
     assert line == f"50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train {AT_HALF}"
 
@@ -62,12 +58,6 @@ def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
     (tmp_path / "train.log").write_text(BEGINS + at(3500, "18.8 it/s, 400 s left"))
     line = alone.line(0.0)
     assert line == f"1 of 3 jobs, about 7 min and 1 job not measured yet left; at work: 0103 street train {AT_HALF}"
-
-
-def test_a_training_that_began_shows_its_iteration_and_loss(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("iteration 1 of 120, loss 0.31"))
-    line = progress(tmp_path, {MASKS}).line(0.0)
-    assert line.endswith("about 15 min left; at work: 0103 street train (iteration 1 of 120, loss 0.31)")
 
 
 def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):

@@ -53,38 +53,30 @@ def refusal(text: str, folder: Path) -> str:
 
 
 def test_a_file_holds_named_edits_in_order(tmp_path):
-    edits = read(
-        "edits:\n  b:\n  - remove: {track: x}\n  a:\n  - ego: {lateral: 1}\n  - stop: {track: y, at: 1}", tmp_path
-    )
-    assert {name: [step.kind for step in edit.steps] for name, edit in edits.items()} == {
-        "b": ["remove"],
-        "a": ["ego", "stop"],
-    }
+    text = "edits:\n  b:\n  - remove: {track: x}\n  a:\n  - ego: {lateral: 1}\n  - stop: {track: y, at: 1}"
+    edits = read(text, tmp_path)
+    kinds = {name: [step.kind for step in edit.steps] for name, edit in edits.items()}
+    assert kinds == {"b": ["remove"], "a": ["ego", "stop"]}
     assert list(edits) == ["b", "a"] and edits["a"].steps[1].change.at == 1.0
     assert read("edits:\n", tmp_path) == {}
 
 
-def test_every_step_can_be_written(tmp_path):
-    steps = read(EVERY_STEP, tmp_path)["it"].steps
-    assert {step.kind for step in steps} == set(Step.model_fields)
-    assert (steps[6].change.other, steps[7].change.name, steps[3].change.duration) == ("8b", "twin", 2.0)
-
-
-def test_an_edit_survives_its_travel_as_a_rules_parameter(tmp_path):
+def test_every_step_can_be_written_and_travels_as_a_rules_parameter(tmp_path):
     class Job(Settings):
         edit: Edit
 
     edit = read(EVERY_STEP, tmp_path)["it"]
+    steps = edit.steps
+    assert {step.kind for step in steps} == set(Step.model_fields)
+    assert (steps[6].change.other, steps[7].change.name, steps[3].change.duration) == ("8b", "twin", 2.0)
     for record in (edit, Job(edit=edit)):
         text = canonical_json(record.model_dump(mode="json"))
         assert type(record).model_validate_json(text) == record
-    assert canonical_json(edit.steps[0].model_dump(mode="json")) == '{"remove":{"track":"6e5c"}}'
+    assert canonical_json(steps[0].model_dump(mode="json")) == '{"remove":{"track":"6e5c"}}'
 
 
 def test_a_missing_file_is_reported_as_missing(tmp_path):
-    with pytest.raises(
-        ConfigError, match=r"nowhere\.yaml: the edits file cannot be read \(No such file or directory\)"
-    ):
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: the edits file cannot be read \(No such file"):
         read_edits(tmp_path / "nowhere.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x80")
     with pytest.raises(ConfigError, match=r"binary\.yaml: the edits file is not UTF-8 text"):
@@ -131,8 +123,10 @@ def refused_step(step: str, folder: Path) -> str:
         ("{delete: {track: x}}", f": there is no step 'delete'; there are: {KINDS}"),
         ("remove: x", " (remove) is 'x'; it is a mapping: remove: {track: 6e5c, ...}"),
         ("ego:", " (ego) is None; it is a mapping: ego: {lateral: 2.0}"),
+        ("shift: {track: x, lateral: 3,5}",
+         " (shift): 5 stands where a key should; a decimal has a point: 3.5, not 3,5"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, expected):
     assert refused_step(step, tmp_path) == expected
 
@@ -168,11 +162,6 @@ def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, expected):
 )  # fmt: skip
 def test_a_step_with_other_fields_is_refused_by_its_number_and_kind(tmp_path, kind, fields, expected):
     assert refused_step(f"{kind}: {{{fields}}}", tmp_path) == f" ({kind}): {expected}"
-
-
-def test_a_decimal_comma_is_distinguished_from_a_point(tmp_path):
-    message = refused_step("shift: {track: x, lateral: 3,5}", tmp_path)
-    assert message == " (shift): 5 stands where a key should; a decimal has a point: 3.5, not 3,5"
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ METHODS = {
     "vanilla": {"parts": ["background"]},
     "with_lidar": {"parts": ["background", "actors"], "overrides": {"train": {"scans": SCANS}}},
 }
-EVAL = "results/0001/{}/eval.json"
 
 
 @pytest.fixture(scope="module")

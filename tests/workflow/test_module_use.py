@@ -46,22 +46,19 @@ rule everything:
 """
 
 
-def modifier(prefix: str | None = None, replaced: dict | None = None, inner: PathModifier | None = None) -> Any:
-    return PathModifier(replaced, prefix, None, inner)
-
-
-def prefix_of(path_modifier: PathModifier) -> tuple[str, str]:
-    """The prefix taken from a module, and what Snakemake makes of a path afterwards."""
-    workflow = SimpleNamespace(modifier=SimpleNamespace(path_modifier=path_modifier))
+def prefix_of(*prefixes: str | None) -> tuple[str, str]:
+    """The prefix taken from a module, or from a module of a module, and what Snakemake makes of a path afterwards."""
+    modifier = None
+    for prefix in prefixes:
+        modifier = PathModifier(None, prefix, None, modifier)
+    workflow = SimpleNamespace(modifier=SimpleNamespace(path_modifier=modifier))
     return take_prefix(workflow), str(workflow.modifier.path_modifier.replace_prefix("results/x"))
 
 
 def test_the_prefix_is_the_workflows_own_affair_and_snakemake_adds_none():
-    assert prefix_of(modifier()) == ("", "results/x")
-    assert prefix_of(modifier("made")) == ("made", "results/x")
-    inner = modifier("outer/")
-    assert prefix_of(modifier("made", inner=inner)) == ("outer/made", "results/x")
-    assert inner.replace_prefix("y") == "outer/y", "the module of a module changes nothing of that one"
+    assert prefix_of(None) == ("", "results/x")
+    assert prefix_of("made") == ("made", "results/x")
+    assert prefix_of("outer/", "made") == ("outer/made", "results/x")
 
 
 def test_a_modules_config_is_laid_over_the_defaults_and_stays_as_it_is():

@@ -16,18 +16,12 @@ def sentences(places, **config) -> list[str]:
     return without_effect(load(merged(DEFAULTS, config)), places)
 
 
-def test_defaults_are_not_reported():
+def test_a_setting_that_a_dataset_or_method_overrides_is_reported_once_with_its_place():
     assert sentences([*DEMO, *REAL]) == []
-
-
-def test_a_setting_that_a_dataset_overrides_is_reported_once_with_its_place():
     assert sentences(DEMO, train={"iterations": 3000}) == [
         "train.iterations: 3000 does not hold for dataset demo, where datasets.demo.overrides.train.iterations is 800"
     ]
     assert sentences(REAL, train={"iterations": 3000}) == [], "no scene of the demo takes part"
-
-
-def test_a_setting_that_a_method_overrides_is_reported_for_that_method():
     (sentence,) = sentences([*DEMO, *REAL], train={"depth_weight": 0.5})
     assert sentence.startswith("train.depth_weight: 0.5 does not hold for method street, where methods.street.")
     assert sentence.endswith("is 0.01")

@@ -49,18 +49,15 @@ def test_a_dataset_without_scene_tables_names_the_files_of_each_scene(monkeypatc
         assert made.tables(at) == [f"{tmp_path}/.data/a/v1/{scene}/poses.json"] and made.scene_tables(at) == []
 
 
-def test_actors_are_an_input_of_methods_with_that_part_alone():
-    made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
-    assert taken(made, "a1", "mine") == ["elsewhere/a1/actors.npz"]
-    assert taken(made, "b1", "mine") == ["elsewhere/b1/actors.npz"]
-    assert taken(made, "a1", "vanilla") == []
-
-
-def test_depth_follows_the_overrides_of_dataset_and_method():
+def test_inputs_of_a_training_follow_its_parts_and_the_overrides_of_dataset_and_method():
     free = {"overrides": {"train": {"depth_weight": 0.0}}}
-    made = plan(methods={"vanilla": {}, "free": free}, b=HELD)
-    assert [bool(taken(made, scene, "vanilla")) for scene in ("a1", "b1")] == [False, True]
-    assert [bool(taken(made, scene, "free")) for scene in ("a1", "b1")] == [False, False]
+    made = plan(methods={"vanilla": {}, "free": free, "mine": {"parts": ACTORS}}, b=HELD)
+    depth, actors = ([f"elsewhere/b1/{stage}.npz"] for stage in ("lidar_depth", "actors"))
+    inputs = {(scene, method): taken(made, scene, method) for scene in ("a1", "b1") for method in made.config.methods}
+    assert inputs == {
+        ("a1", "vanilla"): [], ("b1", "vanilla"): depth, ("a1", "free"): [], ("b1", "free"): [],
+        ("a1", "mine"): ["elsewhere/a1/actors.npz"], ("b1", "mine"): [*actors, *depth],
+    }  # fmt: skip
     everywhere = plan(methods={"vanilla": {}, "free": free}, train={"depth_weight": 0.1})
     assert [bool(taken(everywhere, scene, "vanilla")) for scene in ("a1", "b1")] == [True, True]
     assert taken(everywhere, "a1", "free") == []
@@ -72,16 +69,10 @@ def test_depth_follows_the_overrides_of_dataset_and_method():
         ({"vanilla": {}}, {"a1": set(), "b1": {"lidar_depth"}}),
         ({"vanilla": {}, "mine": {"parts": ACTORS}}, {"a1": {"actors"}, "b1": {"actors", "lidar_depth"}}),
         ({"vanilla": {}, "held": {"overrides": HELD}}, {"a1": {"lidar_depth"}, "b1": {"lidar_depth"}}),
-        (
-            {"mine": {"parts": ACTORS, "overrides": {"train": {"depth_weight": 0}}}},
-            {"a1": {"actors"}, "b1": {"actors"}},
-        ),
-        (
-            {"vanilla": {}, "lidar": {"overrides": LIDAR}},
-            {"a1": {"scans", "scan_baselines"}, "b1": {"scans", "scan_baselines", "lidar_depth"}},
-        ),
+        ({"vanilla": {}, "lidar": {"overrides": LIDAR}},
+         {"a1": {"scans", "scan_baselines"}, "b1": {"scans", "scan_baselines", "lidar_depth"}}),
     ],
-)
+)  # fmt: skip
 def test_a_report_expects_them_where_a_method_of_the_scene_takes_them(methods, more):
     made = plan(methods=methods, b=HELD)
     expected = json.loads(made.report([]).settings())["expected"]
@@ -129,23 +120,9 @@ def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_th
     assert plan(**settings).triangulated(SimpleNamespace(scene="a1")) == taken
 
 
-def test_the_refinement_gets_only_the_settings_that_determine_it():
-    job = stage_record("refine_poses", random_seed=3, refine_poses={"rounds": 5})
-    assert job.keys() == {"refine_poses", "random_seed", "lidar"} and job["lidar"] is None
-    assert (job["refine_poses"]["rounds"], job["random_seed"]) == (5, 3)
-    lidar = {"lidar_depth": {"ray_spacing": [0.2, 0.4]}, "lidar_seed": {"own_car_radius": 3.0}}
-    alone = stage_record("refine_poses", refine_poses={"start": "images"}, **lidar)
-    assert alone["lidar"] == {"ray_spacing": [0.2, 0.4], "own_car_radius": 3.0}
-
-
 @pytest.mark.parametrize(
     ("settings", "estimated"),
-    [
-        ({"start": "images"}, True),
-        ({"enabled": True, "start": "images"}, True),
-        ({"enabled": False, "start": "images"}, False),
-        ({}, False),
-    ],
+    [({"start": "images"}, True), ({"enabled": False, "start": "images"}, False), ({}, False)],
 )
 def test_the_extraction_knows_whether_poses_are_estimated_where_drives_may_lack_them(settings, estimated):
     mine = {"datasets": {"mine": {"reader": "drive", "dataroot": "d", "scenes": ["it"]}}, "refine_poses": settings}
@@ -160,9 +137,13 @@ def stage_record(stage: str, **values: Any) -> dict[str, Any]:
 def test_each_stage_gets_the_settings_that_determine_it():
     values = {
         "actors": {"humans": True}, "holdout": {"last_block": 2}, "images": {"width": 320}, "random_seed": 7,
-        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3},
+        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3}, "lidar_depth": {"ray_spacing": [0.2, 0.4]},
     }  # fmt: skip
-    values |= {"lidar_depth": {"ray_spacing": [0.2, 0.4]}}
+    job = stage_record("refine_poses", random_seed=3, refine_poses={"rounds": 5})
+    assert job.keys() == {"refine_poses", "random_seed", "lidar"} and job["lidar"]["own_car_radius"] == 2.5
+    assert (job["refine_poses"]["rounds"], job["random_seed"]) == (5, 3)
+    alone = stage_record("refine_poses", refine_poses={"start": "images"}, **values)
+    assert alone["lidar"] == {"ray_spacing": [0.2, 0.4], "own_car_radius": 3.0}
     actors, depth = (stage_record(stage, **values) for stage in ("actors", "lidar_depth"))
     for record in (actors, depth):
         assert (record["holdout"]["last_block"], record["images"]["width"], record["own_car_radius"]) == (2, 320, 3.0)
@@ -178,43 +159,38 @@ def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
     assert made.evaluation_stages("a1", ["mine"]).keys() == {*of_scene, "actors", "mine/train", "mine/evaluate"}
 
 
-def test_pictures_of_scans_are_those_of_methods_that_render_lidar():
-    """By the settings of the method, and of the dataset."""
-    made = plan(methods={"vanilla": {}, "street": None, "scans": {"overrides": LIDAR}}, b=LIDAR)
-    assert made.methods_with_lidar_in_any_scene == ["vanilla", "scans"]
-    expected = {"a1/scans", "a2/scans", "b1/scans", "b1/vanilla"}
-    for files in (made.looks(), made.report([]).pictures()):
-        assert {
-            path.removeprefix("elsewhere/").removesuffix("/lidar.png") for path in files if "lidar" in path
-        } == expected
-    made.refuse_unknown(["elsewhere/a1/scans/lidar.png", "elsewhere/b1/vanilla/lidar.png"])
-    with pytest.raises(ConfigError, match=r"method 'vanilla' renders no LiDAR of scene a1 .* those do: scans \("):
-        made.refuse_unknown(["elsewhere/a1/vanilla/lidar.png"])
-
-
-def test_films_of_scans_are_those_of_methods_that_render_lidar_and_can_be_left_out():
-    """They can be asked for by name then, too."""
+def test_pictures_and_films_of_scans_are_those_of_methods_that_render_lidar():
+    """By the settings of the method, and of the dataset. Films that are left out can be asked for by name, too."""
     methods = {"vanilla": {}, "street": None, "scans": {"overrides": LIDAR}}
-    made = plan(methods=methods, b={"render": {"lidar": False}})
-    expected = {f"elsewhere/{scene}/scans/lidar.mp4" for scene in ("a1", "a2")}
-    assert {path for path in made.films() if "lidar" in path} == expected <= set(made.report([]).links())
-    made.refuse_unknown([*expected, "elsewhere/b1/scans/lidar.mp4", "elsewhere/b1/scans/lidar.json"])
-    with pytest.raises(ConfigError, match=r"method 'vanilla' renders no LiDAR of scene a1"):
-        made.refuse_unknown(["elsewhere/a1/vanilla/lidar.mp4"])
-    none = plan(methods={"vanilla": {}})
+    made = plan(methods=methods, b={**LIDAR, "render": {"lidar": False}})
+    assert made.methods_with_lidar_in_any_scene == ["vanilla", "scans"]
+
+    def of_lidar(files: list[str]) -> set[str]:
+        return {path.removeprefix("elsewhere/") for path in files if "lidar" in path}
+
+    pictures = {f"{folder}/lidar.png" for folder in ("a1/scans", "a2/scans", "b1/scans", "b1/vanilla")}
+    assert of_lidar(made.looks()) == of_lidar(made.report([]).pictures()) == pictures
+    films = {"a1/scans/lidar.mp4", "a2/scans/lidar.mp4"}
+    assert of_lidar(made.films()) == films <= of_lidar(made.report([]).links())
+    more = ("b1/vanilla/lidar.png", "b1/scans/lidar.mp4", "b1/scans/lidar.json")
+    made.refuse_unknown([f"elsewhere/{name}" for name in (*pictures, *films, *more)])
+    for kind in ("png", "mp4"):
+        with pytest.raises(ConfigError, match=r"method 'vanilla' renders no LiDAR of scene a1 .* those do: scans \("):
+            made.refuse_unknown([f"elsewhere/a1/vanilla/lidar.{kind}"])
     with pytest.raises(ConfigError, match=r"those do: none \(docs/lidar\.md; presets/lidar\.yaml"):
-        none.refuse_unknown(["elsewhere/a1/vanilla/lidar.mp4"])
+        plan(methods={"vanilla": {}}).refuse_unknown(["elsewhere/a1/vanilla/lidar.mp4"])
 
 
-def test_a_method_that_moves_without_objects_has_films_of_its_parts_but_no_actors_and_no_edits(tmp_path):
-    edits = tmp_path / "edits.yaml"
-    edits.write_text("edits: {gone: [remove: {track: a}]}")
-    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
-    made = plan(
-        methods={"drifting": {"parts": DRIFTING}, "mine": {"parts": ACTORS}},
-        render={"trajectories": {"original": {}, "objects": {"parts": "moving"}}},
-        datasets={"a": dataset},
-    )
+@pytest.fixture
+def with_edit(tmp_path) -> dict[str, Any]:
+    """Scene a1, which has an edit."""
+    (tmp_path / "edits.yaml").write_text("edits: {gone: [remove: {track: a}]}")
+    dataset = {"scenes": ["a1"], "edits": {"a1": str(tmp_path / "edits.yaml")}}
+    return {"datasets": {"a": dataset}, "render": {"trajectories": {"original": {}, "objects": {"parts": "moving"}}}}
+
+
+def test_a_method_that_moves_without_objects_has_films_of_its_parts_but_no_actors_and_no_edits(with_edit):
+    made = plan(**with_edit, methods={"drifting": {"parts": DRIFTING}, "mine": {"parts": ACTORS}})
     assert {path.split("/", 2)[2] for path in made.films()} >= {"drifting/objects.mp4", "drifting/parts.mp4"}
     assert taken(made, "a1", "drifting") == []
     assert made.edits() == ["elsewhere/a1/mine/edits/gone.mp4"]
@@ -225,12 +201,8 @@ def test_a_method_that_moves_without_objects_has_films_of_its_parts_but_no_actor
     assert not pages["drifting"]["edits"] and list(pages["mine"]["edits"]) == ["gone"]
 
 
-def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(tmp_path):
-    edits = tmp_path / "edits.yaml"
-    edits.write_text("edits: {gone: [remove: {track: a}]}")
-    trajectories = {"original": {}, "objects": {"parts": "moving"}}
-    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
-    made = plan(render={"trajectories": trajectories}, datasets={"a": dataset})
+def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(with_edit):
+    made = plan(**with_edit)
     assert {path.split("/", 1)[1] for path in made.drives() if "/a1/" in path} == {
         "a1/street/edits/gone/drive/drive.json",
         "a1/street/trajectories/original/drive/drive.json",
@@ -240,20 +212,16 @@ def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(tmp
     for target, message in {
         "street/trajectories/objects/drive/drive.json": "shows the moving parts alone",
         "street/trajectories/nowhere/drive/drive.json": "no film called 'nowhere'",
+        "vanilla/truth.mp4": r"truth\.mp4 needs the truth of a synthetic world, and scene a1 is none",
         "street/edits/gone/drive": "ask for the file elsewhere/a1/street/edits/gone/drive/drive.json",
     }.items():
         with pytest.raises(ConfigError, match=message):
             made.refuse_unknown([f"elsewhere/a1/{target}"])
 
 
-def test_scans_are_of_edits_and_trajectories_of_methods_that_render_lidar(tmp_path):
-    edits = tmp_path / "edits.yaml"
-    edits.write_text("edits: {gone: [remove: {track: a}]}")
-    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
-    lidar = {"overrides": {"train": {"scans": {"per_image": 0.3}}}}
-    methods = {"vanilla": {}, "static": lidar, "moving": {"parts": ["background", "actors"], **lidar}}
-    trajectories = {"original": {}, "objects": {"parts": "moving"}}
-    made = plan(render={"trajectories": trajectories}, datasets={"a": dataset}, methods=methods)
+def test_scans_are_of_edits_and_trajectories_of_methods_that_render_lidar(with_edit):
+    lidar = {"overrides": LIDAR}
+    made = plan(**with_edit, methods={"vanilla": {}, "static": lidar, "moving": {"parts": ACTORS, **lidar}})
     made.refuse_unknown([
         "elsewhere/a1/moving/edits/gone/scans/scans.json",
         "elsewhere/a1/static/trajectories/original/scans/scans.json",
@@ -304,20 +272,15 @@ def test_a_report_asked_for_alone_is_of_what_is_there(tmp_path):
     assert {Path(link).name for link in made.report([]).links()} >= {"original.mp4", "parts.mp4", "viewer.html"}
 
 
-def test_the_reference_is_the_first_static_method():
-    def reference(methods):
-        return json.loads(plan(methods=methods).report([]).settings())["reference"]
-
-    assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}, "b": {}, "c": {}}) == "b"
-    assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}}) is None
-
-
-def test_published_figures_reach_the_report_and_its_job_alone():
-    """A change of them reruns the report alone: no stage and no result that it expects knows of them."""
+def test_what_only_the_report_knows():
+    """The reference is the first static method; a change of published figures reruns the report alone."""
     figures = {"source": "S", "url": "https://example.org", "scene": "a1", "method": "M", "psnr": 20.0}
     before, after = (json.loads(plan(**more).report([]).settings()) for more in ({}, {"published": [figures]}))
     assert before.pop("published") == [] and before == {name: after[name] for name in before}
     assert after["published"][0].items() >= figures.items()
+    moving = {"vanilla": None, "street": None, "moves": {"parts": ACTORS}}
+    for methods, reference in (({**moving, "b": {}, "c": {}}, "b"), (moving, None)):
+        assert json.loads(plan(methods=methods).report([]).settings())["reference"] == reference
 
 
 def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_been_measured(tmp_path):
@@ -411,8 +374,3 @@ EVERY_METHOD = ("", "street", "vanilla")
 def test_targets_concern_these_scenes_and_methods(targets, scenes, methods):
     expected = {(scene, method) for scene in scenes for method in methods}
     assert plan().scenes_and_methods(targets) == expected
-
-
-def test_a_film_beside_the_truth_is_refused_for_a_recorded_drive():
-    with pytest.raises(ConfigError, match=r"truth\.mp4 needs the truth of a synthetic world, and scene a1 is none"):
-        plan().refuse_unknown(["elsewhere/a1/vanilla/truth.mp4"])

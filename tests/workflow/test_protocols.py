@@ -33,33 +33,26 @@ def header(name: str) -> str:
 
 
 @EVERY
-def test_one_command_measures_both_methods_on_every_scene_and_writes_the_report(name):
-    made = plan(name)
-    report = made.report(["metrics", "report"])
-    (dataset,) = [found for found in made.config.datasets.values() if found.batch]
-    assert report.metrics() == [f"results/protocols/{name}/{scene}/metrics.json" for scene in dataset.scenes]
-    assert list(made.config.methods) == ["vanilla", "street"]
-    command = f"snakemake --cores 4 --configfile presets/protocols/{name}.yaml -- metrics report"
-    assert command in header(name)
-
-
-@EVERY
-def test_a_header_says_what_is_held_out_and_needed_and_whether_it_was_run(name):
-    text = header(name)
+def test_a_preset_measures_as_its_header_and_document_say(name):
+    """One command measures both methods on every scene and writes the report; iterations, held-out images and cameras
+    are those of the document for each; published figures are of measured scenes, or means over a known number."""
+    made, text = plan(name), header(name)
+    config = made.config
+    (dataset,) = [found for found in config.datasets.values() if found.batch]
+    metrics = [f"results/protocols/{name}/{scene}/metrics.json" for scene in dataset.scenes]
+    assert made.report(["metrics", "report"]).metrics() == metrics and list(config.methods) == ["vanilla", "street"]
+    assert f"snakemake --cores 4 --configfile presets/protocols/{name}.yaml -- metrics report" in text
     assert "Held out: " in text and "Data: " in text and "Not run by the authors" in text
-    for url in {figures.url for figures in plan(name).config.published}:
-        assert url in text or url.replace("https://arxiv.org/abs/", "arXiv ") in text
-
-
-@EVERY
-def test_a_preset_sets_what_has_an_effect(name):
-    """Iterations, held-out images and cameras as the document has them, for every scene and method."""
-    config = plan(name).config
     for scene in config.batch_scenes:
         for method in config.methods:
             there = for_scene(config, scene, method)
             assert there.train.iterations == 30_000 and there.holdout.last_block == 0
             assert there.eval_camera == there.cameras[0]
+    assert config.published
+    for item in config.published:
+        assert item.url in text or item.url.replace("https://arxiv.org/abs/", "arXiv ") in text
+        assert item.scene in config.batch_scenes or (item.scene == "mean" and item.scenes)
+        assert item.group == "interpolation"
 
 
 @pytest.mark.parametrize(
@@ -139,15 +132,6 @@ def test_the_table_of_vad_gs_is_repeated():
     perceptual = figures("vad_gs_nuscenes", "ssim", "lpips")
     assert perceptual[:5] == [(0.65, 0.13), (0.63, 0.16), (0.63, 0.22), (0.81, 0.16), (0.66, 0.23)]
     assert perceptual[7] == (0.76, 0.24) and {*perceptual[5:7], *perceptual[8:]} == {(None, None)}
-
-
-@EVERY
-def test_published_figures_are_of_measured_scenes_or_means_over_a_known_number(name):
-    config = plan(name).config
-    assert config.published
-    for item in config.published:
-        assert item.scene in config.batch_scenes or (item.scene == "mean" and item.scenes)
-        assert item.group == "interpolation"
 
 
 def test_a_preset_has_no_key_twice():

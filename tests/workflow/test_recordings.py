@@ -33,6 +33,9 @@ DRIVE: dict[str, Any] = {
 }
 
 
+MINE = {"reader": "drive", "scenes": ["one"]}
+
+
 def changed(**values: Any) -> dict[str, Any]:
     """The drive with other values; None takes a key out."""
     return {key: value for key, value in {**copy.deepcopy(DRIVE), **values}.items() if value is not None}
@@ -87,12 +90,7 @@ def test_images_alone_are_refused_where_the_seed_needs_lidar(tmp_path):
 )
 def test_a_hold_out_of_all_key_frames_is_refused(tmp_path, key_frames, holdout, frames, refused):
     drive = changed(frames=[frame for frame in DRIVE["frames"] if frame["timestamp"] < 500_000 * key_frames])
-    mine = {
-        "reader": "drive",
-        "dataroot": str(tmp_path),
-        "scenes": ["one"],
-        "frames": {"one": frames} if frames else {},
-    }
+    mine = {**MINE, "dataroot": str(tmp_path), "frames": {"one": frames} if frames else {}}
     said = refusal(plan(tmp_path, {"one": drive}, holdout=holdout, datasets={"mine": mine}), "lidar_seed")
     count = frames[1] - frames[0] if frames else key_frames
     assert said == (
@@ -113,17 +111,16 @@ def test_key_frames_near_a_held_out_one_are_not_trained_on_at_ten_hertz():
     ]  # fmt: skip
 
 
-def test_a_camera_that_one_drive_lacks_is_refused_for_that_drive(tmp_path):
+def test_a_camera_or_frames_that_one_drive_lacks_are_refused_for_that_drive(tmp_path):
     lacking = changed(cameras={"front": CAMERA})
     made = plan(tmp_path, {"one": DRIVE, "two": lacking}, cameras=["front", "back"])
     assert refusal(made, *ALL) is None
     assert refusal(made, *ALL, scene="two") == "scene two: the drive has no camera 'back'; there are: front"
     made.refuse_unknown_cameras("mine", ["front", "back"])
-
-
-def test_a_range_beyond_the_drive_is_refused(tmp_path):
-    mine = {"reader": "drive", "dataroot": str(tmp_path), "scenes": ["one"], "frames": {"one": (2, 11)}}
-    said = refusal(plan(tmp_path, {"one": DRIVE}, datasets={"mine": mine}), "extract")
+    mine = {**MINE, "dataroot": str(tmp_path), "frames": {"one": (2, 11)}}
+    said = refusal(
+        Plan({**made.config.model_dump(mode="json"), "datasets": {"mine": mine}}, str(REPOSITORY)), "extract"
+    )
     assert said == "scene one: the frame range (2, 11) ends beyond its 10 key frames"
 
 
@@ -159,11 +156,9 @@ def test_a_damaged_drive_is_left_to_its_reader(tmp_path, damaged):
 def test_every_unfit_scene_is_named_up_to_a_few(tmp_path):
     names = ["a", "b", "c", "d", "e", "f"]
     made = plan(tmp_path, dict.fromkeys(names, changed(sweeps=[])))
-    job = SimpleNamespace(rule=SimpleNamespace(name="lidar_seed"))
+    jobs = [SimpleNamespace(rule=SimpleNamespace(name="lidar_seed"), wildcards=SimpleNamespace(scene=n)) for n in names]
     with pytest.raises(ConfigError) as refused:
-        made.recordings.refuse_unfit(
-            SimpleNamespace(**vars(job), wildcards=SimpleNamespace(scene=name)) for name in names
-        )
+        made.recordings.refuse_unfit(jobs)
     assert re.findall(r"scene (\w)\b", str(refused.value)) == names[:4]
     assert str(refused.value).endswith(". 2 more scenes have such faults")
 
@@ -186,10 +181,9 @@ def test_a_world_that_only_gets_another_edit_keeps_its_tracks(tmp_path):
     os.utime(scene, (1, 1))
     assert not made.recordings.has_same_world("w"), "the world was begun anew since"
     shutil.copystat(marker, scene)
-    other = {**world, "world": {"key_frames": 9}}
-    assert not Plan({"datasets": {"w": other}, "results_dir": str(results)}, str(REPOSITORY)).recordings.has_same_world(
-        "w"
-    )
+    world["world"] = {"key_frames": 9}
+    made = Plan({"datasets": {"w": world}, "results_dir": str(results)}, str(REPOSITORY))
+    assert not made.recordings.has_same_world("w")
 
 
 def test_images_that_exceed_the_required_gpu_memory_are_named_at_planning(tmp_path, capsys):
@@ -215,7 +209,7 @@ def test_images_that_exceed_the_required_gpu_memory_are_named_at_planning(tmp_pa
 
 def test_the_size_of_training_images_counts_cameras_ranges_and_the_hold_out(tmp_path):
     of_one = 1600 * 900 * 3e-9
-    mine = {"reader": "drive", "dataroot": str(tmp_path), "scenes": ["one"]}
+    mine = {**MINE, "dataroot": str(tmp_path)}
     made = plan(tmp_path, {"one": DRIVE})
     assert made.recordings.image_gb("one") == pytest.approx(5 * of_one), "10 without the 5th and the last four"
     config = {**made.config.model_dump(mode="json"), "holdout": {"every_nth": 0, "last_block": 0}}

@@ -30,11 +30,8 @@ def dumped(record: dict) -> str:
     return json.dumps(record, sort_keys=True, separators=(",", ":"))
 
 
-def test_a_changed_setting_is_named_with_its_old_and_new_value():
+def test_a_changed_setting_is_named_with_its_values_and_changed_code_by_its_rule():
     assert shortened([dumped(TRAIN), CODE], [dumped(OTHER), CODE]) == "train street: train.ssim_weight 0.2 -> 0.3"
-
-
-def test_changed_code_is_named_by_its_rule():
     assert shortened([CODE], [NEW_CODE], method=None) == "train: code of train changed"
     changed = shortened([dumped(TRAIN), CODE], [dumped(OTHER), NEW_CODE], input_changed=True)
     assert changed == (

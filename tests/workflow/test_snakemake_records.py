@@ -1,7 +1,6 @@
 """Damaged records of Snakemake: removed and named, and the run goes on."""
 
 import base64
-from pathlib import Path
 
 import pytest
 from helpers.shared_runs import VANILLA
@@ -40,10 +39,7 @@ def test_only_records_that_snakemake_fails_on_are_removed(tmp_path, content):
     assert sentence is not None and f"records of {long} were damaged" in sentence
     assert sound.exists() and written.exists() and not split.exists()
     assert drop_foreign_records(tmp_path) is None and drop_foreign_records(tmp_path / "absent") is None
-
-
-def test_the_message_names_a_few_of_many(tmp_path: Path):
     for i in range(5):
-        (tmp_path / base64.b64encode(f"results/{i}".encode()).decode()).write_bytes(b"[]")
+        (tmp_path / base64.b64encode(f"results/{i}".encode()).decode()).write_bytes(content)
     sentence = drop_foreign_records(tmp_path)
     assert sentence is not None and "results/0, results/1, results/2 and 2 more" in sentence

@@ -70,15 +70,12 @@ def test_the_summary_warns_about_standing_dark_and_static_drives(drives):
     assert "memorised" not in still and "dark" not in still
 
 
-def test_a_standing_car_has_a_scale_and_seeds(drives):
-    parser = drives["stands"].drives["vanilla"].recording.record
-    assert parser.scene_scale == 1.0 and np.ptp(parser.camtoworlds[:, :3, 3], axis=0).max() == 0.0
-    assert parser.seed.lidar > 100 and np.isfinite(parser.points).all()
-
-
 @pytest.mark.parametrize(("film", "left"), [("original", 0.0), ("lateral_2m", 2.0)])
 def test_a_film_of_a_stationary_car_is_taken_by_a_stationary_camera(drives, film, left):
     made = drives["stands"]
+    parser = made.drives["vanilla"].recording.record
+    assert parser.scene_scale == 1.0 and np.ptp(parser.camtoworlds[:, :3, 3], axis=0).max() == 0.0
+    assert parser.seed.lidar > 100 and np.isfinite(parser.points).all()
     job, scene = made.job("film", FilmJob, "street", film), made.drives["street"].recording.scene
     path = film_path(scene, job.camera, job.fps, job.trajectory)
     assert len(path) == 15

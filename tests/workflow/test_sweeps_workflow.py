@@ -7,10 +7,6 @@ from helpers.workflow_copy import WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("sweeps_workflow")]
 
-FROM_EXTRACTION_ON = {
-    "extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "train", "evaluate",
-    "scene_metrics",
-}  # fmt: skip
 MISSING = "sweeps/CAM_FRONT/0001__0010.jpg"
 
 
@@ -59,23 +55,3 @@ def test_key_frames_alone_are_measured(finished):
     for group in ("interpolation", "extrapolation"):
         near = metrics["drive"][group]["from_training_m"]
         assert near == pytest.approx(1.0), "at 4 m/s, a quarter of a second away"
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({}, set()),
-        ({"sweeps": False}, FROM_EXTRACTION_ON),
-        ({"lidar_seed": {"sweeps": False, "max_points": 500, "far_points": 100}}, FROM_EXTRACTION_ON),
-    ],
-    ids=["nothing", "images", "LiDAR"],
-)
-def test_a_change_of_what_is_used_reruns_what_depends_on_it(finished, change, expected):
-    before = finished.config
-    finished.config = {**before, **change}
-    finished.write_config()
-    try:
-        assert set(finished.planned("results/0001/metrics.json")) == expected
-    finally:
-        finished.config = before
-        finished.write_config()

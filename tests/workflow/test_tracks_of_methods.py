@@ -9,7 +9,6 @@ import pytest
 from helpers import REPOSITORY
 
 from drivesplat.errors import ConfigError
-from drivesplat.settings.config import load
 from drivesplat.workflow.named_tracks import edits_left_out, refuse_wrong_tracks
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import stage_settings
@@ -46,27 +45,19 @@ def at(method: str | None = None, tracks: str | None = None, scene: str = "a1", 
     return SimpleNamespace(scene=scene, **{name: value for name, value in given.items() if value is not None})
 
 
-@pytest.mark.parametrize(
-    ("method", "folder"), [("street", "r/a1"), ("found", "r/a1/discovered"), ("blind", "r/a1/unlabelled")]
-)
-def test_a_training_reads_what_was_made_for_its_tracks(method, folder):
-    made, job = plan(), at(method)
-    assert made.scene(job) == f"{folder}/scene.json" and made.of_tracks("parser.pkl")(job) == f"{folder}/parser.pkl"
-    assert made.of_images("masks/masks.json", of_tracks=True)(job) == [f"{folder}/masks/masks.json"]
-    stages = ("actors", "lidar_depth", "scans") if method != "blind" else ()
-    taken = [file for stage in ("actors", "lidar_depth", "scans") for file in made.training_input(stage)(job)]
-    assert taken == [f"{folder}/{stage}.npz" for stage in stages]
-
-
-def test_stages_of_a_scene_read_the_record_of_the_folder_that_they_write_to():
-    made = plan()
-    for folder in ("", "discovered/", "unlabelled/"):
-        job = at(tracks=folder)
+@pytest.mark.parametrize(("method", "folder"), [("street", ""), ("found", "discovered/"), ("blind", "unlabelled/")])
+def test_trainings_and_stages_read_what_was_made_for_their_tracks(method, folder):
+    made, stages = plan(), ("actors", "lidar_depth", "scans")
+    for job in (at(method), at(tracks=folder)):
         assert made.scene(job) == f"r/a1/{folder}scene.json"
         assert made.of_images("seed.ply", of_tracks=True)(job) == [f"r/a1/{folder}seed.ply"]
-        assert made.of_images("seed.ply", of_tracks=True)(at(tracks=folder, scene="b1")) == []
-        assert made.actors(job) == ([] if folder == "unlabelled/" else [f"r/a1/{folder}actors.npz"])
-        assert made.discovered(job) == (["r/a1/discovered.json"] if folder == "discovered/" else [])
+    assert made.of_tracks("parser.pkl")(at(method)) == f"r/a1/{folder}parser.pkl"
+    taken = [file for stage in stages for file in made.training_input(stage)(at(method))]
+    assert taken == ([] if method == "blind" else [f"r/a1/{folder}{stage}.npz" for stage in stages])
+    job = at(tracks=folder)
+    assert made.of_images("seed.ply", of_tracks=True)(at(tracks=folder, scene="b1")) == []
+    assert made.actors(job) == ([] if method == "blind" else [f"r/a1/{folder}actors.npz"])
+    assert made.discovered(job) == (["r/a1/discovered.json"] if method == "found" else [])
 
 
 def test_all_methods_are_measured_with_annotated_tracks():
@@ -178,12 +169,7 @@ def test_a_record_that_a_run_makes_is_left_to_its_stage(edited):
 
 @pytest.mark.parametrize(("track", "shown"), [("aa", "street"), ("found_0001", "found")])
 def test_a_vehicle_is_shown_by_methods_with_its_track(track, shown):
-    values = {
-        "datasets": {"a": {"scenes": ["a1"]}},
-        "methods": METHODS,
-        "subjects": {"a1": {"track": track, "key_frame": 3}},
-    }
-    config = load(values)
+    config = plan(subjects={"a1": {"track": track, "key_frame": 3}}).config
     for method in ("street", "found"):
         subject = json.loads(stage_settings(config, "remove_actor", "a1", method))["subject"]
         assert subject == ({"track": track, "key_frame": 3} if method == shown else {"track": None, "key_frame": None})

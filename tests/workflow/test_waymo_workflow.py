@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.waymo_drive import GLOBAL, NAME, tables_scan, tiny_drive
 from helpers.waymo_files import write_v1, write_v2
-from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from drivesplat.scene.scene import read_scene
 
@@ -73,15 +73,3 @@ def test_results_are_exact_and_an_altered_recording_is_refused(copy):
     image.write_bytes(whole)
     done = copy.run(f"results/{NAME}/seed.ply")
     assert done.returncode == 0, done.stdout
-
-
-def test_a_missing_component_stops_before_any_job(copy):
-    lost = copy.folder / f"waymo/v2/lidar_pose/{NAME}.parquet"
-    kept = lost.rename(lost.with_suffix(".kept"))
-    try:
-        done = copy.run(V2, flags=("--forceall",))
-    finally:
-        kept.rename(lost)
-    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    (line,) = complaints(done.stdout)
-    assert f"lidar_pose/{NAME}.parquet is missing" in line and "docs/waymo.md" in line

@@ -14,14 +14,10 @@ from drivesplat.workflow.stages import TRAINING_INPUTS, stage_settings
 from drivesplat.workflow.without_cameras import CAMERA_STAGES, methods_left_out, require_methods
 
 ALONE = {"cameras": [], "eval_camera": None}
-METHODS = {
-    "vanilla": {},
-    "street": {"parts": ["background", "actors"]},
-    "with_lidar": {
-        "parts": ["background", "actors"],
-        "overrides": {"train": {"depth_weight": 0.01, "scans": {"per_image": 0.25, "fine_tune": 0.2, "geometry": 0.3}}},
-    },
-}
+SCANS = {"per_image": 0.25, "fine_tune": 0.2, "geometry": 0.3}
+ACTORS = {"parts": ["background", "actors"]}
+LIDAR = {"overrides": {"train": {"depth_weight": 0.01, "scans": SCANS}}}
+METHODS = {"vanilla": {}, "street": ACTORS, "with_lidar": ACTORS | LIDAR}
 
 
 def settings(**values: Any) -> dict[str, Any]:
@@ -78,15 +74,15 @@ def test_the_report_expects_its_own_stages():
     [
         ("vanilla/eval.json", "and method 'vanilla' renders images alone; those that render LiDAR: with_lidar"),
         ("with_lidar/original.mp4", ": with_lidar/original.mp4 needs images; docs/lidar.md"),
-        ("with_lidar/ghost_panel.png", ": with_lidar/ghost_panel.png needs images"),
-        ("with_lidar/edits/away/scans/scans.json", ": with_lidar/edits/away/scans/scans.json needs images"),
-        ("with_lidar/trajectories/original/drive/drive.json", "drive.json needs images"),
-        ("with_lidar/splat.ply", ": with_lidar/splat.ply needs images"),
-        ("masks/masks.json", ": masks/masks.json needs images"),
-        ("seed.ply", ": seed.ply needs images"),
-        ("ablation.csv", ": ablation.csv needs images"),
+        *(
+            (target, f"{target} needs images")
+            for target in (
+                "with_lidar/ghost_panel.png", "with_lidar/edits/away/scans/scans.json", "with_lidar/splat.ply",
+                "with_lidar/trajectories/original/drive/drive.json", "masks/masks.json", "seed.ply", "ablation.csv",
+            )
+        ),
     ],
-)
+)  # fmt: skip
 def test_a_result_that_needs_images_is_refused_by_name(target, words):
     made = plan(ablation={"of": "with_lidar"})
     with pytest.raises(ConfigError) as refused:
@@ -103,11 +99,12 @@ def test_what_it_has_is_not_refused():
     made.refuse_unknown([f"there/a2/{name}" for name in (*of_scene, *(f"with_lidar/{name}" for name in of_method))])
 
 
-@pytest.mark.parametrize("stage", CAMERA_STAGES)
-def test_stages_of_images_have_no_settings_there(stage):
+def test_stages_of_images_have_no_settings_there():
     """Whoever asks for their results: also another workflow, whose targets are unknown."""
-    with pytest.raises(ConfigError, match=rf"^scene a2 has no camera .*the stage {stage} needs images$"):
-        stage_settings(load(settings()), stage, "a2", "with_lidar", "original")
+    config = load(settings())
+    for stage in CAMERA_STAGES:
+        with pytest.raises(ConfigError, match=rf"^scene a2 has no camera .*the stage {stage} needs images$"):
+            stage_settings(config, stage, "a2", "with_lidar", "original")
 
 
 def test_scans_of_trajectories_take_no_camera_and_those_of_edits_are_refused():
@@ -120,18 +117,14 @@ def test_scans_of_trajectories_take_no_camera_and_those_of_edits_are_refused():
         stage_settings(config, "scan_folder", "a2", "with_lidar", "edits/away")
 
 
-def test_without_a_method_that_renders_lidar_it_is_refused_with_the_remedy():
-    images_alone = load(settings(methods={"vanilla": {}}))
-    require_methods(images_alone, "a1")
-    with pytest.raises(ConfigError, match=r"scene a2 has no camera .*no method renders LiDAR; .*presets/lidar.yaml"):
-        require_methods(images_alone, "a2")
-
-
-def test_planning_names_the_methods_that_it_leaves_out():
-    config = load(settings())
+def test_planning_names_the_methods_that_it_leaves_out_and_refuses_a_scene_without_any():
+    config, images_alone = load(settings()), load(settings(methods={"vanilla": {}}))
     (sentence,) = methods_left_out(config, ["a1", "a2"])
     assert sentence.startswith("dataset b has no camera") and sentence.endswith("left out there (vanilla, street)")
     assert methods_left_out(config, ["a1"]) == []
+    require_methods(images_alone, "a1")
+    with pytest.raises(ConfigError, match=r"scene a2 has no camera .*no method renders LiDAR; .*presets/lidar.yaml"):
+        require_methods(images_alone, "a2")
 
 
 def test_a_camera_of_a_dataset_without_any_is_refused_with_the_remedy(tmp_path):

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from helpers.archives import NO_FILES, addresses, addresses_in_results, dead_links
 from helpers.chromium import chromium, in_a_browser
-from helpers.shared_runs import CAR, EDITS, two_edits
+from helpers.killed_runs import only_complaint
+from helpers.shared_runs import CAR, EDITS
 from helpers.workflow_copy import WorkflowCopy, complaints
 from PIL import Image
 
@@ -30,6 +32,20 @@ def finished(finished_run, tmp_path_factory) -> WorkflowCopy:
     return finished_run.again(tmp_path_factory.mktemp("finished") / "workflow")
 
 
+@contextmanager
+def changed(copy: WorkflowCopy, *changes: tuple[str, str, str]) -> Iterator[None]:
+    """Files of the workflow changed for a while: `(file, old, new)`."""
+    before = {copy.folder / file: (copy.folder / file).read_text() for file, _, _ in changes}
+    for file, old, new in changes:
+        assert old in before[copy.folder / file]
+        (copy.folder / file).write_text(before[copy.folder / file].replace(old, new, 1))
+    try:
+        yield
+    finally:
+        for path, content in before.items():
+            path.write_text(content)
+
+
 def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
     metrics = finished.read("results/0001/metrics.json")
     assert (metrics["schema"], metrics["scene"], metrics["dataset"]) == (1, "0001", "nuscenes")
@@ -40,27 +56,18 @@ def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
         "regions": "boxes", "visibility": "annotated", "extra_points": None, "lidar_missing": 0,
     }  # fmt: skip
     assert {key: metrics["protocol"][key] for key in expected} == expected
-    assert set(metrics["methods"]) == {"vanilla", "street"}
     assert {"settings_sha256", "code_sha256", "inputs_sha256", "versions"} <= metrics["provenance"].keys()
-
-
-def test_every_method_is_measured_in_both_groups_and_all_regions(finished):
-    for result in finished.read("results/0001/metrics.json")["methods"].values():
+    assert set(metrics["methods"]) == {"vanilla", "street"}
+    for result in metrics["methods"].values():
         for group in ("interpolation", "extrapolation"):
             assert set(REGIONS) | {"gap_db", "human_gap_db", "depth"} == set(result[group])
             assert result[group]["all"]["psnr"] > 8.0
-            for region in REGIONS:
-                record = result[group][region]
-                assert record is None or (
-                    record["pixels"] >= 1000 and math.isfinite(record["psnr"]) and record["ssim"] <= 1.0
-                )
+            for record in filter(None, (result[group][region] for region in REGIONS)):
+                assert record["pixels"] >= 1000 and math.isfinite(record["psnr"]) and record["ssim"] <= 1.0
         whole, moving = result["extrapolation"]["static"], result["extrapolation"]["moving_vehicle"]
         assert result["extrapolation"]["gap_db"] == pytest.approx(whole["psnr"] - moving["psnr"])
-        assert (result["train_iterations"], result["peak_gpu_memory_gb"]) == (60, None)
+        assert (result["train_iterations"], result["peak_gpu_memory_gb"]) == (20, None)
         assert result["lpips_unavailable"] == "lpips.enabled is false"
-
-
-def test_the_report_has_a_row_per_scene_and_method(finished):
     report = finished.read("results/gap_report.json")
     assert [(row["scene"], row["method"]) for row in report["rows"]] == [("0001", "vanilla"), ("0001", "street")]
     assert report["left_out"] == [] and report["missing"] == []
@@ -68,38 +75,13 @@ def test_the_report_has_a_row_per_scene_and_method(finished):
     assert len(lines) == 3 and lines[0].startswith("scene,dataset,method")
 
 
-@pytest.mark.slow
-def test_scripts_in_new_interpreters_make_the_same_files(finished, tmp_path):
-    """In other tests scripts are forked from a process with other packages imported (`helpers.forked_scripts`)."""
-    copy = two_edits(tmp_path / "workflow")
-    done = copy.run("all", "results/0001/scans.npz", under=("env",))
-    assert done.returncode == 0, done.stdout
-    made, expected = (set(files_without_logs(one.folder / "results")) for one in (copy, finished))
-    assert made == expected and made
-
-
-def files_without_logs(results: Path) -> Iterator[Path]:
-    """Relative paths; TensorBoard's event files have names of their own."""
-    for path in results.rglob("*.*"):
-        if path.is_file() and not {"logs", "tensorboard"} & set(path.parts):
-            yield path.relative_to(results)
-
-
 def test_what_a_training_leaves_behind(finished):
     folder = finished.folder / "results/0001/vanilla"
     trained = {"checkpoint.npz", "train.json", "eval.json", "tensorboard", ".digests"} | set(HELD_OUT_PAIR.values())
     films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
     looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
-    exports = {
-        "splat.ply",
-        "cameras.json",
-        "transforms.json",
-        "parts",
-        "scene.usdz",
-        "viewer.html",
-        "colmap",
-        "far.npz",
-    }
+    exports = {"cameras.json", "transforms.json", "parts", "scene.usdz", "viewer.html", "colmap", "far.npz"}
+    exports |= {"splat.ply"}
     of_both = trained | films | looks | exports
     assert of_both == {path.name for path in folder.iterdir()}
     assert list((folder / "tensorboard").glob("events.*"))
@@ -180,35 +162,23 @@ def archive(finished, tmp_path_factory) -> Path:
     return folder / "report"
 
 
-def test_snakemakes_report_holds_all_there_is_to_look_at(archive):
+def test_snakemakes_report_holds_all_there_is_to_look_at_and_what_its_pages_link_to(archive):
     names = [path.name for path in archive.rglob("*") if path.is_file()]
     page = (archive / "report.html").read_text(encoding="utf-8")
-    pictures = {"ghost_panel.png", "removal.png", "original.mp4", "lateral_2m.mp4", "metrics.json", "gap_report.csv"}
-    pictures |= {"gap_report.html", "ghosts.html", "viewer.html", "tracks.png"}
-    assert pictures | {"parts.mp4", "stop.mp4", "stop.png", "gone.mp4", "gone.png"} < set(names)
+    films = {"original.mp4", "lateral_2m.mp4", "parts.mp4", "stop.mp4", "gone.mp4"}
+    pictures = {"ghost_panel.png", "removal.png", "stop.png", "gone.png", "tracks.png"}
+    assert films | pictures | {"metrics.json", "gap_report.csv", "ghosts.html"} < set(names)
     assert names.count("viewer.html") == 2 and names.count("gap_report.html") == 1
     assert "Scene 0001" in page and "Across scenes" in page and "the moving vehicle that fills most pixels" in page
     assert "the moving parts on grey" in page and "the frame with the largest difference" in page
     assert all(page.count(fix.method) >= 2 for fix in PUBLISHED_FIXES), "captions of ghost panels name published fixes"
-
-
-def test_every_link_of_the_pages_in_snakemakes_report_is_in_it(archive):
     dead, links = dead_links(archive)
-    assert dead == set()
-    (page,) = archive.rglob("gap_report.html")
-    linked = {Path(address).name for address in addresses(page.read_text(encoding="utf-8"))}
-    assert {
-        "compare.mp4",
-        "original.mp4",
-        "lateral_2m.mp4",
-        "parts.mp4",
-        "stop.mp4",
-        "gone.mp4",
-        "viewer.html",
-    } < linked
-    captions = addresses_in_results((archive / "report.html").read_text(encoding="utf-8"))
+    assert dead == set() and links > 30
+    (report,) = archive.rglob("gap_report.html")
+    linked = {Path(address).name for address in addresses(report.read_text(encoding="utf-8"))}
+    assert films | {"compare.mp4", "viewer.html"} < linked
+    captions = addresses_in_results(page)
     assert sum(address.endswith("/ghosts.html") for address in captions) == 1 + 2, "itself, and two ghost panels"
-    assert links > 30
 
 
 def test_every_link_of_the_page_in_the_results_folder_is_in_it(finished):
@@ -243,13 +213,11 @@ SLOW = pytest.mark.slow
 """For settings that `settings/test_config.py` follows to their stages, too."""
 OF_ACTORS = {"film_parts": 1, "edit": 2}
 """What a method with actors has and others have not."""
-FILMS = {"compare": 1, "film": 4, **OF_ACTORS}
-FILMS_AND_LOOKS = {"ghost_panel": 2, "remove_actor": 2, **FILMS}
 EXPORTS = ("far_gaussians", "export", "export_usd", "export_viewer")
 COLMAP = {"export_colmap": 2}
 TRAINING_AND_AFTER = {
-    "train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1, **FILMS_AND_LOOKS,
-    **dict.fromkeys(EXPORTS, 2),
+    "train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2,
+    "remove_actor": 2, "compare": 1, "film": 4, **OF_ACTORS, **dict.fromkeys(EXPORTS, 2),
 }  # fmt: skip
 ONE_TRAINING_AND_AFTER = {
     "train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1, "compare": 1, "film": 2, "ghost_panel": 1,
@@ -261,42 +229,37 @@ AFTER_EXTRACTION = {
     "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER, **COLMAP
 }  # fmt: skip
 EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
+NO_STAGE = {"refine_poses": {"rounds": 2, "enabled": False}, "device": {"kind": "cpu", "min_free_gb": 1},
+            "lpips": {"enabled": False, "timeout_s": 3}}  # fmt: skip
+"""Settings of a stage that is left out, and of machines alone."""
 
 
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
         ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
-        ({"methods": {"vanilla": {"overrides": {"sky": "mask"}}}}, ONE_TRAINING_AND_AFTER),
         ({"actors": {"humans": True}}, {"actors": 1, "tracks": 1, **STREETS_TRAINING_AND_AFTER}),
-        pytest.param({"lidar_seed": {"voxel_size": 0.2}},
-                     {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER, **COLMAP}, marks=SLOW),
-        ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
-         EVERYTHING | {"extract": 0}),
-        pytest.param({"lidar_seed": {"sweeps": True}}, EVERYTHING, marks=SLOW),
         ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
         ({"render": {"compare": False, "trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2, "gap_report": 1}),
-        pytest.param({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2, "gap_report": 1},
-                     marks=SLOW),
         pytest.param({"export": {"sh_degree": 3, "formats": ["ply", "spz"]}}, {"export": 2, "export_spz": 2},
                      marks=SLOW),
-        ({"refine_poses": {"rounds": 2}, "device": {"kind": "cpu", "min_free_gb": 1},
-          "lpips": {"enabled": False, "timeout_s": 3}}, {}),
         ({"methods": {"third": {}}}, {**ONE_TRAINING_AND_AFTER, "export_viewer": 3, "export_colmap": 1}),
     ],
 )  # fmt: skip
 def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, setting, expected):
-    changed = dict(finished.config)
+    """What reaches no stage reruns nothing."""
+    changed = {**finished.config, **NO_STAGE}
     for key, value in setting.items():
         changed[key] = {**changed[key], **value} if isinstance(changed.get(key), dict) else value
-    assert WorkflowWithConfig(finished, changed).planned() == {rule: n for rule, n in expected.items() if n}
+    with finished.set_to(**changed):
+        assert finished.planned() == {rule: n for rule, n in expected.items() if n}
 
 
 def test_the_reason_of_a_rerun_is_the_changed_setting(finished):
-    changed = {**finished.config, "train": {**finished.config["train"], "iterations": 61}}
-    printed = WorkflowWithConfig(finished, changed).dry_run("metrics")
+    with finished.set_to(train={**finished.config["train"], "iterations": 61}):
+        printed = finished.dry_run("metrics")
     trained = [line.strip() for line in printed.splitlines() if "iterations" in line]
-    assert sorted(trained) == [f"reason: train {method}: train.iterations 60 -> 61" for method in ("street", "vanilla")]
+    assert sorted(trained) == [f"reason: train {method}: train.iterations 20 -> 61" for method in ("street", "vanilla")]
     assert max(map(len, printed.splitlines())) < 2000
 
 
@@ -330,42 +293,27 @@ edits: {stop: [{shift: {lateral: 1, "track": "0001 instance 0", yaw: 0.0, start:
     ids=["a step", "one more edit", "written otherwise"],
 )  # fmt: skip
 def test_a_changed_step_reruns_its_edit_and_the_page_that_plays_it(finished, old, new, expected, of_gone):
-    path = finished.folder / "edits.yaml"
     assert old in EDITS
-    path.unlink()
-    path.write_text(EDITS.replace(old, new))
-    try:
+    with changed(finished, ("edits.yaml", old, new)):
         assert finished.planned() == expected
         if of_gone is not None:
             assert finished.planned(LEFT_GONE) == of_gone
-    finally:
-        path.write_text(EDITS)
 
 
 def test_a_changed_step_hides_no_change_of_the_report(finished):
     """The page links to the film, which is no reason to leave the page as it was."""
-    path = finished.folder / "edits.yaml"
-    path.write_text(EDITS.replace("at: 2}", "at: 2.5}"))
-    report = finished.folder / "drivesplat/report/gaps.py"
-    code = report.read_text(encoding="utf-8")
-    report.write_text(code + "\nNEW = 1\n", encoding="utf-8")
-    try:
+    with changed(
+        finished, ("edits.yaml", "at: 2}", "at: 2.5}"), ("drivesplat/report/gaps.py", "SCHEMA = 3", "SCHEMA = 4")
+    ):
         assert finished.planned() == {"edit": 1, "export_viewer": 1, "gap_report": 1}
-    finally:
-        path.write_text(EDITS)
-        report.write_text(code, encoding="utf-8")
 
 
 def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
-    path = finished.folder / "edits.yaml"
-    path.write_text(EDITS + "  typo:\n    - remove: {track: abcd}\n")
-    try:
+    typo = "  typo:\n    - remove: {track: abcd}\n  gone:"
+    with changed(finished, ("edits.yaml", "  gone:", typo)):
         target = "results/0001/street/edits/typo.mp4"
         done, planned = (finished.run(target, flags=flags) for flags in ((), ("-n",)))
-    finally:
-        path.write_text(EDITS)
-    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    (line,) = complaints(done.stdout)
+    line = only_complaint(done)
     assert planned.returncode != 0 and complaints(planned.stdout) == {line}
     words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"tracks that move: {CAR[:8]}")
     assert all(word in line for word in words), line
@@ -373,32 +321,23 @@ def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
 
 
 def test_a_wrong_track_is_refused_before_a_result_is_deleted(finished):
-    before = finished.config
-    pictures = ("removal.png", "ghost_panel.png")
-    had = [(finished.folder / f"results/0001/vanilla/{name}").read_bytes() for name in pictures]
-    finished.config = {**before, "subjects": {"0001": {"track": "0001 instance 9"}}}
-    finished.write_config()
-    try:
-        done = finished.run(*(f"results/0001/vanilla/{name}" for name in pictures))
-    finally:
-        finished.config = before
-        finished.write_config()
-    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    (line,) = complaints(done.stdout)
+    pictures = [finished.folder / f"results/0001/vanilla/{name}" for name in ("removal.png", "ghost_panel.png")]
+    had = [path.read_bytes() for path in pictures]
+    with finished.set_to(subjects={"0001": {"track": "0001 instance 9"}}):
+        line = only_complaint(finished.run(*(str(path.relative_to(finished.folder)) for path in pictures)))
     words = ("subjects.0001", "no track '0001 instance 9'", "did you mean 0001 instance", f"tracks that move: {CAR}")
     assert all(word in line for word in words), line
-    assert [(finished.folder / f"results/0001/vanilla/{name}").read_bytes() for name in pictures] == had
+    assert [path.read_bytes() for path in pictures] == had
 
 
 def test_order_comments_and_written_out_defaults_rerun_nothing(finished):
-    import yaml
-
+    """Of settings, and of the code; `refine_poses` is not enabled."""
     reversed_keys = {key: finished.config[key] for key in reversed(finished.config)}
     reversed_keys["lidar_seed"] = {"voxel_size": 0.1, "far_points": 100, "max_points": 500}
-    text = "# a comment\n" + yaml.safe_dump(reversed_keys, sort_keys=False)
-    finished.write_config(text)
+    finished.write_config("# a comment\n" + yaml.safe_dump(reversed_keys, sort_keys=False))
     try:
-        assert finished.planned() == {}
+        with changed(finished, *COMMENTS, UNUSED):
+            assert finished.planned() == {}
     finally:
         finished.write_config()
 
@@ -441,38 +380,13 @@ COMMENTS = (
 UNUSED = ("drivesplat/poses/refinement_record.py", "SCHEMA = 1", "SCHEMA = 2")
 
 
-@contextmanager
-def changed(copy: WorkflowCopy, *changes: tuple[str, str, str]) -> Iterator[None]:
-    """Files of the workflow changed for a while: `(file, old, new)`."""
-    before = {copy.folder / file: (copy.folder / file).read_text() for file, _, _ in changes}
-    for file, old, new in changes:
-        assert old in before[copy.folder / file]
-        (copy.folder / file).write_text(before[copy.folder / file].replace(old, new, 1))
-    try:
-        yield
-    finally:
-        for path, content in before.items():
-            path.write_text(content)
-
-
-def test_comments_and_code_of_other_settings_rerun_nothing(finished):
-    """`refine_poses` is not enabled."""
-    with changed(finished, *COMMENTS, UNUSED):
-        assert finished.planned() == {}
-
-
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
     [
-        ("drivesplat/evaluation/metrics.py", "MIN_FRAME_PIXELS = 100", "MIN_FRAME_PIXELS = 90",
-         {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "compare": 1, "ghost_panel": 2, "remove_actor": 2}),
         ("drivesplat/preprocess/masks.py", "BRIGHT = 0.7", "BRIGHT = 0.71",
          {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
-        ("drivesplat/scene/object_class.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
-        pytest.param("drivesplat/io/video.py", "bicubic", "bilinear", FILMS, marks=SLOW),
-        ("drivesplat/trajectories/lateral_offset.py", "HEADING_SPEED = 1.0", "HEADING_SPEED = 0.5",
-         {"edit": 2, "export_viewer": 2}),
-        ("drivesplat/report/gaps.py", "SCHEMA = 3", "SCHEMA = 4", {"gap_report": 1}),
+        pytest.param("drivesplat/scene/object_class.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING,
+                     marks=SLOW),
     ],
 )  # fmt: skip
 def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, old, new, expected):
@@ -481,17 +395,11 @@ def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, o
 
 
 def test_a_truncated_result_is_named_with_the_rule_that_rebuilds_it(finished, tmp_path):
-    import shutil
-
-    copy = WorkflowCopy(tmp_path / "copy", finished.config)
-    shutil.copytree(finished.folder, copy.folder, symlinks=True)
+    copy = finished.again(tmp_path / "copy")
     seed = copy.folder / "results/0001/seed.ply"
     seed.write_bytes(seed.read_bytes()[:2000])
-    done = copy.run("results/0001/metrics.json")
-    assert done.returncode != 0
-    (line,) = complaints(done.stdout)
+    line = only_complaint(copy.run("results/0001/metrics.json"))
     assert "seed.ply" in line and "lidar_seed" in line
-    assert "Traceback" not in done.stdout
     assert not (copy.folder / "results/0001/parser.pkl").exists()
 
 
@@ -503,18 +411,3 @@ def test_a_drive_in_four_panels_is_made_on_request(finished):
     assert (footage.frames, footage.width, footage.height) == (19, 128, 72)
     labels = finished.read("results/0001/street/quad/stop.json")
     assert {"extract", "street/train"} < labels["provenance"]["stages"].keys() and len(labels["film"]["panels"]) == 4
-
-
-class WorkflowWithConfig(WorkflowCopy):
-    """The same folder under another config."""
-
-    def __init__(self, other: WorkflowCopy, config: dict):
-        super().__init__(other.folder, config)
-        self._other = other
-
-    def dry_run(self, *targets: str) -> str:
-        self.write_config()
-        try:
-            return super().dry_run(*targets)
-        finally:
-            self._other.write_config()

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
+from helpers.drives import scene_at
 from nuscenes.utils.data_classes import LidarPointCloud
 from PIL import Image
-
-from drivesplat.preprocess.extract import extract_scene
-from drivesplat.settings.extract import SceneSource
 
 CAMERAS = {"CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT"}
 KEY_FRAMES = 6
@@ -70,7 +68,7 @@ def test_every_recording_has_its_file_and_an_ego_pose_of_its_time_far_from_zero(
             assert -2.0 < np.median(cloud[2]) < 0.0, "most returns come from the road below the sensor"
 
 
-def test_annotations_of_an_object_form_one_chain(demo_tables):
+def test_annotations_of_an_object_form_one_chain_with_boxes_and_speeds(demo_tables, demo_root, samples):
     for instance in demo_tables.instance:
         rows = chain(demo_tables, "sample_annotation", instance["first_annotation_token"])
         assert len(rows) == instance["nbr_annotations"]
@@ -78,9 +76,6 @@ def test_annotations_of_an_object_form_one_chain(demo_tables):
         assert {row["instance_token"] for row in rows} == {instance["token"]}
         times = [demo_tables.get("sample", row["sample_token"])["timestamp"] for row in rows]
         assert times == sorted(set(times))
-
-
-def test_the_devkit_gives_boxes_and_their_speeds(demo_tables, demo_root, samples):
     path, boxes, intrinsics = demo_tables.get_sample_data(samples[0]["data"]["CAM_FRONT"])
     assert path.startswith(str(demo_root)) and intrinsics.shape == (3, 3)
     assert "vehicle.car" in {box.name for box in boxes} and all(box.center[2] > 0 for box in boxes)
@@ -94,16 +89,10 @@ def test_the_devkit_gives_boxes_and_their_speeds(demo_tables, demo_root, samples
     assert min(speeds["pedestrian.moving"]) > 0.5 and max(speeds["pedestrian.moving"]) < 2.0
 
 
-@pytest.mark.parametrize("sweeps", [False, True])
-def test_the_projects_reader_reads_it(demo_root, sweeps):
-    source = SceneSource(
-        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None,
-        cameras=("CAM_FRONT",), sweeps=sweeps, on_missing="stop",
-    )  # fmt: skip
-    scene = extract_scene(source, demo_root)
-    assert len(scene.frames) == (31 if sweeps else KEY_FRAMES) and len(scene.sweeps) == KEY_FRAMES
-    assert scene.missing_images == 0
-    assert {frame.sample_index for frame in scene.frames} == set(range(KEY_FRAMES))
+def test_the_projects_reader_reads_it(demo_root):
+    scene = scene_at(demo_root, dataset="demo", scene="demo", on_missing="stop")
+    assert len(scene.frames) == 31 and len(scene.sweeps) == KEY_FRAMES and scene.missing_images == 0
+    assert [frame.sample_index for frame in scene.frames if frame.is_key_frame] == list(range(KEY_FRAMES))
     assert np.linalg.norm(scene.frames[0].camera_to_world[:3, 3]) < 5.0, "the scene's own origin is where it starts"
     moving = {track.category for track in scene.tracks if np.ptp(track.object_to_world[:, 0, 3]) > 1.0}
     assert "vehicle.car" in moving

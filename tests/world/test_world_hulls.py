@@ -33,29 +33,21 @@ def seen(request, scene, recorder):
     return frame, recorder.geometry(FRONT, int(frame.timestamp - scene.key_frame_timestamps[0])).objects
 
 
-def vehicles(scene, recorder, frame, objects):
-    """Per vehicle in clear view: the vehicle, its hull's pixels, its own pixels."""
-    tokens = {instance_token("demo", item.name): n for n, item in enumerate(recorder.objects)}
+def test_vehicles_lie_within_their_hulls_and_have_the_label_of_moving_or_parked_ones(scene, recorder, seen):
+    """Vehicles in clear view, and a walker."""
+    frame, objects = seen
+    labels, names = label_image(scene, frame, SIZE), [item.name for item in recorder.objects]
+    numbers = {instance_token("demo", name): n for n, name in enumerate(names)}
     for hull in hulls_in(scene, frame, SIZE):
-        own = objects == tokens[hull.box.track_id]
-        if hull.box.category.startswith("vehicle.") and hull.box.visibility == 4 and own.sum() >= MIN_PIXELS:
-            yield recorder.objects[tokens[hull.box.track_id]], fill(hull.polygon, SIZE), own
-
-
-def test_vehicles_lie_within_their_hulls_at_the_image_time(scene, recorder, seen):
-    frame, objects = seen
-    for item, hull, own in vehicles(scene, recorder, frame, objects):
-        assert not (own & ~binary_dilation(hull, np.ones((3, 3)))).any(), f"{item.name} sticks out of its hull"
-
-
-def test_the_label_image_separates_moving_and_parked_vehicles(scene, recorder, seen):
-    frame, objects = seen
-    labels = label_image(scene, frame, SIZE)
-    names = np.array([item.name for item in recorder.objects])
-    for item, _, own in vehicles(scene, recorder, frame, objects):
-        kind = "parked" if item.name.startswith("parked") else "moving"
+        number = numbers[hull.box.track_id]
+        own = objects == number
+        if not hull.box.category.startswith("vehicle.") or hull.box.visibility != 4 or own.sum() < MIN_PIXELS:
+            continue
+        around = binary_dilation(fill(hull.polygon, SIZE), np.ones((3, 3)))
+        assert not (own & ~around).any(), f"{names[number]} sticks out of its hull"
+        kind = "parked" if names[number].startswith("parked") else "moving"
         expected = [LABELS[f"{kind}_car"], LABELS[f"{kind}_other_vehicle"]]
-        assert np.isin(labels[own], expected).mean() > 0.8, item.name
-    walker = objects == list(names).index("pedestrian 0")
+        assert np.isin(labels[own], expected).mean() > 0.8, names[number]
+    walker = objects == names.index("pedestrian 0")
     if walker.sum() >= MIN_PIXELS:
         assert (labels[walker] == LABELS["moving_human"]).mean() > 0.8

@@ -5,28 +5,15 @@ import pytest
 from helpers.demo_worlds import LIDAR, RIG, names_of, recorder_of, world_of
 
 from drivesplat.world.optics.rig import trigger_times
-from drivesplat.world.recorder import Recorder
 
 
-@pytest.fixture(scope="module")
-def standing() -> Recorder:
-    """A static street: sweeps differ only in noise."""
-    return recorder_of(ego="stands", vehicles=0, pedestrians=0)
-
-
-@pytest.fixture(scope="module")
-def points(standing) -> np.ndarray:
-    return standing.sweep(LIDAR, 0)
-
-
-def test_noise_differs_between_sweeps_and_is_reproducible(standing):
-    first, again, later = (standing.sweep(LIDAR, time) for time in (0, 0, 50_000))
-    np.testing.assert_array_equal(first, again)
-    assert len(first) != len(later) or not np.array_equal(first, later)
-
-
-def test_returns_are_listed_ray_by_ray(standing, points):
-    """Rows come beam by beam: ring and intensity are those of their ray, the position that of its measured range."""
+def test_returns_are_listed_ray_by_ray_with_noise_of_their_sweep():
+    """Rows come beam by beam: ring and intensity are those of their ray, the position that of its measured range. In a
+    static street sweeps differ only in noise."""
+    standing = recorder_of(ego="stands", vehicles=0, pedestrians=0)
+    points, again, later = (standing.sweep(LIDAR, time) for time in (0, 0, 50_000))
+    np.testing.assert_array_equal(points, again)
+    assert len(points) != len(later) or not np.array_equal(points, later)
     found = standing.scan(LIDAR, 0)
     ring, step = np.nonzero(found.returned)
     np.testing.assert_array_equal(points[:, 4], ring)

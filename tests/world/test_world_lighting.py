@@ -24,9 +24,38 @@ def floor(top: float = 0.0) -> StreetObject:
     return fixed("floor", mesh)
 
 
-def roof(at: float) -> StreetObject:
-    mesh = box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0))
-    return fixed("roof", mesh)
+def radiance(objects: list[StreetObject], light=LIGHT, rotation: np.ndarray = DOWN, height: float = 4.0) -> np.ndarray:
+    return render(at_rest(objects), light, one_pixel(rotation, height), 1).radiance[0, 0]
+
+
+def hazy(value: np.ndarray, light=LIGHT) -> np.ndarray:
+    """What is left of a radiance over the four metres to the floor."""
+    haze = 1.0 - math.exp(-4.0 / 900.0)
+    return (1.0 - haze) * value + haze * light.horizon
+
+
+def test_a_white_plane_sends_back_sun_and_sky_or_the_sky_alone_in_the_shadow_or_a_lamps_light():
+    at = 5.0 / math.tan(SUN_HEIGHT)
+    roof = fixed("roof", box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0)))
+    in_the_sun = hazy(math.sin(SUN_HEIGHT) * LIGHT.sun + LIGHT.sky)
+    np.testing.assert_allclose(radiance([floor()]), in_the_sun, rtol=1e-5)
+    np.testing.assert_allclose(radiance([floor(), roof]), hazy(LIGHT.sky), rtol=1e-5)
+    night = lamplight(np.array([[0.0, 0.0, 6.0]]), np.eye(4))._replace(headlight=0.0)
+    squared = 36.0 + 1.0  # lamps are not points: one metre squared is added
+    lit = hazy(night.lamp * (6.0 / math.sqrt(squared)) ** 2 / squared + night.sky, night)
+    np.testing.assert_allclose(radiance([floor()], night), lit, rtol=1e-5)
+
+
+@pytest.mark.parametrize("elevation", [0.0, 10.0, 35.0, 90.0])
+def test_rays_without_a_hit_show_the_sky(elevation):
+    up = math.sin(math.radians(elevation))
+    direction = np.array([0.0, math.sqrt(1 - up * up), up])
+    side = np.array([1.0, 0.0, 0.0])
+    rotation = np.stack([side, np.cross(direction, side), direction], axis=1)
+    expected = LIGHT.horizon + (1.0 - math.exp(-4.0 * up)) * (LIGHT.zenith - LIGHT.horizon)
+    expected = expected + 0.3 * max(0.0, float(direction @ SUN)) ** 60 * LIGHT.sun
+    found = radiance([floor(-100.0)], LIGHT, rotation, 500.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
 
 
 def at_rest(objects: list[StreetObject]) -> StreetSnapshot:
@@ -43,50 +72,6 @@ def one_pixel(rotation: np.ndarray, height: float, focal: float = 0.1) -> WorldC
     pose = np.eye(4)
     pose[:3, :3], pose[2, 3] = rotation, height
     return camera_of(np.diag([focal, focal, 1.0]), pose, 1, 1)
-
-
-def radiance(objects: list[StreetObject], light, camera: WorldCamera) -> np.ndarray:
-    return render(at_rest(objects), light, camera, 1).radiance[0, 0]
-
-
-def hazy(value: np.ndarray, distance: float) -> np.ndarray:
-    haze = 1.0 - math.exp(-distance / 900.0)
-    return (1.0 - haze) * value + haze * LIGHT.horizon
-
-
-def test_a_white_plane_in_the_sun_sends_back_sun_times_cosine_and_the_sky():
-    expected = hazy(math.sin(SUN_HEIGHT) * LIGHT.sun + LIGHT.sky, 4.0)
-    np.testing.assert_allclose(radiance([floor()], LIGHT, one_pixel(DOWN, 4.0)), expected, rtol=1e-5)
-
-
-def test_in_the_shadow_the_sky_alone_is_left():
-    shading = roof(5.0 / math.tan(SUN_HEIGHT))
-    expected = hazy(LIGHT.sky, 4.0)
-    np.testing.assert_allclose(radiance([floor(), shading], LIGHT, one_pixel(DOWN, 4.0)), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("elevation", [0.0, 10.0, 35.0, 90.0])
-def test_rays_without_a_hit_show_the_sky(elevation):
-    up = math.sin(math.radians(elevation))
-    direction = np.array([0.0, math.sqrt(1 - up * up), up])
-    side = np.array([1.0, 0.0, 0.0])
-    rotation = np.stack([side, np.cross(direction, side), direction], axis=1)
-    blend = 1.0 - math.exp(-4.0 * up)
-    expected = LIGHT.horizon + blend * (LIGHT.zenith - LIGHT.horizon)
-    expected = expected + 0.3 * max(0.0, float(direction @ SUN)) ** 60 * LIGHT.sun
-    found = radiance([floor(-100.0)], LIGHT, one_pixel(rotation, 500.0))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
-
-
-def test_a_street_lamp_follows_the_inverse_square_law():
-    lamps = np.array([[0.0, 0.0, 6.0]])
-    night = lamplight(lamps, np.eye(4))._replace(headlight=0.0)
-    found = radiance([floor()], night, one_pixel(DOWN, 4.0))
-    squared = 36.0 + 1.0  # lamps are not points: one metre squared is added
-    facing = (6.0 / math.sqrt(squared)) ** 2
-    haze = 1.0 - math.exp(-4.0 / 900.0)
-    expected = (1 - haze) * (night.lamp * facing / squared + night.sky) + haze * night.horizon
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_development_is_a_gamma_of_the_exposed_radiance():

@@ -21,92 +21,83 @@ TINY = WorldJob(
 REPLY = "holds other files"
 
 
+def write(root: Path, *names: str) -> None:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(name)
+
+
 def content(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
-@pytest.fixture
-def recorded(tmp_path) -> Path:
-    """The folder of a recorded dataset."""
-    for name in ("samples/CAM_FRONT/a.jpg", "sweeps/LIDAR_TOP/b.pcd.bin", "v1.0-mini/sample.json", "maps/c.png"):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(name)
-    return tmp_path
-
-
-@pytest.mark.parametrize(
-    "write", [lambda root: prepare_folder(root, {}), lambda root: make_world(root, TINY, {"stages": {}})]
-)
-def test_a_recorded_dataset_is_refused_and_left_as_it_is(recorded, write):
-    before = content(recorded)
-    with pytest.raises(ConfigError, match=REPLY) as refused:
-        write(recorded)
-    assert str(recorded) in str(refused.value) and "dataroot" in str(refused.value)
-    assert content(recorded) == before
-
-
-@pytest.mark.parametrize("name", ["notes.txt", "samples/CAM_FRONT/a.jpg", "deep/er/still/x"])
-def test_a_single_foreign_file_is_refused(tmp_path, name):
-    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / name).write_text("mine")
-    with pytest.raises(ConfigError, match=REPLY):
-        refuse_foreign_data(tmp_path)
-
-
-def test_absent_and_empty_folders_and_earlier_worlds_are_accepted(tmp_path):
-    refuse_foreign_data(tmp_path / "absent")
-    (tmp_path / "empty" / "v1.0-mini").mkdir(parents=True)
-    refuse_foreign_data(tmp_path / "empty")
-    prepare_folder(tmp_path / "empty", {"stages": {}})
-    (tmp_path / "empty" / "samples").mkdir()
-    (tmp_path / "empty" / "samples" / "x.jpg").write_text("")
-    refuse_foreign_data(tmp_path / "empty")
-
-
-def test_preparing_removes_an_earlier_world_and_records_the_new_provenance(tmp_path):
-    prepare_folder(tmp_path, {"stages": {"demo_world": {"code": "old"}}})
-    for folder in ("samples", "sweeps", "maps", "truth", "semantic", "sky"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "old").write_text("")
-    prepare_folder(tmp_path, {"stages": {"demo_world": {"code": "new"}}})
-    assert list(content(tmp_path)) == [WORLD_MARKER]
-    assert json.loads((tmp_path / WORLD_MARKER).read_text())["provenance"]["stages"]["demo_world"]["code"] == "new"
-
-
-def plan(**config) -> Plan:
-    return Plan(config, str(REPOSITORY))
 
 
 def demo(root: Path, **settings) -> dict:
     return {"dataroot": str(root), "scenes": ["demo"], "world": {}, "batch": False, **settings}
 
 
-@pytest.mark.parametrize(
-    "target", ["results/demo/metrics.json", "results/demo/vanilla/checkpoint.npz", "{}/v1.0-mini/log.json"]
-)
-def test_planning_refuses_a_world_in_a_recorded_datasets_folder_before_any_job(recorded, target):
-    before = content(recorded)
+def plan(root: Path) -> Plan:
+    return Plan({"datasets": {"demo": demo(root)}}, str(REPOSITORY))
+
+
+def test_a_recorded_dataset_is_refused_before_any_job_and_left_as_it_is(tmp_path):
+    write(tmp_path, "samples/CAM_FRONT/a.jpg", "sweeps/LIDAR_TOP/b.pcd.bin", "v1.0-mini/sample.json", "maps/c.png")
+    before = content(tmp_path)
+    with pytest.raises(ConfigError, match=REPLY) as refused:
+        make_world(tmp_path, TINY, {"stages": {}})
+    assert str(tmp_path) in str(refused.value) and "dataroot" in str(refused.value)
+    for target in (
+        "results/demo/metrics.json",
+        "results/demo/vanilla/checkpoint.npz",
+        f"{tmp_path}/v1.0-mini/log.json",
+    ):
+        with pytest.raises(ConfigError, match=REPLY):
+            plan(tmp_path).refuse_absent_data([target])
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "samples/CAM_FRONT/a.jpg", "deep/er/still/x"])
+def test_a_single_foreign_file_is_refused(tmp_path, name):
+    write(tmp_path, name)
     with pytest.raises(ConfigError, match=REPLY):
-        plan(datasets={"demo": demo(recorded)}).refuse_absent_data([target.format(recorded)])
-    assert content(recorded) == before
+        refuse_foreign_data(tmp_path)
 
 
-def test_planning_needs_no_data_for_a_world_that_is_yet_to_be_made(tmp_path):
-    plan(datasets={"demo": demo(tmp_path / "new")}).refuse_absent_data(["results/demo/metrics.json"])
-    assert not (tmp_path / "new").exists()
+def test_absent_and_empty_folders_are_accepted_and_earlier_worlds_replaced(tmp_path):
+    plan(tmp_path / "absent").refuse_absent_data(["results/demo/metrics.json"])
+    refuse_foreign_data(tmp_path / "absent")
+    assert not (tmp_path / "absent").exists()
+    root = tmp_path / "empty"
+    (root / "v1.0-mini").mkdir(parents=True)
+    refuse_foreign_data(root)
+    prepare_folder(root, {"stages": {"demo_world": {"code": "old"}}})
+    write(root, *(f"{folder}/old" for folder in ("samples", "sweeps", "maps", "truth", "semantic", "sky")))
+    prepare_folder(root, {"stages": {"demo_world": {"code": "new"}}})
+    assert list(content(root)) == [WORLD_MARKER]
+    assert json.loads((root / WORLD_MARKER).read_text())["provenance"]["stages"]["demo_world"]["code"] == "new"
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"scenes": []}, "a dataset with a world has one scene"),
+        ({"scenes": ["a", "b"]}, "a dataset with a world has one scene"),
+        ({"world": {"width": 10}}, r"datasets.demo.world.width.*10"),
+        ({"world": {"sweeps": ["RADAR_FRONT"]}}, r"datasets.demo.world.sweeps"),
+    ],
+)
+def test_wrong_settings_of_a_world_are_named(tmp_path, changes, words):
+    with pytest.raises(ConfigError, match=words):
+        load({"datasets": {"demo": demo(tmp_path, **changes)}})
 
 
 def test_two_worlds_in_one_dataroot_are_refused(tmp_path):
-    other = demo(tmp_path, scenes=["other"])
+    first, second, elsewhere = (
+        demo(tmp_path),
+        *(demo(root, scenes=["other"]) for root in (tmp_path, tmp_path / "other")),
+    )
     with pytest.raises(ConfigError, match="two datasets make their world in the same dataroot"):
-        load({"datasets": {"demo": demo(tmp_path), "other": other}})
-    load({"datasets": {"demo": demo(tmp_path), "other": {**other, "dataroot": str(tmp_path / "other")}}})
-
-
-@pytest.mark.parametrize("scenes", [[], ["a", "b"]])
-def test_a_world_has_one_scene(tmp_path, scenes):
-    with pytest.raises(ConfigError, match="a dataset with a world has one scene"):
-        load({"datasets": {"demo": demo(tmp_path, scenes=scenes)}})
+        load({"datasets": {"demo": first, "other": second}})
+    load({"datasets": {"demo": first, "other": elsewhere}})
 
 
 def test_a_worlds_stage_knows_its_scene_tables_and_street_alone(tmp_path):
@@ -139,10 +130,3 @@ def test_a_world_records_between_key_frames_what_is_read_there_unless_its_settin
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert json.loads(stage_settings(config, "demo_world", "demo"))["world"]["sweeps"] == recorded
-
-
-def test_wrong_settings_of_a_world_are_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"datasets.demo.world.width.*10"):
-        load({"datasets": {"demo": demo(tmp_path, world={"width": 10})}})
-    with pytest.raises(ConfigError, match=r"datasets.demo.world.sweeps"):
-        load({"datasets": {"demo": demo(tmp_path, world={"sweeps": ["RADAR_FRONT"]})}})

@@ -8,17 +8,16 @@ from collections import namedtuple
 import numpy as np
 import pytest
 from helpers.demo_worlds import CAMERAS, LIDAR, edit_of, job_of, recorder_of, world_of
+from helpers.drives import scene_at
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.scans import scan_records
 from drivesplat.readers.truth import Truth, read_truth
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.scan import wrapped
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.scans import ScanSettings, ScansJob
@@ -48,13 +47,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(root) -> Scene:
-    return extract_scene(
-        SceneSource(
-            dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None,
-            cameras=("CAM_FRONT",), sweeps=True, on_missing="stop",
-        ),
-        root,
-    )  # fmt: skip
+    return scene_at(root, dataset="demo", scene="demo", on_missing="stop")
 
 
 @pytest.fixture(scope="module")
@@ -95,12 +88,8 @@ def test_the_stage_masks_reads_class_and_sky_maps(root, scene, tmp_path):
         for kind in ("semantic", "sky"):
             made = png(tmp_path / mask_name(kind, frame.camera, frame.timestamp))
             np.testing.assert_array_equal(made, png(root / kind / "CAM_FRONT" / f"{stem}.png"))
-    highest = max(
-        int(classes[classes != 255].max())
-        for path in (root / "semantic/CAM_FRONT").iterdir()
-        if (classes := png(path)) is not None
-    )
-    assert record.semantic_classes == highest + 1
+    classes = np.stack([png(path) for path in (root / "semantic/CAM_FRONT").iterdir()])
+    assert record.semantic_classes == classes[classes != 255].max() + 1
 
 
 def test_a_held_out_camera_has_truth_with_images_and_records_nothing(root, truth):
@@ -125,25 +114,30 @@ def test_the_edited_truth_lacks_the_removed_vehicle(root, truth):
         np.testing.assert_array_equal(png(root / "truth" / frame.image), png(root / "truth" / same.image))
 
 
-def test_scans_hold_every_ray_with_or_without_a_return(root, truth, recorder):
+def test_scans_hold_every_ray_and_returns_lie_where_range_pattern_and_poses_say(root, truth, recorder):
+    """Range along each ray from the sensor's place at the ray's own time, within the noise of 2 cm."""
     views = ((0.0, None, None), (2.0, None, None), (0.0, None, AHEAD), (0.0, "gone", None))
     assert [(scan.left_m, scan.edit, scan.without) for scan in truth.scans] == [
         view for view in views for _ in range(KEY_FRAMES)
     ]
-    rows = {row["token"]: row for row in table(root, "sample_data")}
-    for scan in truth.scans[:KEY_FRAMES:5]:
-        rays = np.load(root / "truth" / scan.file)
-        assert {name: rays[name].shape for name in rays} == dict.fromkeys(
-            ("range", "intensity", "instance", "returned"), (32, 1085)
-        )
-        points = np.fromfile(root / rows[scan.token]["filename"], np.float32).reshape(-1, 5)
-        assert len(points) == rays["returned"].sum()
-        np.testing.assert_array_equal(points[:, 4], np.nonzero(rays["returned"])[0])
-        assert np.isinf(rays["range"]).any() and not rays["returned"][np.isinf(rays["range"])].any()
-        assert (rays["instance"][np.isinf(rays["range"])] == 0).all()
-    pattern = np.load(root / "truth" / truth.pattern)
+    pattern, files = np.load(root / "truth" / truth.pattern), {row["token"]: row for row in table(root, "sample_data")}
     np.testing.assert_array_equal(pattern["offsets"], recorder.pattern.offsets)
     assert (pattern["elevations"].shape, pattern["azimuths"].shape) == ((32,), (1085,))
+    for scan in truth.scans[:KEY_FRAMES:5]:
+        rays = np.load(root / "truth" / scan.file)
+        assert {rays[name].shape for name in ("range", "intensity", "instance", "returned")} == {(32, 1085)}
+        beam, step = np.nonzero(rays["returned"])
+        points = np.fromfile(root / files[scan.token]["filename"], np.float32).reshape(-1, 5).astype(float)
+        np.testing.assert_array_equal(points[:, 4], beam)
+        lost = np.isinf(rays["range"])
+        assert lost.any() and not rays["returned"][lost].any() and (rays["instance"][lost] == 0).all()
+        e, a, seconds = pattern["elevations"][beam], pattern["azimuths"][step], 0.1 * scan.key_frame
+        local = np.stack([np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)], axis=-1)
+        poses = recorder.ego_to_street(seconds + pattern["offsets"]) @ LIDAR.sensor_to_ego
+        to_timestamp = np.linalg.inv(recorder.ego_pose(seconds) @ LIDAR.sensor_to_ego) @ poses
+        expected = np.einsum("nij,nj->ni", to_timestamp[step, :3, :3], rays["range"][beam, step, None] * local)
+        error = np.linalg.norm(points[:, :3] - expected - to_timestamp[step, :3, 3], axis=1)
+        assert error.max() < 0.12 and np.sqrt((error**2).mean()) == pytest.approx(0.02, rel=0.05)
 
 
 def test_scans_of_one_sweep_from_elsewhere_and_without_the_vehicle_ahead(root, truth, recorder):
@@ -188,22 +182,6 @@ def test_the_stage_scans_finds_the_rays_of_the_truth_and_what_they_met(root, sce
     dynamic = [numbers[i] for i, t in enumerate(scene.tracks) if t.object_class.is_dynamic and i in numbers]
     met = both & np.isin(rays["instance"], dynamic)
     assert met.sum() > 300 and (found == rays["instance"])[met].mean() > 0.9
-
-
-def test_returns_lie_where_range_pattern_and_poses_say(root, truth, recorder):
-    """Range along each ray from the sensor's place at the ray's own time, within the noise of 2 cm."""
-    scan, pattern = truth.scans[3], np.load(root / "truth" / truth.pattern)
-    rays = np.load(root / "truth" / scan.file)
-    row = next(row for row in table(root, "sample_data") if row["token"] == scan.token)
-    points = np.fromfile(root / row["filename"], np.float32).reshape(-1, 5)[:, :3].astype(float)
-    beam, step = np.nonzero(rays["returned"])
-    e, a = pattern["elevations"][beam], pattern["azimuths"][step]
-    local = np.stack([np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)], axis=-1)
-    poses = recorder.ego_to_street(0.3 + pattern["offsets"]) @ LIDAR.sensor_to_ego
-    to_timestamp = np.linalg.inv(recorder.ego_pose(0.3) @ LIDAR.sensor_to_ego) @ poses
-    expected = np.einsum("nij,nj->ni", to_timestamp[step, :3, :3], rays["range"][beam, step, None] * local)
-    error = np.linalg.norm(points - expected - to_timestamp[step, :3, 3], axis=1)
-    assert error.max() < 0.12 and np.sqrt((error**2).mean()) == pytest.approx(0.02, rel=0.05)
 
 
 Usage = namedtuple("Usage", "total used free")

@@ -6,42 +6,22 @@ import trimesh
 from helpers.demo_worlds import named, recorder_of, world_of
 
 from drivesplat.world.street.objects import EGO_PARTS
-from drivesplat.world.street.road import STRAIGHT, ReferenceLine
+from drivesplat.world.street.road import STRAIGHT
 from drivesplat.world.street.street import BEND_RADIUS, RISE, road_of
 
 S = np.linspace(-40.0, 220.0, 26_001)
 STEP = S[1] - S[0]
-ROADS = ((35.0, 0.06), (-60.0, -0.12), (0.0, 0.06), (35.0, 0.0))
 
 
-@pytest.fixture(params=ROADS)
-def bend_and_grade(request) -> tuple[float, float]:
-    return request.param
-
-
-@pytest.fixture
-def road(bend_and_grade) -> ReferenceLine:
-    bend, grade = bend_and_grade
-    return road_of(world_of(bend_deg=bend, grade=grade))
-
-
-def test_metres_along_the_road_are_metres_on_the_map_and_its_arc_has_its_radius(road, bend_and_grade):
-    steps = np.linalg.norm(np.diff(road.center(S)[:, :2], axis=0), axis=1)
-    np.testing.assert_allclose(steps, STEP, rtol=1e-6)
-    heading, turning = np.degrees(road.heading(S)), np.abs(np.diff(road.heading(S))) / STEP
-    assert heading[0] == 0.0 and heading[-1] == pytest.approx(bend_and_grade[0], abs=1e-9)
-    assert not bend_and_grade[0] or turning.max() == pytest.approx(1 / BEND_RADIUS, rel=1e-6)
-
-
-def test_the_heading_is_the_direction_of_the_centre_line(road):
-    step = np.diff(road.center(S)[:, :2], axis=0)
-    middle = (S[1:] + S[:-1]) / 2
+@pytest.mark.parametrize(("bend", "grade"), [(35.0, 0.06), (-60.0, -0.12), (0.0, 0.06), (35.0, 0.0)])
+def test_the_centre_line_has_its_length_heading_radius_and_slope(bend, grade):
+    road = road_of(world_of(bend_deg=bend, grade=grade))
+    step, middle = np.diff(road.center(S)[:, :2], axis=0), (S[1:] + S[:-1]) / 2
+    np.testing.assert_allclose(np.linalg.norm(step, axis=1), STEP, rtol=1e-6, err_msg="metres on the map")
     np.testing.assert_allclose(np.arctan2(step[:, 1], step[:, 0]), road.heading(middle), atol=1e-4)
-
-
-def test_the_slope_is_the_derivative_of_the_elevation(road, bend_and_grade):
-    _, grade = bend_and_grade
-    middle = (S[1:] + S[:-1]) / 2
+    heading, turning = np.degrees(road.heading(S)), np.abs(np.diff(road.heading(S))) / STEP
+    assert heading[0] == 0.0 and heading[-1] == pytest.approx(bend, abs=1e-9)
+    assert not bend or turning.max() == pytest.approx(1 / BEND_RADIUS, rel=1e-6)
     np.testing.assert_allclose(np.diff(road.elevation(S)) / STEP, road.slope(middle), atol=1e-5)
     assert np.abs(road.slope(S)).max() == pytest.approx(abs(grade))
     assert road.elevation(S)[0] == 0.0 and road.slope(S)[[0, -1]].tolist() == [0.0, 0.0]

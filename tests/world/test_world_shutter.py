@@ -27,17 +27,18 @@ def test_rows_are_read_downwards_over_the_readout_time_about_the_timestamp():
     np.testing.assert_allclose(camera.pose, recorder_of().camera(FRONT, SECONDS).pose, atol=1e-12)
 
 
-def test_each_row_is_that_of_a_global_shutter_at_its_own_time(channel="CAM_BACK_LEFT"):
+def test_each_row_is_that_of_a_global_shutter_at_its_own_time():
+    side = RIG["CAM_BACK_LEFT"]
     rolling, still = (
         recorder_of(width=WIDTH, readout_s=readout, cyclists=1, bend_deg=30.0) for readout in (READOUT, 0.0)
     )
-    found = rolling.geometry(RIG[channel], round(SECONDS * 1e6))
-    for row in (0, 20, 45, 60, 89):
-        camera = still.camera(RIG[channel], float(row_times()[row]))
+    found = rolling.geometry(side, round(SECONDS * 1e6))
+    for row in (0, 45, 89):
+        camera = still.camera(side, float(row_times()[row]))
         expected = geometry(still.snapshot(camera.seconds), camera)
         np.testing.assert_allclose(found.depth[row], expected.depth[row], rtol=1e-5)
         np.testing.assert_array_equal(found.objects[row], expected.objects[row])
-    middle = geometry(still.snapshot(np.array([SECONDS])), still.camera(RIG[channel], SECONDS))
+    middle = geometry(still.snapshot(np.array([SECONDS])), still.camera(side, SECONDS))
     np.testing.assert_allclose(found.depth[45], middle.depth[45], rtol=1e-5)
     assert (found.depth[85] != middle.depth[85]).mean() > 0.9, "no other row is that of the timestamp"
 
@@ -66,8 +67,5 @@ def test_a_moving_vertical_edge_is_sheared_by_its_speed_times_the_readout(speed)
 
 
 def test_where_nothing_moves_the_readout_changes_no_byte():
-    images = [
-        recorder_of(readout_s=readout, ego="stands", vehicles=0, pedestrians=0).image(FRONT, 0)
-        for readout in (0.0, READOUT)
-    ]
-    np.testing.assert_array_equal(*images)
+    still = {"ego": "stands", "vehicles": 0, "pedestrians": 0}
+    np.testing.assert_array_equal(*(recorder_of(readout_s=s, **still).image(FRONT, 0) for s in (0.0, READOUT)))

@@ -1,11 +1,11 @@
-"""LiDAR scans, of the reference and of the CPU, against closed forms and ray casting."""
+"""LiDAR scans on the CPU against closed forms and ray casting."""
 
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers.random_scans import REVOLUTION_S, ScanScene, even_rays, random_scan
+from helpers.random_scans import ScanScene, even_rays, random_scan
 from scipy.spatial.transform import Rotation
 
 from drivesplat.kernels.scan_compositing import composite_scan
@@ -14,7 +14,6 @@ from drivesplat.rasterization import RayGrid, ScanMotion
 
 HEIGHT = 1.8
 """Metres of the sensor above the road."""
-EVERY_BACKEND = pytest.mark.parametrize("backend", ["reference", "cpu"])
 
 
 def rays_at(azimuths: list[float], elevations: list[float]) -> RayGrid:
@@ -38,16 +37,15 @@ def ahead(ranges: list[float], opacities: list[float], sigma: float = 0.1, rays:
     )
 
 
-@EVERY_BACKEND
 @pytest.mark.parametrize("elevation", [0.0, -0.4])
-def test_one_gaussian_has_the_profile_of_the_closed_form(backend, elevation):
+def test_one_gaussian_has_the_profile_of_the_closed_form(elevation):
     """Its standard deviations are sigma / (r cos elevation) and sigma / r, widened by the beams' footprint."""
     distance, sigma, opacity, spread = 8.0, 0.2, 0.7, (2e-3, 4e-3)
     offsets = [0.01 * i for i in range(-9, 10)]
     scene = ahead([distance], [opacity], sigma, rays_at(offsets, [elevation + o for o in offsets]))
     direction = torch.tensor([math.cos(elevation), 0.0, math.sin(elevation)], dtype=torch.float64)
     scene.means[0] = distance * direction
-    rendering = scene.render(backend, beam_spread=spread)
+    rendering = scene.render(beam_spread=spread)
     variance_a = (sigma / distance / math.cos(elevation)) ** 2 + spread[0] ** 2
     variance_e = (sigma / distance) ** 2 + spread[1] ** 2
     o = torch.tensor(offsets, dtype=torch.float64)
@@ -59,11 +57,10 @@ def test_one_gaussian_has_the_profile_of_the_closed_form(backend, elevation):
     torch.testing.assert_close(rendering.range, distance * (profile > 0).double(), rtol=1e-9, atol=1e-9)
 
 
-@EVERY_BACKEND
-def test_the_projection_is_linear_in_azimuth_elevation_and_range(backend):
+def test_the_projection_is_linear_in_azimuth_elevation_and_range():
     """Conics and slopes follow from the numerical Jacobian of the spherical coordinates."""
     scene = random_scan(1, n=20, rays=even_rays(2, 2))
-    found = scene.render(backend, beam_spread=(0.0, 0.0)).gaussians[0]
+    found = scene.render(beam_spread=(0.0, 0.0)).gaussians[0]
     view = scene.world_to_sensor
 
     def spherical(mean: torch.Tensor) -> torch.Tensor:
@@ -83,13 +80,12 @@ def test_the_projection_is_linear_in_azimuth_elevation_and_range(backend):
         torch.testing.assert_close(torch.cat([found.means2d[g], found.ranges[g : g + 1]]), spherical(scene.means[g]))
 
 
-@EVERY_BACKEND
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
-def test_two_gaussians_composite_front_to_back_in_any_order(backend, order):
+def test_two_gaussians_composite_front_to_back_in_any_order(order):
     scene = ahead([3.0, 6.0], [0.6, 0.8])
     for name in ("means", "opacities", "values"):
         setattr(scene, name, getattr(scene, name)[order])
-    rendering = scene.render(backend, before=torch.tensor([[4.0]]).double())
+    rendering = scene.render(before=torch.tensor([[4.0]]).double())
     torch.testing.assert_close(rendering.values[0, 0], torch.tensor([0.6, 0.32, 0.0]).double())
     assert rendering.alpha.item() == pytest.approx(0.92)
     assert rendering.range.item() == pytest.approx((0.6 * 3.0 + 0.32 * 6.0) / 0.92)
@@ -97,7 +93,6 @@ def test_two_gaussians_composite_front_to_back_in_any_order(backend, order):
     assert rendering.alpha_before.item() == pytest.approx(0.6)
 
 
-@EVERY_BACKEND
 @pytest.mark.parametrize(
     ("opacities", "seen", "median"),
     [
@@ -108,14 +103,13 @@ def test_two_gaussians_composite_front_to_back_in_any_order(backend, order):
         ([0.4, 0.3, 0.5], [0.4, 0.18, 0.21], 4.0),
     ],
 )
-def test_cut_offs_of_alpha_and_the_median(backend, opacities, seen, median):
+def test_cut_offs_of_alpha_and_the_median(opacities, seen, median):
     """Alpha is 1/255 to 0.999; a ray ends before its transmittance reaches 1e-4; the median is where it passes 0.5."""
-    rendering = ahead([3.0, 4.0, 5.0][: len(opacities)], opacities, sigma=1e-3).render(backend)
+    rendering = ahead([3.0, 4.0, 5.0][: len(opacities)], opacities, sigma=1e-3).render()
     assert rendering.values[0, 0, : len(seen)].tolist() == pytest.approx(seen)
     assert rendering.median_range.item() == pytest.approx(median)
 
 
-@EVERY_BACKEND
 @pytest.mark.parametrize(
     ("place", "met"),
     [
@@ -123,12 +117,12 @@ def test_cut_offs_of_alpha_and_the_median(backend, opacities, seen, median):
         ((0.5, 0.0, 5.0), False), ((1.0, 0.0, 5.0), True), ((-0.5, 0.0, -5.0), False), ((-9.0, -1.0, -1.0), True),
     ],
 )  # fmt: skip
-def test_near_far_and_polar_gaussians_are_skipped(backend, place, met):
+def test_near_far_and_polar_gaussians_are_skipped(place, met):
     x, y, z = place
     rays = rays_at([math.atan2(y, x)], [math.atan2(z, math.hypot(x, y))])
     scene = ahead([1.0], [0.8], sigma=1e-3, rays=rays)
     scene.means[0] = torch.tensor(place)
-    rendering = scene.render(backend, max_range=50.0)
+    rendering = scene.render(max_range=50.0)
     assert rendering.alpha.item() == pytest.approx(0.8 if met else 0.0)
     assert bool(rendering.gaussians[0].radii.any()) == met
 
@@ -156,8 +150,7 @@ def road(incidence: float, spacing: float = 0.1) -> tuple[ScanScene, torch.Tenso
     return scene, (HEIGHT / torch.sin(-rays.elevations)).float()
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.3e-3, 0.7e-3])
-@pytest.mark.parametrize("incidence", [30.0, 12.0, 5.0])
+@pytest.mark.parametrize(("incidence", "spread"), [(30.0, 0.7e-3), (12.0, 0.3e-3), (5.0, 0.0), (5.0, 0.7e-3)])
 def test_a_road_of_flat_gaussians_has_its_true_ranges_at_any_incidence(incidence, spread):
     """Within a centimetre; without slopes every ray ends at the nearest Gaussian's centre, decimetres too early."""
     scene, truth = road(incidence)
@@ -177,10 +170,9 @@ def test_slopes_are_limited_at_the_edges_of_gaussians():
     scene.scales[0] = torch.tensor([0.3, 0.001, 0.3])
     turn = math.radians(0.5)
     scene.quats[0] = torch.tensor([math.cos(0.5 * turn), 0.0, 0.0, math.sin(0.5 * turn)])
-    for backend in ("reference", "cpu"):
-        rendering = scene.render(backend, beam_spread=(1e-4, 1e-4))
-        met = rendering.alpha > 0
-        assert met.any() and (rendering.range[met] - 10.0).abs().max() < 1.0
+    rendering = scene.render(beam_spread=(1e-4, 1e-4))
+    met = rendering.alpha > 0
+    assert met.any() and (rendering.range[met] - 10.0).abs().max() < 1.0
 
 
 def moving_scene() -> tuple[ScanScene, ScanMotion]:
@@ -201,11 +193,15 @@ def moving_scene() -> tuple[ScanScene, ScanMotion]:
     return scene, motion
 
 
+FIRINGS = [*range(0, 128, 4), 127]
+
+
 def firing_by_firing(scene: ScanScene, motion: ScanMotion) -> tuple[torch.Tensor, torch.Tensor]:
-    """Range and alpha, each firing on its own, from the sensor's pose and with Gaussians placed at its time."""
+    """Range and alpha of FIRINGS, each on its own, from the sensor's pose and with Gaussians placed at its time."""
     columns = []
     sensor_to_world = torch.linalg.inv(scene.world_to_sensor)
-    for j, offset in enumerate(scene.rays.offsets_s[0].tolist()):
+    for j in FIRINGS:
+        offset = scene.rays.offsets_s[0, j].item()
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec(offset * motion.angular.numpy()).as_matrix())
         pose[:3, 3] = offset * motion.linear
@@ -223,20 +219,9 @@ def test_motion_is_that_of_rays_rendered_firing_by_firing():
     found, still = scene.render(motion=motion), scene.render()
     seen = alpha > 0.9
     assert seen.float().mean() > 0.6
-    error, without = (abs(rendering.range - exact)[seen] for rendering in (found, still))
+    error, without = (abs(rendering.range[:, FIRINGS] - exact)[seen] for rendering in (found, still))
     assert error.median() < 0.005 and (error < 0.02).double().mean() > 0.95
     assert without.median() > 0.2
     assert error.max() < 0.05, "where the revolution begins and ends, too"
     assert (exact[:, 0] - exact[:, -1])[seen[:, 0]].abs().median() > 1.0
-    assert (found.alpha - alpha).abs().mean() < 0.01
-
-
-def test_a_moving_gaussian_is_where_it_is_when_the_beam_passes_it():
-    """Ahead of a sensor that drives towards it and whose revolution ends behind it, half a revolution later."""
-    scene = ahead([20.0], [0.9], sigma=0.05, rays=even_rays(1, 360))
-    scene.rays = replace(scene.rays, elevations=torch.zeros_like(scene.rays.elevations))
-    motion = ScanMotion(torch.tensor([30.0, 0.0, 0.0]).double(), torch.zeros(3).double())
-    distance = scene.render(motion=motion).range[0, 180].item()
-    assert distance == pytest.approx(20.0 + 30.0 * REVOLUTION_S / 2, abs=1e-6)
-    velocities = torch.tensor([[30.0, 0.0, 0.0]], dtype=torch.float64)
-    assert scene.render(motion=replace(motion, velocities=velocities)).range[0, 180].item() == pytest.approx(20.0)
+    assert (found.alpha[:, FIRINGS] - alpha).abs().mean() < 0.01

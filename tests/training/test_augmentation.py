@@ -1,4 +1,4 @@
-"""Mirrored objects: which an iteration mirrors, and how often."""
+"""What an iteration changes at random: which Gaussians it leaves out, and which objects it mirrors."""
 
 import dataclasses
 
@@ -7,17 +7,63 @@ import pytest
 import torch
 from helpers.hand_made import motion_through, track_of
 from helpers.records import training_record_of
-from helpers.trainings import recorded_views, settings_of, untrained_street
+from helpers.trainings import inputs_in, job_of, recorded_views, settings_of, untrained_street
 
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import want_of
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train_objects import DeformableSettings
-from drivesplat.training.augmentation import choose_mirrored, mirrored_at_random, mirrored_shares
+from drivesplat.training.augmentation import (
+    choose_mirrored,
+    dropout_share,
+    mirrored_at_random,
+    mirrored_shares,
+    with_dropout,
+)
 from drivesplat.training.loop import Trainer
+from drivesplat.training.stage import prepare
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_a_random_share_of_the_static_gaussians_is_left_out(share):
+    """And gets no gradient."""
+    torch.manual_seed(0)
+    model = untrained_street(settings_of())
+    sets, moving = model.sample(model.states(0.5)), model.moving()
+    gaussians = concatenate(sets)
+    shown = [concatenate(with_dropout(sets, model, share)) for _ in range(200)]
+    left_out = torch.stack([some.opacities != gaussians.opacities for some in shown])
+    assert not left_out[:, moving].any()
+    often = left_out[:, ~moving].float().mean(dim=0)
+    assert float(often.mean()) == pytest.approx(share, abs=0.02) and float((often - share).abs().max()) < 0.15
+    once, hidden, still = shown[0].opacities, left_out[0], model.parts[0].params["opacities"]
+    assert hidden.any() and not once[hidden].any()
+    once.sum().backward()
+    assert not still.grad[hidden[model.rows[0]]].any() and still.grad[~hidden[model.rows[0]]].all()
+
+
+@pytest.mark.parametrize(
+    ("images", "cameras", "expected"),
+    [(0, 1, 0.0), (7, 1, 0.2), (20, 1, 0.2), (40, 1, 0.1), (40, 2, 0.2), (120, 2, 0.2 / 3)],
+)
+def test_dropout_shrinks_with_the_training_images_of_a_camera(images, cameras, expected):
+    """Held-out images, eight more, do not count."""
+    names = [f"CAM_{i}" for i in range(cameras)]
+    indices = np.arange(images + 8) % cameras
+    splits = {"train": np.arange(images), "interpolation": np.arange(images, images + 8)}
+    record = training_record_of(images + 8, camera_names=names, camera_indices=indices, splits=splits)
+    assert dropout_share(record, settings_of(dropout=0.2)) == pytest.approx(expected)
+    assert dropout_share(record, settings_of(dropout=0.0)) == 0.0
+
+
+def test_a_training_takes_the_share_of_its_scene(tmp_path):
+    inputs = inputs_in(tmp_path)
+    share = prepare(inputs, job_of(dropout=0.3, dropout_images=1), torch.device("cpu")).settings.dropout
+    assert len(inputs.record.train_images) > 1
+    assert share == pytest.approx(0.3 / len(inputs.record.train_images))
 
 
 def street(mirrored: float) -> SplatModel:
@@ -43,13 +89,13 @@ def are_equal(found: Gaussians, expected: Gaussians) -> bool:
     return all(torch.equal(found.tensors[name], values) for name, values in expected.tensors.items())
 
 
-@pytest.mark.parametrize("share", [0.2, 0.7])
-def test_objects_are_mirrored_at_random(share):
+def test_objects_are_mirrored_at_random():
     """Each for itself, in its share of the iterations; nothing else changes."""
     torch.manual_seed(0)
+    share = 0.3
     model, view = street(share), one_view()
     recorded = model.sample(model.states(view.time))
-    shown = [shown_in(model, view) for _ in range(300)]
+    shown = [shown_in(model, view) for _ in range(200)]
     assert all(are_equal(static, recorded[0]) for static, _ in shown)
     moved = torch.stack([(objects.means - recorded[1].means).norm(dim=1) > 1e-4 for _, objects in shown])
     tracks = [model.parts[1].of_track(track.id) for track in model.parts[1].timeline.tracks]
@@ -109,32 +155,26 @@ def seen_for(seconds: float) -> ActorTrack:
     return track_of(motion_through(times, np.zeros((len(times), 3)), np.zeros(len(times))), f"{seconds} s")
 
 
-@pytest.mark.parametrize("cameras", [1, 3])
-@pytest.mark.parametrize(("images", "expected"), [(5, 0.6), (30, 0.6), (45, 0.3), (60, 0.0), (200, 0.0)])
-def test_objects_in_many_images_of_a_camera_are_mirrored_less(images, expected, cameras):
-    settings, whole = DeformableSettings(mirrored=0.6), seen_for(100.0)
-    found = mirrored_shares([whole], images_of(images, cameras), settings)
+@pytest.mark.parametrize(
+    ("images", "cameras", "expected"), [(5, 1, 0.6), (30, 3, 0.6), (45, 1, 0.3), (45, 3, 0.3), (60, 1, 0.0)]
+)
+def test_objects_in_many_images_of_a_camera_are_mirrored_less(images, cameras, expected):
+    found = mirrored_shares([seen_for(100.0)], images_of(images, cameras), DeformableSettings(mirrored=0.6))
     np.testing.assert_allclose(found, [expected], atol=0.02)
 
 
 def test_the_images_count_in_which_an_object_is_present():
     """Of two hundred images of a camera, one shows the first object in twenty, the other in all."""
-    model, record = street(0.0), images_of(200)
-    tracks = [seen_for(9.5), seen_for(100.0)]
-    shares = mirrored_shares(tracks, record, DeformableSettings(mirrored=0.4))
-    np.testing.assert_allclose(shares, [0.4, 0.0], atol=1e-9)
+    model, record, tracks = street(0.0), images_of(200), (seen_for(9.5), seen_for(100.0))
     half = DeformableSettings(mirrored=0.4, mirrored_images=15)
     assert 0.0 < mirrored_shares(tracks, record, half)[0] < 0.4
-    model.parts[1].timeline.tracks = tuple(tracks)
-    choose_mirrored(model, record, settings_of(deformable=DeformableSettings(mirrored=0.4)))
-    np.testing.assert_allclose(model.parts[1].mirrored, shares, atol=1e-6)
-    choose_mirrored(model, record, settings_of(deformable=DeformableSettings(mirrored=0.0)))
-    assert model.parts[1].mirrored is None
-    choose_mirrored(model, images_of(0), settings_of(deformable=DeformableSettings(mirrored=0.4)))
-    assert (model.parts[1].mirrored == 0.4).all(), "without images, as a LiDAR alone"
+    model.parts[1].timeline.tracks = tracks
 
+    def chosen(share: float, record: TrainingRecord, of: SplatModel = model) -> torch.Tensor | None:
+        choose_mirrored(of, record, settings_of(deformable=DeformableSettings(mirrored=share)))
+        return of.parts[1].mirrored
 
-def test_vehicles_are_not_mirrored():
-    rigid = untrained_street(settings_of())
-    choose_mirrored(rigid, images_of(10), settings_of())
-    assert all(part.mirrored is None for part in rigid.parts)
+    np.testing.assert_allclose(chosen(0.4, record), [0.4, 0.0], atol=1e-6)
+    assert chosen(0.0, record) is None
+    assert (chosen(0.4, images_of(0)) == 0.4).all(), "without images, as a LiDAR alone"
+    assert chosen(0.4, record, untrained_street(settings_of())) is None, "vehicles"
