@@ -51,6 +51,7 @@ def test_its_training_takes_no_result_of_images_and_fits_scans_alone():
     made = plan()
     assert made.of_images("masks/masks.json")(at("a1")) == ["there/a1/masks/masks.json"]
     assert made.of_images("masks/masks.json")(at("a2")) == []
+    assert made.annotated_scene(at("a2")) == "there/a2/scene_refined.json", "LiDAR refines poses alone"
     taken = {scene: [i for i in TRAINING_INPUTS if made.training_input(i)(at(scene))] for scene in ("a1", "a2")}
     assert taken == {"a1": ["actors", "lidar_depth", "scans"], "a2": ["actors", "scans"]}
     with_image, alone = (json.loads(made.settings("train")(at(scene))) for scene in ("a1", "a2"))
