@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivesplat.poses.corrections import Corrections, apply_corrections, magnitudes
+from drivesplat.poses.refinement_record import finite
 from drivesplat.poses.registration import Pair, pairs_of, plane_distances, register
 from drivesplat.poses.surfaces import Surfaces, surfaces_of
 from drivesplat.scene.rigid import inverse
@@ -103,8 +104,8 @@ def align_sweeps(scene: Scene, job: RefinePosesJob, threads: int = 1) -> Alignme
     record = {
         "sweeps": len(sweeps),
         "pairs": len(judge.pairs),
-        "before_m": _finite(before),
-        "after_m": _finite(after),
+        "before_m": finite(before),
+        "after_m": finite(after),
         "taken": taken,
         **magnitudes(inverse(vehicle) @ refined),
     }
@@ -125,8 +126,8 @@ def _surfaces(scene: Scene, job: RefinePosesJob, threads: int) -> dict[int, Surf
 
 
 def _vehicle_poses(scene: Scene, sweeps: list[Sweep]) -> np.ndarray:
-    """The vehicle's poses (n, 4, 4) at the times of sweeps, by the LiDAR's mount at the sweep nearest to an
-    image; without images the LiDAR's own poses."""
+    """The vehicle's poses (n, 4, 4) at the times of sweeps, by the mount of the LiDAR at the sweep nearest to an image.
+    Without images, the poses of the LiDAR."""
     if not scene.frames:
         return np.stack([sweep.sensor_to_world for sweep in sweeps])
     times = np.array([frame.timestamp for frame in scene.frames])
@@ -135,7 +136,3 @@ def _vehicle_poses(scene: Scene, sweeps: list[Sweep]) -> np.ndarray:
     frame, sweep = np.unravel_index(np.argmin(between), between.shape)
     sensor_to_vehicle = inverse(poses[frame]) @ sweeps[sweep].sensor_to_world
     return np.stack([sweep.sensor_to_world @ inverse(sensor_to_vehicle) for sweep in sweeps])
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

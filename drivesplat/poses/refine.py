@@ -31,7 +31,7 @@ from drivesplat.poses.from_matches import MatchJudge, match_judge
 from drivesplat.poses.from_sweeps import SweepJudge
 from drivesplat.poses.lens import lens_warnings, with_tested_images
 from drivesplat.poses.readout import RollingFeatures
-from drivesplat.poses.refinement_record import Refinement, record_header
+from drivesplat.poses.refinement_record import Refinement, finite, record_header
 from drivesplat.poses.rig import RigImages
 from drivesplat.poses.triangulated import Observations, no_points, triangulated_points
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
@@ -118,7 +118,7 @@ def refine_from_matches(
         reason = stretched(scene, refined, limits)
     record = {**record_header(scene, job, reason), **_record(images, observations, changes, trial)}
     if judge and judged:
-        record["judged"] = {judge.name: dict(zip(("before", "after"), judged, strict=True))}
+        record["judged"] = {judge.name: dict(zip(("before", "after"), map(finite, judged), strict=True))}
     log.info("scene %s: %s", scene.name, _figures(record))
     if reason is None:
         log.info("scene %s: the refined poses are taken", scene.name)
@@ -245,13 +245,13 @@ def _record(
         "points": len(observations.positions),
         "observations": len(observations.point),
         "points_per_image": {"least": int(points.min()), "median": float(np.median(points))},
-        "reprojection_px": _finite(_median(observations.error)),
+        "reprojection_px": finite(_median(observations.error)),
         "trial": trial
         and {
             "points": trial.points,
             "observations": trial.observations,
-            "before_px": _finite(trial.before),
-            "after_px": _finite(trial.after),
+            "before_px": finite(trial.before),
+            "after_px": finite(trial.after),
         },
         "judged": None,
         **magnitudes(changes),
@@ -286,7 +286,3 @@ def _figures(record: dict[str, Any]) -> str:
 def _median(errors: np.ndarray) -> float:
     """The median, infinite without any errors."""
     return float(np.median(errors)) if len(errors) else np.inf
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.poses.from_sweeps import Alignment, align_sweeps
-from drivesplat.poses.refinement_record import Refinement, record_header
+from drivesplat.poses.refinement_record import Refinement, finite, record_header
 from drivesplat.poses.triangulated import no_points
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.scene import Scene
@@ -47,7 +47,7 @@ def refine_or_keep(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO
     decision = {
         "refined": refined,
         "kept_because": None if refined else by_images or "registered sweeps fit each other no better",
-        "lidar": aligned.record | {"final_m": aligned.judge.distance(refinement.scene)},
+        "lidar": aligned.record | {"final_m": finite(aligned.judge.distance(refinement.scene))},
     }
     return replace(refinement, record=record | decision)
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
@@ -31,3 +33,8 @@ def record_header(scene: Scene, job: RefinePosesJob, reason: str | None) -> dict
         "images_kept_because": reason,
         "lidar": None,
     }
+
+
+def finite(value: float) -> float | None:
+    """A value of poses.json: None for one that is not finite."""
+    return value if np.isfinite(value) else None
