@@ -2,7 +2,7 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.npz; with cameras masks/, without scans.npz; where a
 # method has discovered tracks discovered.json.
-# OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;
+# OUTPUTS: <results>/{scene}/{method}/eval.json; eval_objects.json, held_out_recorded.png, held_out_rendered.png beside it;
 # <results>/{scene}/metrics.json; where a method renders LiDAR <results>/{scene}/scan_baselines.json;
 # resources/lpips/backbone.json.
 
@@ -46,6 +46,7 @@ rule evaluate:
         lpips=plan.lpips_record,
     output:
         metrics="<results>/{scene}/{method}/eval.json",
+        objects="<results>/{scene}/{method}/eval_objects.json",
         recorded="<results>/{scene}/{method}/held_out_recorded.png",
         rendered="<results>/{scene}/{method}/held_out_rendered.png",
     log:

@@ -1,5 +1,5 @@
-"""checkpoint.npz against held-out images and scans, and against truth where there is any, into eval.json and a pair of
-images."""
+"""checkpoint.npz against held-out images and scans, and against truth where there is any, into eval.json,
+eval_objects.json and a pair of images."""
 
 from drivesplat.workflow.job import job
 from drivesplat.evaluation.evaluate import evaluate_method, read_evaluation_inputs
@@ -18,3 +18,4 @@ with job(snakemake, dataset=("images", "sweeps")) as current:
     write_image(current.output.recorded, evaluation.sample.recorded)
     write_image(current.output.rendered, evaluation.sample.rendered)
     write_json(current.output.metrics, {**evaluation.record, "provenance": provenance})
+    write_json(current.output.objects, {**evaluation.objects, "provenance": provenance})

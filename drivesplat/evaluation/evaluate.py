@@ -12,9 +12,9 @@ from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, training_figures
 from drivesplat.evaluation.image_metrics import (
-    evaluate_groups,
     held_out_depths,
     held_out_images,
+    measure_groups,
     measured_images,
     side_camera_metrics,
 )
@@ -95,9 +95,11 @@ class SamplePair:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The content of a method's eval.json, without provenance, and a sample image with its rendering."""
+    """The content of a method's eval.json and of its eval_objects.json, without provenance, and a sample image with its
+    rendering."""
 
     record: dict[str, Any]
+    objects: dict[str, Any]
     sample: SamplePair
 
 
@@ -108,7 +110,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     training = inputs.recording.record
     with explain_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
-        groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
+        groups, objects = measure_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
         if inputs.scans is not None:
             spread = inputs.checkpoint.job.train.scans.beam_spread_rad
             lidar = lidar_metrics(model, inputs.recording.scene, inputs.scans, spread, device)
@@ -116,10 +118,9 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
         aside = side_camera_metrics(model, inputs.recording, lpips_map, device)
         against_truth = truth_metrics(model, inputs, job, lpips_map, device)
         sample = render_sample_pair(model, inputs.recording, job.eval_camera, device)
+    header = {"schema": 1, "scene": training.scene.name, "dataset": training.scene.dataset}
     record = {
-        "schema": 1,
-        "scene": training.scene.name,
-        "dataset": training.scene.dataset,
+        **header,
         "protocol": protocol(training, inputs.masks_record, job),
         "drive": summarize_drive(inputs.recording, job.eval_camera, measured_images(training, job.eval_camera)),
         "result": {
@@ -133,7 +134,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
             **({"lpips_unavailable": unavailable} if unavailable else {}),
         },
     }
-    return Evaluation(record, sample)
+    return Evaluation(record, {**header, "groups": objects}, sample)
 
 
 def truth_metrics(

@@ -18,6 +18,7 @@ from drivesplat.evaluation.metrics import (
     relative_depth_errors,
     with_gap,
 )  # fmt: skip
+from drivesplat.evaluation.object_metrics import ObjectErrors, by_object, object_errors
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.depth import depths_in, split_sweeps
@@ -43,8 +44,21 @@ def evaluate_groups(
 ) -> dict[str, dict[str, Any]]:
     """The metrics of every held-out group by region. With LiDAR `depths` of images, by index, also `depth`; with
     several cameras also `overlap` and `no_overlap`, the static pixels that other cameras see as well, and the rest."""
+    return measure_groups(model, recording, camera, lpips_map, device, depths)[0]
+
+
+def measure_groups(
+    model: SplatModel,
+    recording: EvaluationData,
+    camera: str,
+    lpips_map: LpipsMap | None,
+    device: torch.device,
+    depths: Mapping[int, PixelDepths],
+) -> tuple[dict[str, dict[str, Any]], dict[str, list[dict[str, Any]]]]:
+    """`evaluate_groups`, and for every group the records of its objects (`by_object`)."""
     of_group = partial(_group_metrics, model, recording, lpips_map, device, depths)
-    return {group: of_group(images) for group, images in measured_images(recording.record, camera).items()}
+    measured = {group: of_group(images) for group, images in measured_images(recording.record, camera).items()}
+    return {group: own for group, (own, _) in measured.items()}, {group: own for group, (_, own) in measured.items()}
 
 
 def side_camera_metrics(
@@ -56,7 +70,7 @@ def side_camera_metrics(
     left_out = [int(i) for i in record.splits[SIDE_CAMERA] if record.is_key_frame[i]]
     cameras = sorted({record.camera_name(index) for index in left_out})
     images = {camera: [i for i in left_out if record.camera_name(i) == camera] for camera in cameras}
-    return {name: _group_metrics(model, recording, lpips_map, device, {}, own) for name, own in images.items()}
+    return {name: _group_metrics(model, recording, lpips_map, device, {}, own)[0] for name, own in images.items()}
 
 
 def _group_metrics(
@@ -66,8 +80,8 @@ def _group_metrics(
     device: torch.device,
     depths: Mapping[int, PixelDepths],
     images: list[int],
-) -> dict[str, Any]:
-    """The metrics of a held-out group of `images`."""
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The metrics of a held-out group of `images`, and of its objects."""
     record = recording.record
     several_cameras = len(record.camera_names) > 1
     metrics = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if several_cameras else ())))
@@ -83,16 +97,18 @@ def _group_metrics(
             depth_errors.append(relative_depth_errors(metres, depths[index]))
             yield index, image
 
-    def measure(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:
-        index, image = one
-        masks = region_masks(recording.labels(index))
+    def measure(one: tuple[int, np.ndarray]) -> tuple[dict[str, FrameErrors], list[ObjectErrors]]:
+        (index, image), labels = one, recording.labels(one[0])
+        masks, truth = region_masks(labels), recording.image(index)
         if several_cameras:
             masks |= overlap_masks(record, index, masks["static"])
-        return metrics.measure(image, recording.image(index), masks)
+        return metrics.measure(image, truth, masks), object_errors(recording, index, image, truth, labels)
 
-    for frame in prefetch(measure, renderings(), measuring_threads()):
+    objects: list[ObjectErrors] = []
+    for frame, of_objects in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(frame)
-    return {**with_gap(metrics.summary()), **depth_summary(depth_errors)}
+        objects += of_objects
+    return {**with_gap(metrics.summary()), **depth_summary(depth_errors)}, by_object(objects)
 
 
 def held_out_depths(recording: EvaluationData, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:

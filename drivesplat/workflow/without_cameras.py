@@ -24,7 +24,7 @@ IMAGE_RESULTS = (
 IMAGE_RESULTS_OF_METHODS = (
     *HELD_OUT_PAIR.values(), *LOOKS.values(), "removal.png", "ghost_panel.json", "removal.json", "quad", "far.npz",
     "splat.ply", "cameras.json", "transforms.json", "parts", "scene.usdz", "viewer.html", "colmap", "splat.spz",
-    "splat.sog", "truth.mp4", "truth.json",
+    "splat.sog", "truth.mp4", "truth.json", "eval_objects.json",
 )  # fmt: skip
 """Those of a method, without films, edits and drive folders."""
 HOW = "docs/lidar.md says what there is without cameras"
