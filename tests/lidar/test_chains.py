@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from drivesplat.lidar.objects.clusters import Chain, Cluster, chains_of, connected
+from drivesplat.lidar.objects.chains import chains_of
+from drivesplat.lidar.objects.clusters import Chain, Cluster, connected
 from drivesplat.lidar.objects.merging import after_gaps
 
 

@@ -1,7 +1,7 @@
 """Moving objects of a drive from its LiDAR scans: evidence, clusters, chains, boxes."""
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from jaxtyping import Bool
@@ -9,11 +9,13 @@ from scipy.spatial import cKDTree
 
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.lidar.objects.boxes import Discovered, fitted_box
-from drivesplat.lidar.objects.clusters import Chain, chains_of, clusters_of
+from drivesplat.lidar.objects.chains import chains_of
+from drivesplat.lidar.objects.clusters import Chain, clusters_of
 from drivesplat.lidar.objects.ends import Ends
 from drivesplat.lidar.objects.merging import after_gaps, of_parts, united
 from drivesplat.lidar.objects.seen_empty import seen_empty
 from drivesplat.lidar.objects.separation import separated
+from drivesplat.lidar.objects.standing import StandingMap
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
 
@@ -38,6 +40,10 @@ MIN_MOVING = 0.4
 """Fraction of the returns in the place of an object that move."""
 BESIDE, KERB = 0.2, 0.3
 """Metres around a cluster, and above the ground, where returns are counted for it."""
+MAX_BLOCKED = 0.05
+"""Fraction of its way on which an object may pass through what stands: paths are off by some decimetres in places."""
+MAX_ACCELERATION = 5.0
+"""Metres per second squared, for half of the time, of an object: brisk braking, or a turn taken at speed."""
 MAX_SEPARATIONS = 8
 """Rounds in which boxes and the returns that belong to them are found by turns."""
 Boxed = tuple[Chain, Discovered]
@@ -54,9 +60,12 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     moving = seen_empty(scans)
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
     around = Surroundings(scans, moving)
-    long = [chain for chain in chains_of(clusters) if len(chain.clusters) >= MIN_SCANS]
-    whole = after_gaps(of_parts(long))
+    standing = StandingMap(scans, moving, around.ground)
+    chains = [part for chain in chains_of(clusters) for part in unblocked(chain, standing)]
+    long = [chain for chain in chains if len(chain.clusters) >= MIN_SCANS]
+    whole = after_gaps(of_parts(long), standing.blocked_link)
     boxes = [around.boxed(chain) for chain in whole if is_object(chain) and around.confirm(chain)]
+    boxes = [boxed for boxed in boxes if is_possible(boxed, standing)]
     boxes = _without_overlaps(boxes, around)
     for _ in range(MAX_SEPARATIONS if boxes else 0):  # boxes and the returns that belong to each, until these stay
         before = [_counts(chain) for chain, _ in boxes]
@@ -65,7 +74,27 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
             break
         boxes = [around.boxed(chain) for chain in chains]
     ends = Ends(scans)
-    return sorted((ends.followed(item) for _, item in _without_overlaps(boxes, around)), key=lambda it: it.seconds[0])
+    found = [item for item in _without_overlaps(boxes, around) if is_possible(item, standing)]
+    return sorted((ends.followed(item) for _, item in found), key=lambda it: it.seconds[0])
+
+
+def unblocked(chain: Chain, standing: StandingMap) -> list[Chain]:
+    """The parts of a chain between which it would pass through what stands."""
+    parts = [Chain([chain.clusters[0]])]
+    for before, after in pairwise(chain.clusters):
+        if standing.blocked_link(before, after):
+            parts.append(Chain())
+        parts[-1].clusters.append(after)
+    return parts
+
+
+def is_possible(boxed: Boxed, standing: StandingMap) -> bool:
+    """Whether an object can move as a box does: it passes through nothing that stands, and no vehicle or person speeds
+    up and turns so much."""
+    _, item = boxed
+    seconds = np.linspace(item.seconds[0], item.seconds[-1], 4 * len(item.seconds))
+    acceleration = float(np.median(np.linalg.norm(item.path.accelerations(seconds), axis=1)))
+    return standing.blocked_share(item) <= MAX_BLOCKED and acceleration <= MAX_ACCELERATION
 
 
 def _counts(chain: Chain) -> list[tuple[int, int]]:
@@ -138,7 +167,7 @@ class Surroundings:
         self._scans, self._moving = scans, moving
         elevations = np.sort(scans[0].scan.rays.beam_elevations)
         self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
-        self._ground = ground_of(scans, moving)
+        self.ground = ground_of(scans, moving).height
         # Nearer returns are not measured, as they are of the ego vehicle.
         self._blind = max(float(s.scan.ranges[s.scan.returned & ~s.measured].max(initial=0.0)) for s in scans)
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
@@ -146,7 +175,7 @@ class Surroundings:
     def boxed(self, chain: Chain) -> Boxed:
         """A chain with its box, on the ground: where its height is unknown, between known ones, or on the height of the
         lowest returns."""
-        heights = np.array([self._ground.height(cluster.place) for cluster in chain.clusters])
+        heights = np.array([self.ground(cluster.place) for cluster in chain.clusters])
         known = np.isfinite(heights)
         if known.any():
             grounds = np.interp(chain.seconds, chain.seconds[known], heights[known])
@@ -157,7 +186,7 @@ class Surroundings:
     def confirm(self, chain: Chain) -> bool:
         """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
         move, as those of standing objects do not."""
-        clearances = np.array([cluster.lowest - self._ground.height(cluster.place) for cluster in chain.clusters])
+        clearances = np.array([cluster.lowest - self.ground(cluster.place) for cluster in chain.clusters])
         beams_apart = [
             self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2])) for cluster in chain.clusters
         ]
@@ -166,7 +195,7 @@ class Surroundings:
             return False
         moving_shares = []  # of the returns in a cluster's extents, above the ground where it is known
         for cluster in chain.clusters:
-            ground = self._ground.height(cluster.place)
+            ground = self.ground(cluster.place)
             floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
             tree, heights = self._of_scan(cluster.scan)
             low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
