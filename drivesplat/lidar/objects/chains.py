@@ -25,7 +25,9 @@ TOP_CHANGE = 0.6
 """Metres by which its highest return typically changes: a few beams."""
 COUNT_RATIO = 4.0
 """Ratio by which the number of its returns typically changes."""
-UNLIKE = 1.5
+TYPICAL = 5
+"""Last clusters of a chain by whose medians its appearance is known."""
+UNLIKE = 1.2
 """Difference in appearance that is allowed to established chains: another object hides a part of them at times."""
 LIKENESS = 1.0
 """Weight of a difference in appearance that is just allowed, relative to a place at the border of its gate."""
@@ -86,19 +88,26 @@ def _costs(chain: Chain, found: Sequence[Cluster]) -> Float[np.ndarray, " n"]:
     within = (apart <= gate) & (np.linalg.norm(places - last.place, axis=1) <= GATE + MAX_SPEED * since)
     costs = np.full(len(found), np.inf)
     for k in np.flatnonzero(within):
-        differs = unlikeness(last, found[k])
+        differs = unlikeness(chain.clusters[-TYPICAL:], found[k])
         if differs < (UNLIKE if len(chain.clusters) >= ESTABLISHED else 1.0):
             costs[k] = apart[k] / gate[k] + LIKENESS * differs
     return costs
 
 
-def unlikeness(a: Cluster, b: Cluster) -> float:
-    """How much two clusters differ in extents, highest return and number of returns: 1 and more is not one object a
-    moment later."""
-    lengths = [float(np.linalg.norm(np.ptp(cluster.points[:, :2], axis=0))) for cluster in (a, b)]
-    tops = [float(cluster.points[:, 2].max()) for cluster in (a, b)]
-    counts = [len(cluster.points) for cluster in (a, b)]
-    by_length = abs(lengths[0] - lengths[1]) / (LENGTH_CHANGE + LENGTH_SHARE * max(lengths))
-    by_top = abs(tops[0] - tops[1]) / TOP_CHANGE
-    by_count = abs(np.log(counts[0] / counts[1])) / np.log(COUNT_RATIO)
+def unlikeness(known: Sequence[Cluster], new: Cluster) -> float:
+    """How much a cluster differs from the `known` ones of a chain, by medians of their extents, highest returns and
+    numbers of returns: 1 and more is not one object a moment later."""
+    lengths, tops, counts = np.array([_appearance(cluster) for cluster in known]).T
+    length, top, count = _appearance(new)
+    typical = float(np.median(lengths))
+    by_length = (length - typical) / (LENGTH_CHANGE + LENGTH_SHARE * max(length, typical))
+    by_top = (top - np.median(tops)) / TOP_CHANGE
+    by_count = (count - np.median(counts)) / np.log(COUNT_RATIO)
     return 0.5 * float(np.linalg.norm([by_length, by_top, by_count]))
+
+
+def _appearance(cluster: Cluster) -> tuple[float, float, float]:
+    """The diagonal of its horizontal extents and the height of its highest return (metres), and the logarithm of the
+    number of its returns."""
+    diagonal = np.linalg.norm(np.ptp(cluster.points[:, :2], axis=0))
+    return float(diagonal), float(cluster.points[:, 2].max()), float(np.log(len(cluster.points)))

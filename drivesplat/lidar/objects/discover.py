@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.lidar.objects.boxes import Discovered, fitted_box
 from drivesplat.lidar.objects.chains import chains_of
-from drivesplat.lidar.objects.clusters import Chain, clusters_of
+from drivesplat.lidar.objects.clusters import Chain, Cluster, clusters_of
 from drivesplat.lidar.objects.ends import Ends
 from drivesplat.lidar.objects.merging import after_gaps, of_parts, united
+from drivesplat.lidar.objects.registration import least_misfit, misfit_along
 from drivesplat.lidar.objects.seen_empty import seen_empty
 from drivesplat.lidar.objects.separation import separated
 from drivesplat.lidar.objects.standing import StandingMap
@@ -42,6 +43,9 @@ BESIDE, KERB = 0.2, 0.3
 """Metres around a cluster, and above the ground, where returns are counted for it."""
 MAX_BLOCKED = 0.05
 """Fraction of its way on which an object may pass through what stands: paths are off by some decimetres in places."""
+MISFIT_LINK, MISFIT = 0.3, 0.15
+"""Metres between the surfaces that an object shows in two scans: at most, beside the distance of neighbouring beams, and
+for half of them, beside half of that distance."""
 MAX_ACCELERATION = 5.0
 """Metres per second squared, for half of the time, of an object: brisk braking, or a turn taken at speed."""
 MAX_SEPARATIONS = 8
@@ -61,11 +65,11 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
     around = Surroundings(scans, moving)
     standing = StandingMap(scans, moving, around.ground)
-    chains = [part for chain in chains_of(clusters) for part in unblocked(chain, standing)]
+    chains = [part for chain in chains_of(clusters) for part in around.parts(chain, standing)]
     long = [chain for chain in chains if len(chain.clusters) >= MIN_SCANS]
     whole = after_gaps(of_parts(long), standing.blocked_link)
     boxes = [around.boxed(chain) for chain in whole if is_object(chain) and around.confirm(chain)]
-    boxes = [boxed for boxed in boxes if is_possible(boxed, standing)]
+    boxes = [boxed for boxed in boxes if around.is_possible(boxed, standing)]
     boxes = _without_overlaps(boxes, around)
     for _ in range(MAX_SEPARATIONS if boxes else 0):  # boxes and the returns that belong to each, until these stay
         before = [_counts(chain) for chain, _ in boxes]
@@ -74,27 +78,8 @@ def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
             break
         boxes = [around.boxed(chain) for chain in chains]
     ends = Ends(scans)
-    found = [item for item in _without_overlaps(boxes, around) if is_possible(item, standing)]
+    found = [boxed for boxed in _without_overlaps(boxes, around) if around.is_possible(boxed, standing)]
     return sorted((ends.followed(item) for _, item in found), key=lambda it: it.seconds[0])
-
-
-def unblocked(chain: Chain, standing: StandingMap) -> list[Chain]:
-    """The parts of a chain between which it would pass through what stands."""
-    parts = [Chain([chain.clusters[0]])]
-    for before, after in pairwise(chain.clusters):
-        if standing.blocked_link(before, after):
-            parts.append(Chain())
-        parts[-1].clusters.append(after)
-    return parts
-
-
-def is_possible(boxed: Boxed, standing: StandingMap) -> bool:
-    """Whether an object can move as a box does: it passes through nothing that stands, and no vehicle or person speeds
-    up and turns so much."""
-    _, item = boxed
-    seconds = np.linspace(item.seconds[0], item.seconds[-1], 4 * len(item.seconds))
-    acceleration = float(np.median(np.linalg.norm(item.path.accelerations(seconds), axis=1)))
-    return standing.blocked_share(item) <= MAX_BLOCKED and acceleration <= MAX_ACCELERATION
 
 
 def _counts(chain: Chain) -> list[tuple[int, int]]:
@@ -187,9 +172,7 @@ class Surroundings:
         """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
         move, as those of standing objects do not."""
         clearances = np.array([cluster.lowest - self.ground(cluster.place) for cluster in chain.clusters])
-        beams_apart = [
-            self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2])) for cluster in chain.clusters
-        ]
+        beams_apart = [self._beams_apart(cluster) for cluster in chain.clusters]
         excess = clearances - [max(MAX_CLEARANCE, KERB + 2 * apart) for apart in beams_apart]
         if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
             return False
@@ -207,6 +190,33 @@ class Surroundings:
             own = int((cluster.points[:, 2] > floor).sum())
             moving_shares.append(own / max(own + standing, 1))
         return bool(np.median(moving_shares) > MIN_MOVING)
+
+    def parts(self, chain: Chain, standing: StandingMap) -> list[Chain]:
+        """The parts of a chain between which it would pass through what stands, or whose surfaces differ."""
+        parts = [Chain([chain.clusters[0]])]
+        for before, after in pairwise(chain.clusters):
+            allowed = MISFIT_LINK + self._beams_apart(after)
+            if standing.blocked_link(before, after) or least_misfit(before, after) > allowed:
+                parts.append(Chain())
+            parts[-1].clusters.append(after)
+        return parts
+
+    def is_possible(self, boxed: Boxed, standing: StandingMap) -> bool:
+        """Whether an object can move as a box does: it passes through nothing that stands, its surface moves with the
+        box, and no vehicle or person speeds up and turns so much."""
+        chain, item = boxed
+        seconds = np.linspace(item.seconds[0], item.seconds[-1], 4 * len(item.seconds))
+        acceleration = float(np.median(np.linalg.norm(item.path.accelerations(seconds), axis=1)))
+        allowed = MISFIT + 0.5 * float(np.median([self._beams_apart(cluster) for cluster in chain.clusters]))
+        return (
+            acceleration <= MAX_ACCELERATION
+            and misfit_along(chain, item) <= allowed
+            and standing.blocked_share(item) <= MAX_BLOCKED
+        )
+
+    def _beams_apart(self, cluster: Cluster) -> float:
+        """Metres between neighbouring beams at the distance of a cluster."""
+        return self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2]))
 
     def _of_scan(self, number: int) -> tuple[cKDTree, np.ndarray]:
         """The places of the returns of a scan that do not move, and their heights."""
