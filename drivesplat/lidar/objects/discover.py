@@ -32,6 +32,13 @@ SAME_VELOCITY, SAME_SHARE = 2.5, 0.5
 """Metres per second, and fraction of the speed, by which the velocities of parts of one object seem to differ."""
 SLACK = (1.0, 0.3)
 """Metres along and across a vehicle by which the middles of its parts may lie beyond its box."""
+MAX_NEITHER_S, MAX_BOTH_S = 1.0, 0.5
+"""Seconds between the end of one box and the begin of another one of the same object, and for which both may be."""
+SETTLED_S = 0.5
+"""Seconds from its ends within which the velocity of a path is uncertain."""
+MEET, MEET_SPEED = 0.7, 1.0
+"""Metres, and metres per second of the time between, by which the two may be apart then; half of the length and
+of the width of a vehicle more, of which each may show another part."""
 NEARLY_ALWAYS, FEW = 0.75, 0.1
 """Fractions of their common time, and of the returns of the larger one."""
 MAX_CLEARANCE = 0.8
@@ -87,14 +94,39 @@ def _counts(chain: Chain) -> list[tuple[int, int]]:
 
 
 def _without_overlaps(boxes: Sequence[Boxed], around: "Surroundings") -> Sequence[Boxed]:
-    """Chains with their boxes, those whose boxes overlap while both move as one object."""
+    """Chains with their boxes, joined where two are of one object."""
     while True:
-        pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if overlap(boxes[i][1], boxes[j][1]))
+        pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if are_one(boxes[i][1], boxes[j][1]))
         pair = next(pairs, None)
         if pair is None:
             return boxes
         whole = united(*(boxes[k][0] for k in pair))
         boxes = [it for k, it in enumerate(boxes) if k not in pair] + [around.boxed(whole)]
+
+
+def are_one(a: Discovered, b: Discovered) -> bool:
+    """Whether two boxes are of one object, at the same time or one after the other."""
+    return overlap(a, b) or continues(a, b) or continues(b, a)
+
+
+def continues(a: Discovered, b: Discovered) -> bool:
+    """Whether a box goes on as another one, of similar kind, that began about when it ended: half-way between, both are
+    at one place, and SETTLED_S before and after, their velocities are alike."""
+    gap = float(b.seconds[0] - a.seconds[-1])
+    if not -MAX_BOTH_S <= gap <= MAX_NEITHER_S or b.seconds[-1] <= a.seconds[-1] or b.seconds[0] <= a.seconds[0]:
+        return False
+    if a.object_class.is_human != b.object_class.is_human:
+        return False
+    between = np.array([0.5 * (a.seconds[-1] + b.seconds[0])])
+    apart = b.path.places(between)[0] - a.path.places(between)[0]
+    before, after = a.path.velocities(between - SETTLED_S)[0], b.path.velocities(between + SETTLED_S)[0]
+    speed = max(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
+    way = (before + after) / max(float(np.linalg.norm(before + after)), 1e-6)
+    along, across = abs(float(apart @ way)), abs(float(apart[0] * way[1] - apart[1] * way[0]))
+    reach = MEET + MEET_SPEED * max(gap, 0.0)
+    alike = float(np.linalg.norm(before - after)) <= max(SAME_VELOCITY, SAME_SHARE * speed)
+    length, width = np.zeros(2) if a.object_class.is_human else 0.25 * (a.size + b.size)[:2]
+    return bool(alike and across <= reach + width and along <= reach + length)
 
 
 def overlap(a: Discovered, b: Discovered) -> bool:
