@@ -66,9 +66,9 @@ GROUND_SCANS = 100
 """Number of scans, evenly spaced, that are enough for that map."""
 
 
-def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
+def discovered(scans: Sequence[RecordedScan], threads: int = 1) -> list[Discovered]:
     """The moving objects in the scans of one LiDAR, which are in order of time, in the order in which they appear."""
-    moving = seen_empty(scans)
+    moving = seen_empty(scans, threads)
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
     around = Surroundings(scans, moving)
     standing = StandingMap(scans, moving, around.ground)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 from scipy.spatial.transform import Rotation
 
+from drivesplat.io.prefetch import prefetch
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scan_record import RecordedScan
 
@@ -28,8 +29,6 @@ AT, AT_SHARE = 0.3, 0.01
 """Metres, and fraction of the range, within which a ray ends at a place."""
 MIN_KNOWN = 4
 """Of the six rays around a place, those that have to return if it is empty."""
-STEPS = 2
-"""Iterations to find the time at which a spinning sensor looks at a place."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,12 @@ class RangeGrid:
     @cached_property
     def _turns(self) -> Float[np.ndarray, "a 3 3"]:
         """The rotation from the sensor at its timestamp to the sensor at the time of each column."""
-        return Rotation.from_rotvec(-self.offsets_s[:, None] * self.scan.angular).as_matrix()
+        return Rotation.from_rotvec(-self.offsets_s[:, None] * self.scan.angular).as_matrix().astype(np.float32)
+
+    @cached_property
+    def _ways(self) -> Float[np.ndarray, "a 3"]:
+        """The way in metres of the sensor from its timestamp to the time of each column."""
+        return (self.offsets_s[:, None] * self.scan.linear).astype(np.float32)
 
     def _columns(self, azimuths: np.ndarray) -> np.ndarray:
         count = self.scan.scan.rays.shape[1]
@@ -104,11 +108,12 @@ class RangeGrid:
     ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """The beam above each place in the world (metres), the column that looks at it, its range, and whether it lies
         between the lowest and the highest beam."""
-        at_timestamp = places = apply(inverse(self.scan.sensor_to_world), points)
-        for _ in range(STEPS):  # in the sensor's frame at the time when it looks at them
-            columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
-            moved = at_timestamp - self.offsets_s[columns][:, None] * self.scan.linear
-            places = np.einsum("nij,nj->ni", self._turns[columns], moved)
+        places = apply(inverse(self.scan.sensor_to_world), points).astype(np.float32)
+        # In the sensor's frame at the time when it looks at them; the sensor moves by millimetres in the time by which
+        # the azimuths at the timestamp are off.
+        columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
+        moved = places - self._ways[columns]
+        places = np.einsum("nij,nj->ni", self._turns[columns], moved)
         columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
         ranges = np.maximum(np.linalg.norm(places, axis=1), 1e-6)
         elevations = np.arcsin(np.clip(places[:, 2] / ranges, -1.0, 1.0))
@@ -117,15 +122,16 @@ class RangeGrid:
         return np.clip(above, 1, len(self.elevations) - 1), columns, ranges, in_view
 
 
-def seen_empty(scans: Sequence[RecordedScan]) -> list[Bool[np.ndarray, " n"]]:
+def seen_empty(scans: Sequence[RecordedScan], threads: int = 1) -> list[Bool[np.ndarray, " n"]]:
     """For each of the scans of one LiDAR, in order of time, which of its measured returns (`RecordedScan.points`) lie
     in space that other scans prove empty."""
     images = [RangeGrid(scan) for scan in scans]
     seconds = np.array([scan.seconds for scan in scans])
-    return [
-        _seen_empty_by(scan.points(), [images[other] for other in asked(seconds, number)])
-        for number, scan in enumerate(scans)
-    ]
+
+    def of_scan(number: int) -> Bool[np.ndarray, " n"]:
+        return _seen_empty_by(scans[number].points(), [images[other] for other in asked(seconds, number)])
+
+    return list(prefetch(of_scan, range(len(scans)), threads))
 
 
 def _seen_empty_by(points: Float[np.ndarray, "n 3"], images: Sequence[RangeGrid]) -> Bool[np.ndarray, " n"]:
