@@ -52,7 +52,9 @@ MAX_BLOCKED = 0.05
 """Fraction of its way on which an object may pass through what stands: paths are off by some decimetres in places."""
 MISFIT_LINK, MISFIT = 0.3, 0.15
 """Metres between the surfaces that an object shows in two scans: at most, beside the distance of neighbouring beams, and
-for half of them, beside half of that distance."""
+for half of them, beside half of that distance and what UNKNOWN_ACCELERATION (metres per second squared), which smooth
+paths miss, adds from scan to scan."""
+UNKNOWN_ACCELERATION = 2.0
 MAX_ACCELERATION = 5.0
 """Metres per second squared, for half of the time, of an object: brisk braking, or a turn taken at speed."""
 MAX_SEPARATIONS = 8
@@ -239,7 +241,9 @@ class Surroundings:
         chain, item = boxed
         seconds = np.linspace(item.seconds[0], item.seconds[-1], 4 * len(item.seconds))
         acceleration = float(np.median(np.linalg.norm(item.path.accelerations(seconds), axis=1)))
-        allowed = MISFIT + 0.5 * float(np.median([self._beams_apart(cluster) for cluster in chain.clusters]))
+        apart = float(np.median([self._beams_apart(cluster) for cluster in chain.clusters]))
+        unknown = 0.5 * UNKNOWN_ACCELERATION * float(np.median(np.diff(chain.seconds))) ** 2
+        allowed = MISFIT + 0.5 * apart + unknown
         return (
             acceleration <= MAX_ACCELERATION
             and misfit_along(chain, item) <= allowed
