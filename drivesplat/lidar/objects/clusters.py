@@ -1,6 +1,5 @@
 """Clusters of moving returns in single scans, and chains: clusters of one object over time."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal

@@ -20,8 +20,10 @@ from drivesplat.lidar.objects.standing import StandingMap
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
 
-MIN_SCANS, MIN_SECONDS, MIN_WAY = 3, 0.4, 1.0
-"""Scans, seconds and metres of a chain that is an object."""
+MIN_SCANS, MIN_SECONDS, MIN_WAY = 4, 0.4, 1.0
+"""Scans, seconds and metres of a chain that is an object: chance makes chains of three clusters."""
+PART_SCANS = 3
+"""Scans of a chain that is a part of an object."""
 MIN_FILL = 0.35
 """Fraction of the scans between its first and its last one in which it was found."""
 MIN_TYPICAL = 4.0
@@ -51,9 +53,9 @@ BESIDE, KERB = 0.2, 0.3
 MAX_BLOCKED = 0.05
 """Fraction of its way on which an object may pass through what stands: paths are off by some decimetres in places."""
 MISFIT_LINK, MISFIT = 0.3, 0.15
-"""Metres between the surfaces that an object shows in two scans: at most, beside the distance of neighbouring beams, and
-for half of them, beside half of that distance and what UNKNOWN_ACCELERATION (metres per second squared), which smooth
-paths miss, adds from scan to scan."""
+"""Metres between the surfaces that an object shows in two scans: at most, beside the distance of neighbouring beams,
+and for half of them, beside half of that distance and what UNKNOWN_ACCELERATION (metres per second squared), which
+smooth paths miss, adds from scan to scan."""
 UNKNOWN_ACCELERATION = 2.0
 MAX_ACCELERATION = 5.0
 """Metres per second squared, for half of the time, of an object: brisk braking, or a turn taken at speed."""
@@ -75,14 +77,14 @@ def discovered(scans: Sequence[RecordedScan], threads: int = 1) -> list[Discover
     around = Surroundings(scans, moving)
     standing = StandingMap(scans, moving, around.ground)
     chains = [part for chain in chains_of(clusters) for part in around.parts(chain, standing)]
-    long = [chain for chain in chains if len(chain.clusters) >= MIN_SCANS]
+    long = [chain for chain in chains if len(chain.clusters) >= PART_SCANS]
     whole = after_gaps(of_parts(long), standing.blocked_link)
     boxes = [around.boxed(chain) for chain in whole if is_object(chain) and around.confirm(chain)]
     boxes = [boxed for boxed in boxes if around.is_possible(boxed, standing)]
     boxes = _without_overlaps(boxes, around)
     for _ in range(MAX_SEPARATIONS if boxes else 0):  # boxes and the returns that belong to each, until these stay
         before = [_counts(chain) for chain, _ in boxes]
-        chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= MIN_SCANS]
+        chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= PART_SCANS]
         if [_counts(chain) for chain in chains] == before:
             break
         boxes = [around.boxed(chain) for chain in chains]

@@ -9,6 +9,8 @@ from drivesplat.lidar.objects.clusters import Chain, Cluster
 
 MAX_POINTS = 100
 """Returns of a cluster that are looked at, evenly chosen."""
+FREE = 3.0
+"""Factor on the distance of surfaces that were moved until they fit: chance makes it small."""
 
 
 def misfit(a: Cluster, b: Cluster, shift: Float[np.ndarray, "2"]) -> float:
@@ -28,7 +30,8 @@ def least_misfit(a: Cluster, b: Cluster) -> float:
 
 
 def misfit_along(chain: Chain, item: Discovered) -> float:
-    """The median `misfit` (metres) of consecutive clusters of a chain, moved as its box moves."""
+    """The median `misfit` (metres) of consecutive clusters of a chain, moved as its box moves; or FREE times that where
+    they fit best, since patches of the even side of a long vehicle slide along it."""
     places = item.path.places(chain.seconds)
     pairs = zip(chain.clusters[:-1], chain.clusters[1:], np.diff(places, axis=0), strict=True)
-    return float(np.median([misfit(a, b, shift) for a, b, shift in pairs]))
+    return float(np.median([min(misfit(a, b, shift), FREE * least_misfit(a, b)) for a, b, shift in pairs]))
