@@ -20,6 +20,7 @@ rule discover:
         "<benchmarks>/{scene}/discover.tsv"
     conda:
         "../envs/drivesplat.yaml"
+    threads: 4
     resources:
         mem_mb=4000,
         runtime=60,

@@ -11,6 +11,6 @@ from drivesplat.settings.discover import DiscoverJob
 
 with job(snakemake) as current:
     scene, records = read_scene(current.input.scene), read_scans(current.input.scans)
-    found = discovered_tracks(scene, records, current.settings(DiscoverJob).discover)
+    found = discovered_tracks(scene, records, current.settings(DiscoverJob).discover, current.threads)
     provenance = current.provenance(scene.provenance, records.provenance)
     write_discovered(current.output.tracks, dataclasses.replace(found, provenance=provenance))

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from drivesplat.lidar.objects.clusters import Chain, Cluster, chains_of, connected
+from drivesplat.lidar.objects.chains import chains_of
+from drivesplat.lidar.objects.clusters import Chain, Cluster, connected
 from drivesplat.lidar.objects.merging import after_gaps
 
 
@@ -47,3 +48,25 @@ def test_chains_are_joined_where_one_goes_on_as_the_other_ended(velocity, joined
     found = after_gaps([after, before])
     assert len(found) == joined
     assert joined == 2 or (np.diff(found[0].seconds) > 0.0).all()
+
+
+def test_a_chain_takes_the_cluster_that_looks_like_its_own():
+    """Where a car was expected lies a leaf, and the car a little beside."""
+    grid = np.stack(np.meshgrid(np.arange(-0.9, 1.0, 0.15), [0.0], np.arange(0.4, 1.5, 0.2)), axis=-1).reshape(-1, 3)
+    cars = [Cluster(k, 0.1 * k, grid + np.array([0.5 * k, 0.0, 0.0]), np.zeros(3)) for k in range(10)]
+    cars.append(Cluster(10, 1.0, grid + np.array([5.3, 0.2, 0.0]), np.zeros(3)))
+    found = chains_of([*([car] for car in cars[:10]), [cluster(10, (5.0, 0.0)), cars[10]]])
+    assert sorted(len(one.clusters) for one in found) == [1, 11]
+
+
+def test_nothing_is_faster_than_any_vehicle():
+    def chained(step: float) -> int:
+        return len(chains_of([[cluster(k, (step * k, 0.0))] for k in range(5)]))
+
+    assert chained(3.0) == 1 and chained(5.0) == 5
+
+
+def test_a_chain_is_not_joined_through_what_stands():
+    before, after = chain(range(12), (0.0, 0.0), (6.0, 0.0)), chain(range(25, 40), (0.0, 0.3), (6.0, 0.0))
+    assert len(after_gaps([before, after], lambda one, other: True)) == 2
+    assert len(after_gaps([before, after], lambda one, other: False)) == 1

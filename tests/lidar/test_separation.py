@@ -5,7 +5,7 @@ from helpers.street_scans import Mover, street_scans
 
 from drivesplat.lidar.objects.boxes import Discovered
 from drivesplat.lidar.objects.clusters import Chain, Cluster
-from drivesplat.lidar.objects.discover import discovered
+from drivesplat.lidar.objects.discover import continues, discovered
 from drivesplat.lidar.objects.separation import beyond, separated
 from drivesplat.lidar.objects.smoothing import smooth_path
 from drivesplat.scene.object_class import ObjectClass
@@ -72,3 +72,21 @@ def test_a_cyclist_and_a_person_who_pass_each_other_keep_their_ways_and_sizes():
     for mover, kind in ((cyclist, ObjectClass.BICYCLE), (person, ObjectClass.PEDESTRIAN)):
         apart = by_class[kind].poses(passing)[:, :2, 3] - mover.at(passing)
         assert np.linalg.norm(apart, axis=1).max() < 0.25
+
+
+def driving(seconds: np.ndarray, start: float, speed: float = 6.0, aside: float = 0.0) -> Discovered:
+    """A car that drives along x, at `start` at second 0."""
+    places = np.stack([start + speed * seconds, np.full(len(seconds), aside)], axis=1)
+    zeros = np.zeros(len(seconds))
+    path = smooth_path(seconds, places, np.ones((len(seconds), 2)))
+    return Discovered(ObjectClass.CAR, np.array([4.5, 1.8, 1.5]), path, seconds, zeros, zeros, 100)
+
+
+def test_a_box_goes_on_as_another_one():
+    first, later = np.linspace(0.0, 2.0, 11), np.linspace(2.6, 5.0, 13)
+    before = driving(first, 0.0)
+    assert continues(before, driving(later, 1.0))
+    assert not continues(before, driving(later, 8.0)), "the next car"
+    assert not continues(before, driving(later, 0.0, aside=3.0)), "the next lane"
+    assert not continues(before, driving(later, 27.0, speed=-6.0)), "oncoming"
+    assert not continues(driving(later, 0.0), before), "earlier"

@@ -1,13 +1,11 @@
-"""Clusters of moving returns in single scans, and chains of them over time."""
+"""Clusters of moving returns in single scans, and chains: clusters of one object over time."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -17,14 +15,8 @@ from drivesplat.scene.scan_record import RecordedScan
 APART, APART_SHARE = 0.6, 0.01
 """Metres, and fraction of the range, by which returns of one object lie apart horizontally at most."""
 MIN_RETURNS = 3
-MAX_SPEED = 40.0
-"""Metres per second of an object that was seen once."""
-GATE, GATE_SPEED = 0.8, 3.0
-"""Metres, and metres per second since it was last seen, by which an object may deviate from its straight way."""
 MEMORY_S = 0.5
 """Seconds over which the velocity of a chain is taken."""
-MAX_GAP_S = 1.2
-"""Seconds after which a chain that was not seen ends."""
 
 
 @dataclass(frozen=True)
@@ -97,34 +89,3 @@ def connected(places: Float[np.ndarray, "n 2"], ranges: Float[np.ndarray, " n"])
     pairs = pairs[apart <= np.minimum(reach[pairs[:, 0]], reach[pairs[:, 1]])]
     links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
     return connected_components(links, directed=False)[1]
-
-
-def chains_of(clusters: Sequence[Sequence[Cluster]]) -> list[Chain]:
-    """Chains of the clusters of consecutive scans: each goes on with the cluster nearest to where it is expected."""
-    open_, closed = [], []
-    for found in clusters:
-        if not found:
-            continue
-        now = float(np.mean([cluster.seconds for cluster in found]))
-        closed += [chain for chain in open_ if now - chain.clusters[-1].seconds > MAX_GAP_S]
-        open_ = [chain for chain in open_ if now - chain.clusters[-1].seconds <= MAX_GAP_S]
-        costs, times = np.full((len(open_), len(found)), np.inf), np.array([cluster.seconds for cluster in found])
-        for row, chain in enumerate(open_):
-            place, velocity = chain.motion_at(-1)
-            since = times - chain.clusters[-1].seconds
-            expected = place + since[:, None] * velocity
-            apart = np.linalg.norm(np.stack([cluster.place for cluster in found]) - expected, axis=1)
-            gate = GATE + since * (MAX_SPEED if len(chain.clusters) == 1 else GATE_SPEED)
-            costs[row] = np.where(apart <= gate, apart / gate, np.inf)
-        taken: list[Chain | None] = [None] * len(found)
-        if open_:
-            rows, columns = linear_sum_assignment(np.where(np.isfinite(costs), costs, 1e3))
-            for row, column in zip(rows, columns, strict=True):
-                if np.isfinite(costs[row, column]):
-                    taken[column] = open_[row]
-        for cluster, chain in zip(found, taken, strict=True):
-            if chain is None:
-                open_.append(Chain([cluster]))
-            else:
-                chain.clusters.append(cluster)
-    return closed + open_

@@ -1,7 +1,7 @@
 """Moving objects of a drive from its LiDAR scans: evidence, clusters, chains, boxes."""
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from jaxtyping import Bool
@@ -9,16 +9,21 @@ from scipy.spatial import cKDTree
 
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.lidar.objects.boxes import Discovered, fitted_box
-from drivesplat.lidar.objects.clusters import Chain, chains_of, clusters_of
+from drivesplat.lidar.objects.chains import chains_of
+from drivesplat.lidar.objects.clusters import Chain, Cluster, clusters_of
 from drivesplat.lidar.objects.ends import Ends
 from drivesplat.lidar.objects.merging import after_gaps, of_parts, united
+from drivesplat.lidar.objects.registration import least_misfit, misfit_along
 from drivesplat.lidar.objects.seen_empty import seen_empty
 from drivesplat.lidar.objects.separation import separated
+from drivesplat.lidar.objects.standing import StandingMap
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
 
-MIN_SCANS, MIN_SECONDS, MIN_WAY = 3, 0.4, 1.0
-"""Scans, seconds and metres of a chain that is an object."""
+MIN_SCANS, MIN_SECONDS, MIN_WAY = 4, 0.4, 1.0
+"""Scans, seconds and metres of a chain that is an object: chance makes chains of three clusters."""
+PART_SCANS = 3
+"""Scans of a chain that is a part of an object."""
 MIN_FILL = 0.35
 """Fraction of the scans between its first and its last one in which it was found."""
 MIN_TYPICAL = 4.0
@@ -29,6 +34,13 @@ SAME_VELOCITY, SAME_SHARE = 2.5, 0.5
 """Metres per second, and fraction of the speed, by which the velocities of parts of one object seem to differ."""
 SLACK = (1.0, 0.3)
 """Metres along and across a vehicle by which the middles of its parts may lie beyond its box."""
+MAX_NEITHER_S, MAX_BOTH_S = 1.0, 0.5
+"""Seconds between the end of one box and the begin of another one of the same object, and for which both may be."""
+SETTLED_S = 0.5
+"""Seconds from its ends within which the velocity of a path is uncertain."""
+MEET, MEET_SPEED = 0.7, 1.0
+"""Metres, and metres per second of the time between, by which the two may be apart then; half of the length and
+of the width of a vehicle more, of which each may show another part."""
 NEARLY_ALWAYS, FEW = 0.75, 0.1
 """Fractions of their common time, and of the returns of the larger one."""
 MAX_CLEARANCE = 0.8
@@ -38,6 +50,15 @@ MIN_MOVING = 0.4
 """Fraction of the returns in the place of an object that move."""
 BESIDE, KERB = 0.2, 0.3
 """Metres around a cluster, and above the ground, where returns are counted for it."""
+MAX_BLOCKED = 0.05
+"""Fraction of its way on which an object may pass through what stands: paths are off by some decimetres in places."""
+MISFIT_LINK, MISFIT = 0.3, 0.15
+"""Metres between the surfaces that an object shows in two scans: at most, beside the distance of neighbouring beams,
+and for half of them, beside half of that distance and what UNKNOWN_ACCELERATION (metres per second squared), which
+smooth paths miss, adds from scan to scan."""
+UNKNOWN_ACCELERATION = 2.0
+MAX_ACCELERATION = 5.0
+"""Metres per second squared, for half of the time, of an object: brisk braking, or a turn taken at speed."""
 MAX_SEPARATIONS = 8
 """Rounds in which boxes and the returns that belong to them are found by turns."""
 Boxed = tuple[Chain, Discovered]
@@ -49,23 +70,27 @@ GROUND_SCANS = 100
 """Number of scans, evenly spaced, that are enough for that map."""
 
 
-def discovered(scans: Sequence[RecordedScan]) -> list[Discovered]:
+def discovered(scans: Sequence[RecordedScan], threads: int = 1) -> list[Discovered]:
     """The moving objects in the scans of one LiDAR, which are in order of time, in the order in which they appear."""
-    moving = seen_empty(scans)
+    moving = seen_empty(scans, threads)
     clusters = [clusters_of(scan, k, own) for k, (scan, own) in enumerate(zip(scans, moving, strict=True))]
     around = Surroundings(scans, moving)
-    long = [chain for chain in chains_of(clusters) if len(chain.clusters) >= MIN_SCANS]
-    whole = after_gaps(of_parts(long))
+    standing = StandingMap(scans, moving, around.ground)
+    chains = [part for chain in chains_of(clusters) for part in around.parts(chain, standing)]
+    long = [chain for chain in chains if len(chain.clusters) >= PART_SCANS]
+    whole = after_gaps(of_parts(long), standing.blocked_link)
     boxes = [around.boxed(chain) for chain in whole if is_object(chain) and around.confirm(chain)]
+    boxes = [boxed for boxed in boxes if around.is_possible(boxed, standing)]
     boxes = _without_overlaps(boxes, around)
     for _ in range(MAX_SEPARATIONS if boxes else 0):  # boxes and the returns that belong to each, until these stay
         before = [_counts(chain) for chain, _ in boxes]
-        chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= MIN_SCANS]
+        chains = [chain for chain in separated(*zip(*boxes, strict=True)) if len(chain.clusters) >= PART_SCANS]
         if [_counts(chain) for chain in chains] == before:
             break
         boxes = [around.boxed(chain) for chain in chains]
     ends = Ends(scans)
-    return sorted((ends.followed(item) for _, item in _without_overlaps(boxes, around)), key=lambda it: it.seconds[0])
+    found = [boxed for boxed in _without_overlaps(boxes, around) if around.is_possible(boxed, standing)]
+    return sorted((ends.followed(item) for _, item in found), key=lambda it: it.seconds[0])
 
 
 def _counts(chain: Chain) -> list[tuple[int, int]]:
@@ -73,14 +98,39 @@ def _counts(chain: Chain) -> list[tuple[int, int]]:
 
 
 def _without_overlaps(boxes: Sequence[Boxed], around: "Surroundings") -> Sequence[Boxed]:
-    """Chains with their boxes, those whose boxes overlap while both move as one object."""
+    """Chains with their boxes, joined where two are of one object."""
     while True:
-        pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if overlap(boxes[i][1], boxes[j][1]))
+        pairs = ((i, j) for i, j in combinations(range(len(boxes)), 2) if are_one(boxes[i][1], boxes[j][1]))
         pair = next(pairs, None)
         if pair is None:
             return boxes
         whole = united(*(boxes[k][0] for k in pair))
         boxes = [it for k, it in enumerate(boxes) if k not in pair] + [around.boxed(whole)]
+
+
+def are_one(a: Discovered, b: Discovered) -> bool:
+    """Whether two boxes are of one object, at the same time or one after the other."""
+    return overlap(a, b) or continues(a, b) or continues(b, a)
+
+
+def continues(a: Discovered, b: Discovered) -> bool:
+    """Whether a box goes on as another one, of similar kind, that began about when it ended: half-way between, both are
+    at one place, and SETTLED_S before and after, their velocities are alike."""
+    gap = float(b.seconds[0] - a.seconds[-1])
+    if not -MAX_BOTH_S <= gap <= MAX_NEITHER_S or b.seconds[-1] <= a.seconds[-1] or b.seconds[0] <= a.seconds[0]:
+        return False
+    if a.object_class.is_human != b.object_class.is_human:
+        return False
+    between = np.array([0.5 * (a.seconds[-1] + b.seconds[0])])
+    apart = b.path.places(between)[0] - a.path.places(between)[0]
+    before, after = a.path.velocities(between - SETTLED_S)[0], b.path.velocities(between + SETTLED_S)[0]
+    speed = max(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
+    way = (before + after) / max(float(np.linalg.norm(before + after)), 1e-6)
+    along, across = abs(float(apart @ way)), abs(float(apart[0] * way[1] - apart[1] * way[0]))
+    reach = MEET + MEET_SPEED * max(gap, 0.0)
+    alike = float(np.linalg.norm(before - after)) <= max(SAME_VELOCITY, SAME_SHARE * speed)
+    length, width = np.zeros(2) if a.object_class.is_human else 0.25 * (a.size + b.size)[:2]
+    return bool(alike and across <= reach + width and along <= reach + length)
 
 
 def overlap(a: Discovered, b: Discovered) -> bool:
@@ -138,7 +188,7 @@ class Surroundings:
         self._scans, self._moving = scans, moving
         elevations = np.sort(scans[0].scan.rays.beam_elevations)
         self._spacing = float(np.median(np.diff(elevations))) if len(elevations) > 1 else 0.0
-        self._ground = ground_of(scans, moving)
+        self.ground = ground_of(scans, moving).height
         # Nearer returns are not measured, as they are of the ego vehicle.
         self._blind = max(float(s.scan.ranges[s.scan.returned & ~s.measured].max(initial=0.0)) for s in scans)
         self._standing: dict[int, tuple[cKDTree, np.ndarray]] = {}
@@ -146,7 +196,7 @@ class Surroundings:
     def boxed(self, chain: Chain) -> Boxed:
         """A chain with its box, on the ground: where its height is unknown, between known ones, or on the height of the
         lowest returns."""
-        heights = np.array([self._ground.height(cluster.place) for cluster in chain.clusters])
+        heights = np.array([self.ground(cluster.place) for cluster in chain.clusters])
         known = np.isfinite(heights)
         if known.any():
             grounds = np.interp(chain.seconds, chain.seconds[known], heights[known])
@@ -157,16 +207,14 @@ class Surroundings:
     def confirm(self, chain: Chain) -> bool:
         """Whether a chain mostly reaches down to the ground, as leaves and signs do not, and most returns in its place
         move, as those of standing objects do not."""
-        clearances = np.array([cluster.lowest - self._ground.height(cluster.place) for cluster in chain.clusters])
-        beams_apart = [
-            self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2])) for cluster in chain.clusters
-        ]
+        clearances = np.array([cluster.lowest - self.ground(cluster.place) for cluster in chain.clusters])
+        beams_apart = [self._beams_apart(cluster) for cluster in chain.clusters]
         excess = clearances - [max(MAX_CLEARANCE, KERB + 2 * apart) for apart in beams_apart]
         if not np.isfinite(excess).any() or np.nanmedian(excess) >= 0.0:
             return False
         moving_shares = []  # of the returns in a cluster's extents, above the ground where it is known
         for cluster in chain.clusters:
-            ground = self._ground.height(cluster.place)
+            ground = self.ground(cluster.place)
             floor = min(ground, cluster.lowest) + KERB if np.isfinite(ground) else -np.inf
             tree, heights = self._of_scan(cluster.scan)
             low, high = cluster.points.min(axis=0) - BESIDE, cluster.points.max(axis=0) + BESIDE
@@ -178,6 +226,35 @@ class Surroundings:
             own = int((cluster.points[:, 2] > floor).sum())
             moving_shares.append(own / max(own + standing, 1))
         return bool(np.median(moving_shares) > MIN_MOVING)
+
+    def parts(self, chain: Chain, standing: StandingMap) -> list[Chain]:
+        """The parts of a chain between which it would pass through what stands, or whose surfaces differ."""
+        parts = [Chain([chain.clusters[0]])]
+        for before, after in pairwise(chain.clusters):
+            allowed = MISFIT_LINK + self._beams_apart(after)
+            if standing.blocked_link(before, after) or least_misfit(before, after) > allowed:
+                parts.append(Chain())
+            parts[-1].clusters.append(after)
+        return parts
+
+    def is_possible(self, boxed: Boxed, standing: StandingMap) -> bool:
+        """Whether an object can move as a box does: it passes through nothing that stands, its surface moves with the
+        box, and no vehicle or person speeds up and turns so much."""
+        chain, item = boxed
+        seconds = np.linspace(item.seconds[0], item.seconds[-1], 4 * len(item.seconds))
+        acceleration = float(np.median(np.linalg.norm(item.path.accelerations(seconds), axis=1)))
+        apart = float(np.median([self._beams_apart(cluster) for cluster in chain.clusters]))
+        unknown = 0.5 * UNKNOWN_ACCELERATION * float(np.median(np.diff(chain.seconds))) ** 2
+        allowed = MISFIT + 0.5 * apart + unknown
+        return (
+            acceleration <= MAX_ACCELERATION
+            and misfit_along(chain, item) <= allowed
+            and standing.blocked_share(item) <= MAX_BLOCKED
+        )
+
+    def _beams_apart(self, cluster: Cluster) -> float:
+        """Metres between neighbouring beams at the distance of a cluster."""
+        return self._spacing * float(np.linalg.norm(cluster.place - cluster.origin[:2]))
 
     def _of_scan(self, number: int) -> tuple[cKDTree, np.ndarray]:
         """The places of the returns of a scan that do not move, and their heights."""

@@ -1,8 +1,10 @@
 """Chains that belong to one object: one after the other, where it was hidden, or side by side, where it fell apart."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from drivesplat.lidar.objects.clusters import Chain, Cluster
 
@@ -10,8 +12,8 @@ MAX_HIDDEN_S, MAX_COMMON_S = 2.5, 0.3
 """Seconds for which an object may be hidden, and by which two chains of it may overlap."""
 HIDDEN_APART, HIDDEN_APART_SPEED = 1.2, 1.0
 """Metres, and metres per second of the gap, by which it may reappear elsewhere than expected."""
-SAME_VELOCITY = 4.0
-"""Metres per second by which the velocities before and after a gap may differ."""
+SAME_VELOCITY, SAME_SHARE = 1.5, 0.5
+"""Metres per second, and fraction of the speed, by which the velocities before and after a gap may differ."""
 MAX_LENGTH, MAX_ASIDE = 6.0, 1.2
 """Metres along and across the way between the middles of two parts of one object."""
 RIGID = 0.35
@@ -21,32 +23,60 @@ MIN_SPEED = 2.5
 """Metres per second of objects that may fall apart: people who walk together are not one body."""
 
 
-def after_gaps(chains: Sequence[Chain]) -> list[Chain]:
-    """Joins chains that go on where others ended, the best matches first."""
+def after_gaps(chains: Sequence[Chain], blocked: Callable[[Cluster, Cluster], bool] | None = None) -> list[Chain]:
+    """Joins chains that go on where others ended, the best matches first, unless the way from the last cluster of one
+    to the first of the other is `blocked`."""
     left = list(chains)
-    while True:
-        best, pair = 1.0, None
-        for i, before in enumerate(left):
-            for j, after in enumerate(left):
-                cost = _gap_cost(before, after) if i != j else 1.0
-                if cost < best:
-                    best, pair = cost, (i, j)
-        if pair is None:
-            return left
-        joined = united(left[pair[0]], left[pair[1]])
-        left = [chain for k, chain in enumerate(left) if k not in pair] + [joined]
+    if not left:
+        return left
+    ends = [_Ends.of(chain) for chain in left]
+    costs = _gap_costs(ends)
+    while len(left) > 1:
+        i, j = (int(k) for k in np.unravel_index(costs.argmin(), costs.shape))
+        if costs[i, j] >= 1.0:
+            break
+        if blocked is not None and blocked(left[i].clusters[-1], left[j].clusters[0]):
+            costs[i, j] = np.inf
+            continue
+        left[i] = united(left[i], left[j])
+        ends[i] = _Ends.of(left[i])
+        left, ends = left[:j] + left[j + 1 :], ends[:j] + ends[j + 1 :]
+        costs = _gap_costs(ends)
+    return left
 
 
-def _gap_cost(before: Chain, after: Chain) -> float:
-    """The deviation of `after` from where `before` would be, relative to what is allowed; 1 and more: not joined."""
-    gap = after.clusters[0].seconds - before.clusters[-1].seconds
-    if not -MAX_COMMON_S < gap <= MAX_HIDDEN_S or min(len(before.clusters), len(after.clusters)) < 2:
-        return 1.0
-    (end, leaving), (begin, arriving) = before.motion_at(-1), after.motion_at(0)
-    if np.linalg.norm(leaving - arriving) > SAME_VELOCITY:
-        return 1.0
-    expected = end + 0.5 * gap * (leaving + arriving)
-    return float(np.linalg.norm(begin - expected) / (HIDDEN_APART + HIDDEN_APART_SPEED * max(gap, 0.0)))
+class _Ends(NamedTuple):
+    """The first and the last time of a chain (seconds), its places (metres) and velocities (m/s) then, and the number
+    of its clusters."""
+
+    first: float
+    last: float
+    begin: np.ndarray
+    arriving: np.ndarray
+    end: np.ndarray
+    leaving: np.ndarray
+    count: int
+
+    @classmethod
+    def of(cls, chain: Chain) -> "_Ends":
+        seconds = (chain.clusters[0].seconds, chain.clusters[-1].seconds)
+        return cls(*seconds, *chain.motion_at(0), *chain.motion_at(-1), len(chain.clusters))
+
+
+def _gap_costs(ends: Sequence[_Ends]) -> Float[np.ndarray, "n n"]:
+    """The deviation of each chain (column) from where another one (row) would be, relative to what is allowed; 1 and
+    more: not joined."""
+    first, last, begin, arriving, end, leaving, count = (np.array(column) for column in zip(*ends, strict=True))
+    gaps = first[None, :] - last[:, None]
+    changes = np.linalg.norm(leaving[:, None] - arriving[None, :], axis=2)
+    speeds = np.maximum(np.linalg.norm(leaving, axis=1)[:, None], np.linalg.norm(arriving, axis=1)[None, :])
+    alike = SAME_VELOCITY + SAME_SHARE * speeds
+    expected = end[:, None] + 0.5 * gaps[..., None] * (leaving[:, None] + arriving[None, :])
+    apart = np.linalg.norm(begin[None, :] - expected, axis=2)
+    allowed = (gaps > -MAX_COMMON_S) & (gaps <= MAX_HIDDEN_S) & (changes <= alike)
+    allowed &= np.minimum(count[:, None], count[None, :]) >= 2
+    np.fill_diagonal(allowed, False)
+    return np.where(allowed, apart / (HIDDEN_APART + HIDDEN_APART_SPEED * np.maximum(gaps, 0.0)), np.inf)
 
 
 def of_parts(chains: Sequence[Chain]) -> list[Chain]:

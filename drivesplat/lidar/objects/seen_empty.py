@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Int8
 from scipy.spatial.transform import Rotation
 
+from drivesplat.io.prefetch import prefetch
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scan_record import RecordedScan
 
@@ -28,8 +29,6 @@ AT, AT_SHARE = 0.3, 0.01
 """Metres, and fraction of the range, within which a ray ends at a place."""
 MIN_KNOWN = 4
 """Of the six rays around a place, those that have to return if it is empty."""
-STEPS = 2
-"""Iterations to find the time at which a spinning sensor looks at a place."""
 
 
 @dataclass(frozen=True)
@@ -67,52 +66,85 @@ class RangeGrid:
     @cached_property
     def _turns(self) -> Float[np.ndarray, "a 3 3"]:
         """The rotation from the sensor at its timestamp to the sensor at the time of each column."""
-        return Rotation.from_rotvec(-self.offsets_s[:, None] * self.scan.angular).as_matrix()
+        return Rotation.from_rotvec(-self.offsets_s[:, None] * self.scan.angular).as_matrix().astype(np.float32)
+
+    @cached_property
+    def _ways(self) -> Float[np.ndarray, "a 3"]:
+        """The way in metres of the sensor from its timestamp to the time of each column."""
+        return (self.offsets_s[:, None] * self.scan.linear).astype(np.float32)
 
     def _columns(self, azimuths: np.ndarray) -> np.ndarray:
         count = self.scan.scan.rays.shape[1]
         return np.floor((azimuths + np.pi) * (count / (2.0 * np.pi))).astype(np.int64) % count
 
-    def seen(self, points: Float[np.ndarray, "n 3"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Whether this scan saw each place in the world (metres) empty, and whether it saw it occupied."""
-        at_timestamp = places = apply(inverse(self.scan.sensor_to_world), points)
-        for _ in range(STEPS):  # in the sensor's frame at the time when it looks at them
-            columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
-            moved = at_timestamp - self.offsets_s[columns][:, None] * self.scan.linear
-            places = np.einsum("nij,nj->ni", self._turns[columns], moved)
+    @cached_property
+    def _around(self) -> tuple[Float[np.ndarray, "b a"], Int8[np.ndarray, "b a"]]:
+        """The least range of the six rays around places between each beam and the one below it, in each column, and how
+        many of them return."""
+        below = np.stack([self.ranges[:-1], self.ranges[1:]])
+        six = np.stack([np.roll(below, step, axis=2) for step in (-1, 0, 1)]).reshape(6, *below.shape[1:])
+        least, known = np.full(self.ranges.shape, np.inf, np.float32), np.zeros(self.ranges.shape, np.int8)
+        least[1:], known[1:] = np.fmin.reduce(six, axis=0), np.isfinite(six).sum(axis=0)
+        return least, known
+
+    def empty(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether this scan saw each place in the world (metres) empty."""
+        above, columns, ranges, in_view = self._looks(points)
+        least, known = (values[above, columns] for values in self._around)
+        return in_view & (known >= MIN_KNOWN) & (least > ranges * (1.0 + BEYOND_SHARE) + BEYOND)
+
+    def occupied(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether this scan saw each place in the world (metres) occupied."""
+        above, columns, ranges, in_view = self._looks(points)
+        near, count = np.zeros(len(points), dtype=bool), self.ranges.shape[1]
+        for beam in (-1, 0):
+            for step in (-1, 0, 1):
+                around = self.ranges[above + beam, (columns + step) % count]
+                near |= np.abs(around - ranges) < AT + AT_SHARE * ranges  # False for NaN
+        return in_view & near
+
+    def _looks(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """The beam above each place in the world (metres), the column that looks at it, its range, and whether it lies
+        between the lowest and the highest beam."""
+        places = apply(inverse(self.scan.sensor_to_world), points).astype(np.float32)
+        # In the sensor's frame at the time when it looks at them; the sensor moves by millimetres in the time by which
+        # the azimuths at the timestamp are off.
+        columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
+        moved = places - self._ways[columns]
+        places = np.einsum("nij,nj->ni", self._turns[columns], moved)
         columns = self._columns(np.arctan2(places[:, 1], places[:, 0]))
         ranges = np.maximum(np.linalg.norm(places, axis=1), 1e-6)
         elevations = np.arcsin(np.clip(places[:, 2] / ranges, -1.0, 1.0))
         above = np.searchsorted(self.elevations, elevations)
-        in_view = (above > 0) & (above < len(self.elevations))
-        above = np.clip(above, 1, len(self.elevations) - 1)
-        count = self.ranges.shape[1]
-        limit, tolerance = ranges * (1.0 + BEYOND_SHARE) + BEYOND, AT + AT_SHARE * ranges
-        known, near = np.zeros(len(points), dtype=np.int8), np.zeros(len(points), dtype=bool)
-        beyond = in_view & np.isfinite(ranges)
-        for beam in (-1, 0):
-            for step in (-1, 0, 1):
-                around = self.ranges[above + beam, (columns + step) % count]
-                known += np.isfinite(around)
-                beyond &= ~(around <= limit)  # True for NaN
-                near |= np.abs(around - ranges) < tolerance  # False for NaN
-        return beyond & (known >= MIN_KNOWN), in_view & near
+        in_view = (above > 0) & (above < len(self.elevations)) & np.isfinite(ranges)
+        return np.clip(above, 1, len(self.elevations) - 1), columns, ranges, in_view
 
 
-def seen_empty(scans: Sequence[RecordedScan]) -> list[Bool[np.ndarray, " n"]]:
+def seen_empty(scans: Sequence[RecordedScan], threads: int = 1) -> list[Bool[np.ndarray, " n"]]:
     """For each of the scans of one LiDAR, in order of time, which of its measured returns (`RecordedScan.points`) lie
     in space that other scans prove empty."""
     images = [RangeGrid(scan) for scan in scans]
     seconds = np.array([scan.seconds for scan in scans])
-    found = []
-    for number, scan in enumerate(scans):
-        points = scan.points()
-        empty, occupied = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
-        for other in asked(seconds, number):
-            was_empty, was_occupied = images[other].seen(points)
-            empty += was_empty
-            occupied += was_occupied
-        found.append((empty >= MIN_EMPTY) & (empty > occupied))
+
+    def of_scan(number: int) -> Bool[np.ndarray, " n"]:
+        return _seen_empty_by(scans[number].points(), [images[other] for other in asked(seconds, number)])
+
+    return list(prefetch(of_scan, range(len(scans)), threads))
+
+
+def _seen_empty_by(points: Float[np.ndarray, "n 3"], images: Sequence[RangeGrid]) -> Bool[np.ndarray, " n"]:
+    """Whether at least MIN_EMPTY scans see each place in the world (metres) empty, and more than see it occupied. Most
+    places are never seen empty: those that the scans left cannot prove empty any more are not looked at again."""
+    rows, empty = np.arange(len(points)), np.zeros(len(points), dtype=np.int64)
+    for left, image in zip(range(len(images) - 1, -1, -1), images, strict=True):
+        empty = empty + image.empty(points[rows])
+        possible = empty + left >= MIN_EMPTY
+        rows, empty = rows[possible], empty[possible]
+    occupied = sum((image.occupied(points[rows]).astype(np.int64) for image in images), np.zeros(len(rows), np.int64))
+    found = np.zeros(len(points), dtype=bool)
+    found[rows] = (empty >= MIN_EMPTY) & (empty > occupied)
     return found
 
 

@@ -38,6 +38,10 @@ class SmoothPath:
         """Metres per second."""
         return self.spline.derivative()(np.clip(seconds, self.first, self.last))
 
+    def accelerations(self, seconds: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+        """Metres per second squared."""
+        return self.spline.derivative(2)(np.clip(seconds, self.first, self.last))
+
 
 def smooth_path(
     seconds: Float[np.ndarray, " k"], places: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, "k 2"]

@@ -21,13 +21,15 @@ NEAR_ENDS_S = 0.15
 """Seconds before an object was first seen, and after it was last seen, for which its motion is known well enough."""
 
 
-def discovered_tracks(scene: Scene, records: ScanRecords, settings: DiscoverSettings) -> DiscoveredTracks:
+def discovered_tracks(
+    scene: Scene, records: ScanRecords, settings: DiscoverSettings, threads: int = 1
+) -> DiscoveredTracks:
     """The moving objects of a scene by the scans of one LiDAR, without provenance, compared with annotated ones if any
     are known. Raises DatasetError where the scene has no scan, or none of the LiDAR that the settings name."""
     lidar, scans = searched(scene, records, settings.lidar)
     if len(scans) < 2:
         log.warning("LiDAR %s has a single scan: nothing shows which objects move", lidar)
-    tracks = tuple(tracks_of(scene, discovered(scans))) if len(scans) > 1 else ()
+    tracks = tuple(tracks_of(scene, discovered(scans, threads))) if len(scans) > 1 else ()
     log.info("%d moving objects in %d scans of LiDAR %s", len(tracks), len(scans), lidar)
     quality = tracks_quality(scene, tracks, scans, records.tracks) if scene.tracks else None
     return DiscoveredTracks(lidar, len(scans), tracks, quality)
