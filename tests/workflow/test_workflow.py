@@ -77,7 +77,9 @@ def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
 
 def test_what_a_training_leaves_behind(finished):
     folder = finished.folder / "results/0001/vanilla"
-    trained = {"checkpoint.npz", "train.json", "eval.json", "tensorboard", ".digests"} | set(HELD_OUT_PAIR.values())
+    trained = {"checkpoint.npz", "train.json", "eval.json", "eval_objects.json", "tensorboard", ".digests"} | set(
+        HELD_OUT_PAIR.values()
+    )
     films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
     looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
     exports = {"cameras.json", "transforms.json", "parts", "scene.usdz", "viewer.html", "colmap", "far.npz"}
