@@ -3,7 +3,7 @@
 import numpy as np
 from helpers.street_scans import Mover, street_scans
 
-from drivesplat.lidar.objects.boxes import Discovered, fitted_box
+from drivesplat.lidar.objects.boxes import Discovered, _center, fitted_box
 from drivesplat.lidar.objects.clusters import Chain, Cluster
 from drivesplat.scene.scan_record import RecordedScan
 
@@ -27,6 +27,15 @@ def chain_of(scans: list[RecordedScan], nearest: float = 0.0) -> Chain:
 def boxed(mover: Mover, speed: float, nearest: float = 0.0) -> Discovered:
     chain = chain_of(street_scans([mover], SECONDS, speed), nearest)
     return fitted_box(chain, np.zeros(len(chain.clusters)), nearest)
+
+
+def test_returns_of_the_front_place_a_car_that_drives_towards_the_sensor_along_y():
+    """The sides nearer to the sensor are seen: in the frame of the box (forward, left), not in that of the world."""
+    points = np.array([[x, y, 1.0] for x in (-0.9, 0.9) for y in (21.5, 22.0)])
+    cluster = Cluster(0, 0.0, points, np.array([0.0, 40.0, 1.8]))
+    frame = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    center, _ = _center(cluster, frame, np.array([[21.5, 22.0], [-0.9, 0.9]]), np.array([4.5, 1.8]), 0.0)
+    np.testing.assert_allclose(center, [22.0 - 2.25, 0.0], atol=1e-9)
 
 
 def test_a_car_whose_front_is_mostly_unseen_is_placed_by_its_back():
