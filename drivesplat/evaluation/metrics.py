@@ -64,7 +64,7 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     covariance = _windowed(x * y) - mean_x * mean_y
     mean_x, mean_y = mean_x + 0.5, mean_y + 0.5
     luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
-    return _channel_mean(luminance * (2.0 * covariance + C2) / (var_x + var_y + C2))
+    return channel_mean(luminance * (2.0 * covariance + C2) / (var_x + var_y + C2))
 
 
 def _windowed(values: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def _windowed(values: np.ndarray) -> np.ndarray:
     return cv2.sepFilter2D(values, -1, taps, taps, borderType=cv2.BORDER_REFLECT)
 
 
-def _channel_mean(values: np.ndarray) -> np.ndarray:
+def channel_mean(values: np.ndarray) -> np.ndarray:
     """The mean (h, w) of three channels (h, w, 3): numpy's, which takes ten times as long for an axis this short."""
     return (values[..., 0] + values[..., 1] + values[..., 2]) / 3
 
@@ -128,7 +128,7 @@ class RegionMetrics:
             )
         image, truth = image.clip(0.0, 1.0).astype(np.float64), truth.astype(np.float64)
         corrected = color_corrected(image, truth, masks.get("all", np.ones(image.shape[:2], dtype=bool)))
-        errors = [_channel_mean((values - truth) ** 2) for values in (image, corrected)]
+        errors = [channel_mean((values - truth) ** 2) for values in (image, corrected)]
         maps = [*errors, ssim_map(image, truth)]
         if self._lpips_map:
             maps.append(self._lpips_map(image, truth))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.evaluation.metrics import MIN_FRAME_PIXELS, psnr
+from drivesplat.evaluation.metrics import MIN_FRAME_PIXELS, channel_mean, psnr
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import LABELS, labelled_hulls
 from drivesplat.scene.tracks import Box
@@ -32,7 +32,7 @@ def object_errors(
     dynamic classes that count in regions. Pixels of the ego vehicle in `labels` (h, w) belong to none."""
     hulls, owners, names = labelled_hulls(recording.scene, recording.frame(index), recording.size(index))
     owned = np.where(labels == LABELS["own_car"], -1, owners).ravel()
-    errors = ((image.clip(0.0, 1.0) - truth) ** 2).mean(axis=2).ravel()
+    errors = channel_mean((image.clip(0.0, 1.0) - truth) ** 2).ravel()
     pixels = np.bincount(owned[owned >= 0], minlength=len(hulls))
     sums = np.bincount(owned[owned >= 0], weights=errors[owned >= 0], minlength=len(hulls))
     counted = [i for i, name in enumerate(names) if name != "left_out" and pixels[i]]

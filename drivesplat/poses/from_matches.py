@@ -15,7 +15,7 @@ from jaxtyping import Float
 from drivesplat.poses.features import later_images, match_pairs
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics
-from drivesplat.scene.rigid import inverse
+from drivesplat.scene.rigid import cross_matrix, inverse
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 
@@ -90,7 +90,5 @@ def _pixels(features: pycolmap.Database, number: int) -> np.ndarray:
 def _fundamental(first: Frame, second: Frame) -> np.ndarray:
     """The matrix (3, 3) from pixels of the first image to lines in the second."""
     relative = inverse(second.camera_to_world) @ first.camera_to_world
-    x, y, z = relative[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     own, other = (np.linalg.inv(continuous_intrinsics(frame, (frame.width, frame.height))) for frame in (first, second))
-    return other.T @ cross @ relative[:3, :3] @ own
+    return other.T @ cross_matrix(relative[:3, 3]) @ relative[:3, :3] @ own

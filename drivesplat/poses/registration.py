@@ -15,7 +15,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.surfaces import Surfaces
-from drivesplat.scene.rigid import apply, inverse, path_lengths, rigid
+from drivesplat.scene.rigid import apply, cross_matrix, inverse, path_lengths, rigid
 from drivesplat.settings.refine_poses import PriorSettings
 
 Pair = tuple[int, int]
@@ -160,6 +160,5 @@ def _logarithm(transforms: np.ndarray) -> np.ndarray:
 
 def _adjoint(transform: np.ndarray) -> np.ndarray:
     """The matrix (6, 6) that takes a small step in one frame to the frame that `transform` (4, 4) leads to."""
-    rotation, (x, y, z) = transform[:3, :3], transform[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.block([[rotation, cross @ rotation], [np.zeros((3, 3)), rotation]])
+    rotation = transform[:3, :3]
+    return np.block([[rotation, cross_matrix(transform[:3, 3]) @ rotation], [np.zeros((3, 3)), rotation]])

@@ -33,6 +33,12 @@ def interpolate(start: np.ndarray, end: np.ndarray, fraction: float) -> np.ndarr
     return rigid(rotation, (1.0 - fraction) * start[:3, 3] + fraction * end[:3, 3])
 
 
+def cross_matrix(vector: np.ndarray) -> np.ndarray:
+    """The matrix (3, 3) of the cross product with a vector (3,): cross_matrix(a) @ b is a x b."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def path_lengths(poses: np.ndarray) -> np.ndarray:
     """Metres (n,) from the first of successive poses (n, 4, 4) to each, along the path."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)

@@ -19,6 +19,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from drivesplat.scene.rigid import cross_matrix
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.sensors import Camera
 
@@ -48,9 +49,7 @@ class Shutter:
     @property
     def motion(self) -> np.ndarray:
         """The matrix (3, 4) that maps a resting point (x, y, z, 1) in the camera's axes to its velocity (m/s) there."""
-        x, y, z = self.velocity[3:]
-        turning = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return -np.column_stack([turning, self.velocity[:3]])
+        return -np.column_stack([cross_matrix(self.velocity[3:]), self.velocity[:3]])
 
 
 def readout_of(camera: Camera) -> np.ndarray:
