@@ -181,8 +181,8 @@ class Actors(Part):
         super().__init__(params, float(np.median(np.linalg.norm(sizes, axis=1))), cap, args, device)
         self.reach = torch.from_numpy(0.5 * sizes + 0.1).float().to(device)  # (a, 3) metres: Gaussians lie within
         self.motions, self.states = [actor.motion for actor in actors], {}
-        self.runs = [last + 1 - first for motion in self.motions for first, last in motion.runs]  # annotations each
-        zeros = (torch.zeros(sum(self.runs), *row, device=device) for row in ((3,), ()))
+        self.runs = [torch.tensor(m.times[a : b + 1]).float().to(device) for m in self.motions for a, b in m.runs]
+        zeros = (torch.zeros(sum(map(len, self.runs)), *row, device=device) for row in ((3,), ()))
         self.translation, self.yaw = map(nn.Parameter, zeros)
         self.adam |= {name: Adam([getattr(self, name)], RATES[name]) for name in ("translation", "yaw")}
 
@@ -217,7 +217,8 @@ class Actors(Part):
     def penalty(self) -> Tensor:
         """Corrections shall be small for the expected errors of annotations, and smooth: they hold between images."""
         off = torch.cat([self.translation / 0.1, self.yaw[:, None] / 0.03], dim=1)
-        bend = torch.cat([run[:-2] - 2.0 * run[1:-1] + run[2:] for run in off.split(self.runs)])
+        runs = zip(off.split(list(map(len, self.runs))), self.runs, strict=True)  # with seconds, of nuScenes 0.5 apart
+        bend = torch.cat([(v[:-2] - 2.0 * v[1:-1] + v[2:]) / (t[2:, None] - t[:-2, None]) ** 2 for v, t in runs])
         return sum(0.001 * values.square().sum() / max(1, len(values)) for values in (off, bend))
 
 

@@ -82,6 +82,7 @@ class Actors(Part):
         self.register_buffer("_annotated_actor", self.timeline.actor_of_annotations, persistent=False)
         self.register_buffer("_sizes", torch.ones(len(tracks)), persistent=False)
         self.register_buffer("_neighbours", self.timeline.neighbours, persistent=False)
+        self._bend_scale = self.timeline.bend_scale
 
     @classmethod
     def from_points(
@@ -208,7 +209,8 @@ class Actors(Part):
         tracks = self._settings.tracks
         if not tracks.corrected:
             return {}
-        return track_penalties(self.shared["translation"], self.shared["yaw"], self._neighbours, tracks)
+        corrections = self.shared["translation"], self.shared["yaw"]
+        return track_penalties(*corrections, self._neighbours, self._bend_scale, tracks)
 
     @torch.no_grad()
     def confine(self) -> None:
@@ -252,12 +254,17 @@ def _apart(want: Want) -> tuple[float, ...]:
 
 
 def track_penalties(
-    translation: Float[Tensor, "m 3"], yaw: Float[Tensor, " m"], neighbours: Int[Tensor, "q 3"], settings: TrackSettings
+    translation: Float[Tensor, "m 3"],
+    yaw: Float[Tensor, " m"],
+    neighbours: Int[Tensor, "q 3"],
+    bend_scale: float,
+    settings: TrackSettings,
 ) -> dict[str, Float[Tensor, ""]]:
     """The penalties of learned corrections of tracks: their mean square, and that of their second differences along the
-    tracks, both in units of the expected annotation error. `neighbours` are all triples of consecutive annotations."""
+    tracks, both in units of the expected annotation error. `neighbours` are all triples of consecutive annotations,
+    `bend_scale` is `Timeline.bend_scale`."""
     size, bend = sums_of_squares(translation, yaw, neighbours, settings.sigma_translation, settings.sigma_yaw)
     penalties = {"track_size": settings.l2_weight / max(1, len(yaw)) * size}
     if len(neighbours):
-        penalties["track_bend"] = settings.smoothness_weight / len(neighbours) * bend
+        penalties["track_bend"] = settings.smoothness_weight * bend_scale / len(neighbours) * bend
     return penalties

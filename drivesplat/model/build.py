@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from drivesplat.model.background import Background
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import drifting_seed
-from drivesplat.model.exposure import Exposures
+from drivesplat.model.exposure import Exposures, exposure_nodes
 from drivesplat.model.parameters import require_rows
 from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -23,8 +22,9 @@ from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings
 from drivesplat.trajectories.actor_record import ActorRecord
 
-EXPOSURE_PREFIX = "exposure.first."
-"""Prefix of the initial gains of exposures in a model's state; the camera name follows."""
+FIRST_PREFIX, LEARNED_PREFIX, NODES = "exposure.first.", "exposure.params.", "exposure.nodes"
+"""Of exposures in a model's state: prefixes of initial gains and of what is learned, which the camera name follows, and
+the times of nodes."""
 OBJECTS: dict[str, type[Actors]] = {kind.name: kind for kind in (Actors, Deformable)}
 """The parts that consist of objects, by name."""
 MIN_SEED_POINTS = 4
@@ -35,7 +35,8 @@ MIN_SEED_POINTS = 4
 class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
-    (3,) of every camera in `exposed`, whose exposure is learned, the initial `lidar_logits` of intensity and return
+    (3,) of every camera in `exposed`, whose exposure is learned, the `reference` camera, whose exposure is only learned
+    over time (None: not), the initial `lidar_logits` of intensity and return
     (None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
 
     record: TrainingRecord
@@ -43,6 +44,7 @@ class ModelInit:
     sky_color: np.ndarray
     classes: int = 0
     exposed: dict[str, np.ndarray] = field(default_factory=dict)
+    reference: str | None = None
     lidar_logits: tuple[float, float] | None = None
     scans: int = 0
 
@@ -72,7 +74,7 @@ def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, sett
         [part for part in made if part is not None],
         _sky(sky, settings, init.sky_color),
         settings.antialiased,
-        _exposures(init.exposed, settings),
+        _initial_exposures(init, settings),
         settings.rolling_shutter,
         settings.max_scale,
     )
@@ -95,14 +97,15 @@ def rebuild_model(
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         made.append(_rebuilt(params, definition, settings))
-    exposed = {
-        key.removeprefix(EXPOSURE_PREFIX): gains for key, gains in state.items() if key.startswith(EXPOSURE_PREFIX)
-    }
+    first, learned = (
+        {key.removeprefix(prefix): values for key, values in state.items() if key.startswith(prefix)}
+        for prefix in (FIRST_PREFIX, LEARNED_PREFIX)
+    )
     model = SplatModel(
         made,
         _sky(sky, settings, np.full(3, 0.5)),
         settings.antialiased,
-        _exposures(exposed, settings),
+        Exposures(first, settings.exposure, tuple(learned), state[NODES]) if NODES in state else None,
         settings.rolling_shutter,
         settings.max_scale,
     )
@@ -203,9 +206,14 @@ def random_subset(count: int, limit: int) -> np.ndarray:
     return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
 
 
-def _exposures(first: Mapping[str, Any], settings: TrainSettings) -> Exposures | None:
-    gains = {camera: torch.as_tensor(values).float().clone() for camera, values in first.items()}
-    return Exposures(gains, settings.exposure) if gains else None
+def _initial_exposures(init: ModelInit, settings: TrainSettings) -> Exposures | None:
+    if init.reference is None:
+        return None
+    record = init.record
+    nodes = exposure_nodes([record.seconds(i) for i in record.train_images], settings.exposure.interval)
+    first = {camera: torch.as_tensor(gains).float().clone() for camera, gains in init.exposed.items()}
+    exposures = Exposures(first, settings.exposure, (init.reference,), nodes)
+    return exposures if len(exposures.params) else None
 
 
 def _sky(kind: SkyKind, settings: TrainSettings, color: np.ndarray) -> Sky | None:

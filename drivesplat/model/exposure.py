@@ -1,60 +1,125 @@
-"""Exposure and white balance of each camera of a rig."""
+"""Exposure and white balance of each camera: between the cameras of a rig, and over time."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from drivesplat.model.view import View
 from drivesplat.settings.train_cameras import ExposureSettings
 
 CHANNELS = ("red", "green", "blue")
+CHANGE_RATIO = 2.0
+"""Expected size of log gains over their expected change within a second, a random walk."""
 
 
 class Exposures(nn.Module):
-    """For each listed camera an affine map of every colour channel: c becomes f exp(g) c + o. `first` holds the initial
-    gains f (3,) estimated before the training; `params` what is learned: log gains g (row 0) and offsets o (row 1),
-    (2, 3) a camera, in units of their expected size, initially 0.
+    """An affine map of every colour channel, by camera and time t: c becomes f exp(g + g(t)) c + o.
 
-    Other cameras keep the model's colours: the reference camera, which fixes the brightness of the scene, and cameras
-    without training images.
+    `first` holds the initial gains f (3,) of the cameras with constants, estimated before the training. `params` is
+    what is learned of each camera, (r, 3), in units of its expected size and initially 0: log gain g (row 0) and offset
+    o (row 1), only of these cameras, then the log gains g(t) at the k times `nodes` (seconds). Between nodes g(t) is
+    linear, beyond them constant.
+
+    Cameras without parameters, and views without a camera, keep the model's colours. The reference camera has no
+    constants: it fixes the brightness of the scene.
     """
 
-    def __init__(self, first: Mapping[str, Tensor], settings: ExposureSettings):
+    def __init__(
+        self,
+        first: Mapping[str, Tensor],
+        settings: ExposureSettings,
+        cameras: tuple[str, ...] = (),
+        nodes: Float[Tensor, " k"] | None = None,
+    ):
+        """`cameras` without constants, besides those in `first`."""
         super().__init__()
+        self.register_buffer("nodes", torch.zeros(0) if nodes is None else nodes)
         self.first = nn.ParameterDict(
             {camera: nn.Parameter(gains, requires_grad=False) for camera, gains in first.items()}
         )
-        self.params = nn.ParameterDict({camera: nn.Parameter(torch.zeros(2, 3)) for camera in first})
+        rows = {
+            **dict.fromkeys(first, 2 + len(self.nodes)),
+            **dict.fromkeys(set(cameras) - set(first), len(self.nodes)),
+        }
+        self.params = nn.ParameterDict(
+            {camera: nn.Parameter(torch.zeros(rows[camera], 3)) for camera in sorted(rows) if rows[camera]}
+        )
         self._settings = settings
 
-    def applied(self, image: Float[Tensor, "h w 3"], camera: str | None) -> Float[Tensor, "h w 3"]:
-        """Maps an image from the model's colours to those of `camera`."""
-        if camera not in self.params:
+    def applied(self, image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, "h w 3"]:
+        """Maps an image from the model's colours to those of the view's camera at its time."""
+        if view.camera not in self.params:
             return image
-        gains, offsets = self._map(camera)
+        gains, offsets = self._map(view.camera, view.moment)
         return image * gains + offsets
 
     def penalty(self, camera: str | None) -> Float[Tensor, ""] | None:
-        """The weighted mean square of a camera's parameters; None without parameters or weight."""
+        """The weighted mean square of a camera's constants, that of its log gains over time, and that of their
+        changes; None without parameters or weight."""
         if camera not in self.params or not self._settings.weight:
             return None
-        return self._settings.weight * self.params[camera].square().mean()
+        constants, changing = self._rows(camera)
+        squares = [rows.square().mean() for rows in (constants, changing) if len(rows)]
+        if len(changing) > 1:
+            squares.append((CHANGE_RATIO * changing.diff(dim=0)).square().mean() / (self.nodes[1] - self.nodes[0]))
+        return self._settings.weight * torch.stack(squares).sum()
 
-    def _map(self, camera: str) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Gains and offsets of a camera."""
-        log_gains, offsets = self.params[camera]
-        gains = self.first[camera] * torch.exp(self._settings.sigma_gain * log_gains)
-        return gains, self._settings.sigma_offset * offsets
+    def _rows(self, camera: str) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "k 3"]]:
+        """The parameters of a camera that are constant, and those over time."""
+        own, changing = self.params[camera], len(self.nodes)
+        constant = len(own) - changing
+        return own[:constant], own[constant:]
+
+    def _map(self, camera: str, seconds: Float[Tensor, ""]) -> tuple[Tensor, Tensor | float]:
+        """Gains (3,) and offsets (3,) or 0 of a camera at a time."""
+        constants, changing = self._rows(camera)
+        log_gains, offsets = self._log_gains(changing, seconds), 0.0
+        if len(constants):
+            log_gains, offsets = log_gains + constants[0], self._settings.sigma_offset * constants[1]
+        gains = torch.exp(self._settings.sigma_gain * log_gains)
+        return (gains * self.first[camera] if len(constants) else gains), offsets
+
+    def _log_gains(self, changing: Float[Tensor, "k 3"], seconds: Float[Tensor, ""]) -> Float[Tensor, "3"]:
+        """The log gains over time, in units of their expected size."""
+        if not len(changing):
+            return changing.new_zeros(3)
+        within = torch.minimum(torch.maximum(seconds, self.nodes[0]), self.nodes[-1])
+        weights = 1.0 - (within - self.nodes).abs() / (self.nodes[1] - self.nodes[0])
+        return weights.clamp(min=0.0) @ changing
 
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every camera's entry of `params`."""
         return dict.fromkeys(self.params, self._settings.learning_rate)
 
+    @torch.no_grad()
     def figures(self) -> dict[str, float]:
-        """Every gain and offset by name: 'CAM_BACK/gain_red'. Waits for the device."""
-        if not len(self.params):
-            return {}
-        values = torch.stack([torch.stack(self._map(camera)) for camera in self.params]).detach().reshape(-1).tolist()
-        names = (f"{camera}/{name}_{c}" for camera in self.params for name in ("gain", "offset") for c in CHANNELS)
-        return dict(zip(names, values, strict=True))
+        """By name, constant gains and offsets ('CAM_BACK/gain_red'), and the smallest and the largest factor of any
+        channel over time ('CAM_BACK/factor_least', 'CAM_BACK/factor_largest'). Waits for the device."""
+        figures = {}
+        for camera in self.params:
+            constants, changing = self._rows(camera)
+            if len(constants):
+                gains = self.first[camera] * torch.exp(self._settings.sigma_gain * constants[0])
+                found = zip(("gain", "offset"), (gains, self._settings.sigma_offset * constants[1]), strict=True)
+                figures |= {
+                    f"{camera}/{n}_{c}": v for n, own in found for c, v in zip(CHANNELS, own.tolist(), strict=True)
+                }
+            if len(changing):
+                factors = torch.exp(self._settings.sigma_gain * changing)
+                figures |= {
+                    f"{camera}/factor_least": float(factors.min()),
+                    f"{camera}/factor_largest": float(factors.max()),
+                }
+        return figures
+
+
+def exposure_nodes(seconds: Sequence[float], interval: float | None) -> Float[Tensor, " k"]:
+    """The times of nodes, about `interval` seconds apart, from the first to the last of the training images at
+    `seconds`; none where exposures are constant (None) or the drive is shorter than half an interval."""
+    if interval is None or not len(seconds):
+        return torch.zeros(0)
+    first, last = min(seconds), max(seconds)
+    count = round((last - first) / interval) + 1
+    return torch.linspace(first, last, count) if count > 1 else torch.zeros(0)

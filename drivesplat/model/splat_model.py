@@ -143,7 +143,7 @@ class SplatModel(nn.Module):
         if self.sky is not None:
             image = self.sky.behind(splats, alpha, seen_from)
         if self.exposure is not None:
-            image = self.exposure.applied(image, view.camera)
+            image = self.exposure.applied(image, view)
         depth = None if rendering.depth is None else depth_at_lines(rendering.depth.squeeze((0, 3)), seen_from)
         alone = None if rendering.objects_alpha is None else rendering.objects_alpha.squeeze((0, 3))
         surfaces = rendering.surface_depth

@@ -17,6 +17,10 @@ MAX_CACHED_TIMES = 16384
 20 s, and with a rolling shutter two more for each. A state of 30 actors with 40 annotations each takes 6 kB, the full
 cache 100 MB."""
 
+BEND_STEP = 0.5
+"""Seconds over which second differences of corrections are penalised, the interval of nuScenes' annotations. At other
+rates the penalty scales as a second derivative does, so that corrections are smooth over the same time."""
+
 
 @dataclass(frozen=True)
 class ActorTrack:
@@ -82,6 +86,14 @@ class Timeline:
             for i in range(first + 1, last)
         ]
         return torch.tensor(triples, dtype=torch.long).reshape(-1, 3)
+
+    @property
+    def bend_scale(self) -> float:
+        """What makes squared second differences of corrections independent of the annotation rate: they count as over
+        BEND_STEP seconds. The median over `neighbours`; 1 for annotations at 2 Hz."""
+        times = torch.cat([torch.from_numpy(track.motion.times) for track in self.tracks])[self.neighbours]
+        steps = (times[:, 2] - times[:, 0]) / 2.0
+        return float((BEND_STEP / steps).pow(4).median()) if len(steps) else 1.0
 
     def corrected(self, shifts: Float[np.ndarray, "m 3"], turns: Float[np.ndarray, " m"]) -> list[Motion]:
         """The motion of each track with corrections of its annotations: metres along the world's axes, and radians

@@ -37,8 +37,8 @@ def inverse(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 @dataclass(frozen=True)
 class View:
     """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image. `camera` names the camera
-    of the rig whose exposure applies; None: that of the reference camera, the model's own colours. `shutter` is None
-    for a global shutter; otherwise pose and time are those of the image's timestamp."""
+    of the rig whose exposure applies; None: the model's own colours. `shutter` is None for a global shutter; otherwise
+    pose and time are those of the image's timestamp. `seconds` is `time` on the device, for captured steps."""
 
     K: Float[Tensor, "3 3"]
     camera_to_world: Float[Tensor, "4 4"]
@@ -47,6 +47,12 @@ class View:
     time: float
     camera: str | None = None
     shutter: RollingShutter | None = None
+    seconds: Float[Tensor, ""] | None = None
+
+    @property
+    def moment(self) -> Float[Tensor, ""]:
+        """`time` as a tensor."""
+        return self.K.new_tensor(self.time) if self.seconds is None else self.seconds
 
     @cached_property
     def viewmat(self) -> Float[Tensor, "4 4"]:
@@ -92,6 +98,7 @@ def view_of(record: TrainingRecord, index: int, device: torch.device) -> View:
         time=record.seconds(index),
         camera=record.camera_name(index),
         shutter=_shutter(record.shutter(index), device),
+        seconds=torch.tensor(record.seconds(index), dtype=torch.float32, device=device),
     )
 
 

@@ -7,7 +7,7 @@ half. Colours come from training images that show the actor. Held-out images and
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from drivesplat.scene.splits import training_images
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
 from drivesplat.settings.train import PartName
 from drivesplat.trajectories.actor_record import ActorRecord, ActorRecords
+from drivesplat.trajectories.smoothing import smoothed
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +44,8 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
     for dynamic_object in sorted(dynamic_objects(scene), key=lambda item: item.track.id):
+        if job.actors.smoothed:
+            dynamic_object = replace(dynamic_object, motion=smoothed(dynamic_object.motion))
         parts = job.actors.parts_of(dynamic_object.track.object_class)
         if parts:
             random = np.random.default_rng((job.random_seed, order[dynamic_object.track.id]))

@@ -230,4 +230,4 @@ class TrainJob(Settings):
     train: TrainSettings
     random_seed: int
     reference_camera: str | None = None
-    """The camera whose exposure the model has. None where exposures are not learned."""
+    """The camera that fixes the brightness of the model. None where exposures are not learned."""

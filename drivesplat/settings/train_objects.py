@@ -18,8 +18,8 @@ class TrackSettings(Settings):
     l2_weight: float = Field(0.001, ge=0)
     """Loss weight of the mean square of the corrections, in units of `sigma_translation` and `sigma_yaw`."""
     smoothness_weight: float = Field(0.001, ge=0)
-    """Loss weight of the mean square of their second differences along a track, in the same units. It keeps corrections
-    smooth, so that they hold for the held-out frames in between (docs/street.md)."""
+    """Loss weight of the mean square of their second differences along a track over half a second, in the same units.
+    It keeps corrections smooth, so that they hold for the held-out frames in between (docs/street.md)."""
     sigma_translation: float = Field(0.1, gt=0)
     """Expected error of an annotated position (metres)."""
     sigma_yaw: float = Field(0.03, gt=0)

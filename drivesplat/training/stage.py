@@ -85,7 +85,7 @@ class TrainingInputs:
         return self.classes if job.train.semantic_weight else 0
 
     def exposed(self, job: TrainJob) -> tuple[str, ...]:
-        """The cameras whose exposure `job` learns: all with training images but the reference camera."""
+        """The cameras whose exposure `job` compares with the reference camera: all others with training images."""
         if job.reference_camera is None:
             return ()
         seen = self.record.train_cameras
@@ -179,6 +179,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         mean_sky_color(views),
         inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
+        job.reference_camera,
         initial_lidar_logits(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
     )

@@ -196,7 +196,9 @@ def _training(at: JobScope) -> dict[str, Any]:
         alone = {"per_image": float(train.scans.per_image > 0), "fine_tune": 0.0, "geometry": 1.0}
         scans = train.scans.model_copy(update=alone)
         return {"parts": method.parts, "sky": "none", "train": train.model_copy(update={"scans": scans})}
-    reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
+    exposure = train.exposure
+    compared = exposure.kind != "none" and (len(config.cameras) > 1 or exposure.interval is not None)
+    reference = config.eval_camera if compared else None
     return {"parts": method.parts, "train": train, "reference_camera": reference}
 
 

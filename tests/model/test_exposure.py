@@ -28,7 +28,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
-from drivesplat.model.exposure import Exposures
+from drivesplat.model.exposure import Exposures, exposure_nodes
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.preprocess.lidar_seed import seed_points
@@ -82,19 +82,57 @@ def of(camera: str, views: list[TrainingView]) -> list[TrainingView]:
 
 def test_exposure_applies_to_listed_cameras_and_not_to_the_reference():
     exposures = exposures_of("BACK", settings=AFFINE)
-    image = torch.rand(4, 5, 3)
-    torch.testing.assert_close(exposures.applied(image, "BACK"), image)
+    image, view = torch.rand(4, 5, 3), rig_views()[0].view
+
+    def applied(exposures: Exposures, camera: str | None) -> torch.Tensor:
+        return exposures.applied(image, dataclasses.replace(view, camera=camera))
+
+    torch.testing.assert_close(applied(exposures, "BACK"), image)
     with torch.no_grad():
         exposures.params["BACK"][0], exposures.params["BACK"][1] = GAINS.log() / 0.2, OFFSET / 0.05
-    torch.testing.assert_close(exposures.applied(image, "BACK"), image * GAINS + OFFSET)
+    torch.testing.assert_close(applied(exposures, "BACK"), image * GAINS + OFFSET)
     for camera in ("FRONT", None):
-        assert exposures.applied(image, camera) is image
+        assert applied(exposures, camera) is image
     figures = exposures.figures()
     assert figures["BACK/gain_blue"] == pytest.approx(0.8) and figures["BACK/offset_red"] == pytest.approx(OFFSET)
     assert len(figures) == 6
     found = Exposures({"BACK": GAINS}, AFFINE)
-    torch.testing.assert_close(found.applied(image, "BACK"), image * GAINS)
+    torch.testing.assert_close(applied(found, "BACK"), image * GAINS)
     assert not found.penalty("BACK").any(), "what was found is free"
+
+
+def test_gains_over_time_are_linear_between_nodes_and_constant_beyond():
+    nodes = exposure_nodes([3.0, 1.0, 5.0], 2.0)
+    assert nodes.tolist() == [1.0, 3.0, 5.0]
+    exposures = Exposures({"BACK": GAINS}, AFFINE, ("FRONT",), nodes)
+    assert exposures.params["FRONT"].shape == (3, 3) and exposures.params["BACK"].shape == (5, 3)
+    with torch.no_grad():
+        exposures.params["FRONT"][:, 0] = torch.tensor([2.0, 4.0, 1.0]).log() / AFFINE.sigma_gain
+    image, view = torch.full((1, 1, 3), 0.1), rig_views()[0].view
+    for seconds, gain in ((0.0, 2.0), (1.0, 2.0), (2.0, 8.0**0.5), (3.0, 4.0), (4.0, 2.0), (9.0, 1.0)):
+        for known in (None, torch.tensor(seconds)):
+            seen = dataclasses.replace(view, camera="FRONT", time=seconds, seconds=known)
+            torch.testing.assert_close(exposures.applied(image, seen), image * torch.tensor([gain, 1.0, 1.0]))
+    figures = exposures.figures()
+    assert figures["FRONT/factor_largest"] == pytest.approx(4.0) and figures["FRONT/factor_least"] == 1.0
+    copied = Exposures({"BACK": GAINS}, AFFINE, ("FRONT", "BACK"), nodes)
+    copied.load_state_dict(exposures.state_dict())
+
+
+@pytest.mark.parametrize(("seconds", "interval"), [([1.0, 3.0], None), ([], 1.0), ([1.0], 1.0), ([1.0, 1.4], 1.0)])
+def test_exposures_of_short_drives_are_constant(seconds, interval):
+    assert len(exposure_nodes(seconds, interval)) == 0
+
+
+def test_changes_of_gains_cost_more_than_gains():
+    nodes = torch.tensor([0.0, 0.5, 1.0])
+    exposures = Exposures({}, ExposureSettings(weight=1.0), ("FRONT",), nodes)
+    with torch.no_grad():
+        exposures.params["FRONT"][:] = 0.3
+    assert exposures.penalty("FRONT").item() == pytest.approx(0.09)
+    with torch.no_grad():
+        exposures.params["FRONT"][1] = 0.0
+    assert exposures.penalty("FRONT").item() == pytest.approx(0.06 + (2.0 * 0.3) ** 2 / 0.5)
 
 
 def test_the_penalty_is_the_weighted_mean_square_of_the_rendered_camera():
@@ -303,13 +341,16 @@ def test_all_training_cameras_but_the_reference_have_an_exposure(tmp_path, camer
     [
         (["CAM_FRONT", "CAM_BACK"], "affine", "CAM_BACK"),
         (["CAM_FRONT", "CAM_BACK"], "none", None),
-        (["CAM_BACK"], "affine", None),
+        (["CAM_BACK"], "affine", "CAM_BACK"),
     ],
 )
 def test_the_evaluated_camera_is_the_reference(cameras, kind, expected):
     values = {"cameras": cameras, "eval_camera": "CAM_BACK", "train": {"exposure": {"kind": kind}}}
     job = TrainJob.model_validate_json(stage_settings(load(values), "train", "0061", "vanilla"))
     assert job.reference_camera == expected
+    constant = {**values, "train": {"exposure": {"kind": kind, "interval": None}}}
+    job = TrainJob.model_validate_json(stage_settings(load(constant), "train", "0061", "vanilla"))
+    assert job.reference_camera == (expected if len(cameras) > 1 else None)
 
 
 # ---- the demo world's cameras

@@ -298,7 +298,8 @@ def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
     losses = []
     for replays in (False, True):
         model = untrained_street(settings, people=people)
-        model.exposure = Exposures({"CAM_BACK": torch.full((3,), 0.9)}, settings.exposure) if exposed else None
+        first, nodes = {"CAM_BACK": torch.full((3,), 0.9)}, torch.tensor([0.0, 1.0])
+        model.exposure = Exposures(first, settings.exposure, ("CAM_FRONT",), nodes) if exposed else None
         trainer = Trainer.begin(model, views, settings, 0, torch.device("cpu"))
         captured = replayed(monkeypatch, trainer) if replays else []
         losses.append([])

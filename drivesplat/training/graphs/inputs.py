@@ -69,7 +69,9 @@ class SharedImageInputs:
 
     def _copied(self, image: TrainingView, states: ModelStates) -> ImageInputs:
         """New inputs, with the shape of an image and its states."""
-        view = replace(image.view, K=image.view.K.clone(), camera_to_world=image.view.camera_to_world.clone())
+        seconds = None if image.view.seconds is None else image.view.seconds.clone()
+        K, camera_to_world = image.view.K.clone(), image.view.camera_to_world.clone()
+        view = replace(image.view, K=K, camera_to_world=camera_to_world, seconds=seconds)
         copies = {name: mask.clone() for name, mask in _masks(image).items()}
         lidar = None if image.lidar is None else self._room_for(image.lidar)
         own = replace(image, view=view, pixels=image.pixels.clone(), lidar=lidar, **copies)
@@ -90,7 +92,9 @@ def can_share(image: TrainingView) -> bool:
 
 def _tensors(image: TrainingView, states: ModelStates) -> list[Tensor]:
     """All tensors of an image but LiDAR depth, and those of states, in a fixed order."""
-    return [image.view.K, image.view.camera_to_world, image.pixels, *_masks(image).values(), *tensors_of(states)]
+    view = image.view
+    times = [] if view.seconds is None else [view.seconds]
+    return [view.K, view.camera_to_world, *times, image.pixels, *_masks(image).values(), *tensors_of(states)]
 
 
 def _masks(image: TrainingView) -> dict[str, Tensor]:
