@@ -1,4 +1,4 @@
-"""Matches over longer baselines than a refinement uses, as the judge of corrections where there is no LiDAR.
+"""Matches over longer baselines than a refinement uses, as a judge of corrections.
 
 Their errors depend on poses alone: a match in another image lies on a line that two poses and the feature determine.
 """

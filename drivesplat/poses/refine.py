@@ -65,8 +65,8 @@ def refine_poses(
     judge: SweepJudge | None = None,
 ) -> Refinement:
     """Refines a scene's poses with its images; features on the ego vehicle are ignored. Where these cannot improve the
-    given poses, or `judge` objects (LiDAR; without it matches over longer baselines), logs a warning and keeps the
-    given ones.
+    given poses, or withheld measurements object (LiDAR's `judge`, matches over longer baselines), logs a warning and
+    keeps the given ones. Where LiDAR alone objects, only cameras move.
 
     Raises DatasetError where an image cannot be read or the mount of a camera changes; with `start: images` also where
     images do not determine the poses.
@@ -83,8 +83,8 @@ def refine_poses(
         log.info("scene %s: features are matched", scene.name)
         if job.refine_poses.start == "images":
             return estimate_from_matches(images, start, database, job, threads)
-        checked_by = judge or match_judge(images, job, database, threads)
-        refinement = refine_from_matches(images, start, database, job, threads, checked_by)
+        matches = match_judge(images, job, database, threads)
+        refinement = refine_from_matches(images, start, database, job, threads, judge, matches)
     sentences = lens_warnings(with_tested_images(scene), ego_mask, threads)
     for sentence in sentences:
         log.warning("scene %s: %s", scene.name, sentence)
@@ -97,13 +97,14 @@ def refine_from_matches(
     database: Path,
     job: RefinePosesJob,
     threads: int = 1,
-    judge: SweepJudge | MatchJudge | None = None,
+    sweeps: SweepJudge | None = None,
+    matches: MatchJudge | None = None,
 ) -> Refinement:
     """Refines given poses, with images and features in `start` and matches in `database`. Where refined poses are not
     better than the given ones, these and points that fit them are kept; where they cannot be trusted, no points.
-    `judge` has the last word; where it is LiDAR, the given poses are as accurate as it."""
+    Withheld `sweeps` and `matches` have the last word; with sweeps, the given poses are as accurate as LiDAR."""
     scene, settings = images.scene, job.refine_poses
-    priors = priors_of(images, settings, settings.priors_with_lidar if isinstance(judge, SweepJudge) else None)
+    priors = priors_of(images, settings, settings.priors_with_lidar if sweeps else None)
     rolling = RollingFeatures.of(images, start)
     unadjusted, reconstruction = adjust_in_rounds(start, rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
@@ -112,16 +113,32 @@ def refine_from_matches(
     changes, limits = corrections.at(images.timestamps), job.refine_poses.limits
     flaw = unusable(images, observations, changes, trial, limits)
     refined = scene if flaw else apply_corrections(scene, corrections)
-    judged = None if judge is None or flaw else (judge.distance(scene), judge.distance(refined))
-    reason = flaw or no_gain(trial, limits) or (judge and judged and judge.objection(*judged))
-    if reason is None and not isinstance(judge, SweepJudge):
+    judges = [judge for judge in (sweeps, matches) if judge and not flaw]
+    judged = {judge.name: (judge.distance(scene), judge.distance(refined)) for judge in judges}
+    objections = {judge.name: judge.objection(*judged[judge.name]) for judge in judges}
+    by_lidar = objections.pop(SweepJudge.name, None)
+    reason = flaw or no_gain(trial, limits) or next(filter(None, objections.values()), None)
+    if reason is None and sweeps is None:
         reason = stretched(scene, refined, limits)
+    if reason is None and by_lidar and not objections:  # nothing else that was withheld speaks for the images
+        reason = by_lidar
     record = {**record_header(scene, job, reason), **_record(images, observations, changes, trial)}
-    if judge and judged:
-        record["judged"] = {judge.name: dict(zip(("before", "after"), map(finite, judged), strict=True))}
+    if judged:
+        record["judged"] = {
+            name: {"before": finite(before), "after": finite(after)} for name, (before, after) in judged.items()
+        }
     log.info("scene %s: %s", scene.name, _figures(record))
     if reason is None:
-        log.info("scene %s: the refined poses are taken", scene.name)
+        if by_lidar:
+            log.info(
+                "scene %s: the refined poses are taken for cameras, LiDAR and boxes stay: %s", scene.name, by_lidar
+            )
+            refined, record["cameras_alone_because"] = (
+                replace(scene, frames=refined.frames, poses=refined.poses),
+                by_lidar,
+            )
+        else:
+            log.info("scene %s: the refined poses are taken", scene.name)
         return Refinement(refined, record, triangulated_points(images.indices, observations))
     log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
     points = no_points() if flaw or at_given is None else triangulated_points(images.indices, at_given)
@@ -254,6 +271,7 @@ def _record(
             "after_px": finite(trial.after),
         },
         "judged": None,
+        "cameras_alone_because": None,
         **magnitudes(changes),
         "corrections": [
             {

@@ -22,6 +22,7 @@ MEASURED = (
     "reprojection_px",
     "trial",
     "judged",
+    "cameras_alone_because",
     "shift_m",
     "turn_deg",
     "lens_warnings",

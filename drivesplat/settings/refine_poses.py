@@ -45,13 +45,13 @@ class PriorSettings(Settings):
 class RegisteredPriorSettings(PriorSettings):
     """The same of poses whose LiDAR sweeps were registered to each other."""
 
-    position: float = Field(0.03, gt=0)
+    position: float = Field(0.01, gt=0)
     """Horizontal position (metres)."""
-    height: float = Field(0.03, gt=0)
+    height: float = Field(0.01, gt=0)
     """Height (metres)."""
-    tilt: float = Field(0.003, gt=0)
+    tilt: float = Field(0.001, gt=0)
     """Roll and pitch (radians)."""
-    heading: float = Field(0.002, gt=0)
+    heading: float = Field(0.0007, gt=0)
     """Heading (radians)."""
 
 

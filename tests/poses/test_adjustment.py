@@ -21,11 +21,13 @@ from helpers.hand_made_views import (
 from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.adjustment import Priors, bundle_adjust, observations_of, priors_of, triangulate, with_poses
+from drivesplat.poses.from_matches import MatchJudge
+from drivesplat.poses.from_sweeps import SweepJudge
 from drivesplat.poses.refine import poses_of, refine_from_matches
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages, from_pycolmap, sensor, to_pycolmap
 from drivesplat.scene.rigid import inverse, rigid
-from drivesplat.scene.scene import Scene
+from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.settings.refine_poses import PriorSettings
 
 pytestmark = pytest.mark.usefixtures("quiet")
@@ -244,3 +246,37 @@ def test_images_of_equal_time_get_one_correction(tmp_path):
     assert refined.record["refined"]
     poses = [frame.ego_to_world for frame in refined.scene.frames]
     np.testing.assert_allclose(poses[0::2], poses[1::2], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("by_lidar", "by_matches", "cameras_move", "sweeps_move", "reason"),
+    [
+        (False, False, True, True, None),
+        (True, False, True, False, None),
+        (False, True, False, False, "matches"),
+        (True, True, False, False, "matches"),
+        (True, None, False, False, "surfaces"),
+        (None, False, True, True, None),
+        (None, True, False, False, "matches"),
+    ],
+)
+def test_cameras_move_alone_where_lidar_alone_objects(
+    front, by_lidar, by_matches, cameras_move, sweeps_move, reason, monkeypatch
+):
+    """`by_lidar`, `by_matches`: whether they find refined poses worse; None: there is no such judge."""
+    sweep = Sweep("0.bin", front.drive.scene.frames[3].timestamp, ego_at(0.5), True, 0, "0", "LIDAR_TOP", "nuscenes")
+    scene, judges = dataclasses.replace(front.drive.scene, sweeps=(sweep,)), []
+    images = RigImages.of(scene, front.images.indices)
+    for judge, worse in ((SweepJudge({}, []), by_lidar), (MatchJudge([]), by_matches)):
+        after = 2.0 if worse else 0.5
+        monkeypatch.setattr(type(judge), "distance", lambda _, it, after=after: 1.0 if it is scene else after)
+        judges.append(None if worse is None else judge)
+    job = job_of(priors_with_lidar=PriorSettings().model_dump(), limits={"max_stretch": 0.5})
+    found = refine_from_matches(images, front.start, front.database, job, 1, *judges)
+    for sensors, moves in (("frames", cameras_move), ("sweeps", sweeps_move)):
+        assert (getattr(found.scene, sensors) is getattr(scene, sensors)) != moves, sensors
+    record = found.record
+    assert record["refined"] == cameras_move and found.scene.poses == ("refined" if cameras_move else scene.poses)
+    assert (reason is None) == (record["images_kept_because"] is None) and (reason or "") in str(record["kept_because"])
+    assert ("surfaces" in str(record["cameras_alone_because"])) == (cameras_move and not sweeps_move)
+    assert set(record["judged"]) == {judge.name for judge in judges if judge}
