@@ -1,7 +1,7 @@
 """Building a model from the settings of a method: the only module that knows parts and skies by name."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from drivesplat.model.background import Background
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import drifting_seed
-from drivesplat.model.exposure import Exposures, ExposureStart
+from drivesplat.model.exposure import Exposures, exposure_nodes
 from drivesplat.model.parameters import require_rows
 from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -22,8 +22,9 @@ from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings
 from drivesplat.trajectories.actor_record import ActorRecord
 
-EXPOSURE_PREFIXES = ("exposure.first.", "exposure.found.")
-"""Prefixes of what exposures start from in a model's state; the camera name follows."""
+FIRST_PREFIX, LEARNED_PREFIX, NODES = "exposure.first.", "exposure.params.", "exposure.nodes"
+"""Of exposures in a model's state: prefixes of initial gains and of what is learned, which the camera name follows, and
+the times of nodes."""
 OBJECTS: dict[str, type[Actors]] = {kind.name: kind for kind in (Actors, Deformable)}
 """The parts that consist of objects, by name."""
 MIN_SEED_POINTS = 4
@@ -33,15 +34,18 @@ MIN_SEED_POINTS = 4
 @dataclass(frozen=True)
 class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
-    wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), what `exposures`
-    start from (None: all alike), the initial `lidar_logits` of intensity and return (None: LiDAR is not rendered), and
-    the number of LiDAR `scans` that a training without images fits."""
+    wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
+    (3,) of every camera in `exposed`, whose exposure is learned, the `reference` camera, whose exposure is only learned
+    over time (None: not), the mean `brightness` (0 to 1) of its images, the initial `lidar_logits` of intensity and
+    return (None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
     sky_color: np.ndarray
     classes: int = 0
-    exposures: ExposureStart | None = None
+    exposed: dict[str, np.ndarray] = field(default_factory=dict)
+    reference: str | None = None
+    brightness: float = 0.5
     lidar_logits: tuple[float, float] | None = None
     scans: int = 0
 
@@ -71,7 +75,7 @@ def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, sett
         [part for part in made if part is not None],
         _sky(sky, settings, init.sky_color),
         settings.antialiased,
-        None if init.exposures is None else Exposures(init.exposures, settings.exposure),
+        _initial_exposures(init, settings),
         settings.rolling_shutter,
         settings.max_scale,
     )
@@ -94,18 +98,15 @@ def rebuild_model(
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         made.append(_rebuilt(params, definition, settings))
-    exposures = None
-    if "exposure.nodes" in state:
-        first, found = (
-            {key.removeprefix(prefix): values for key, values in state.items() if key.startswith(prefix)}
-            for prefix in EXPOSURE_PREFIXES
-        )
-        exposures = Exposures(ExposureStart(first, state["exposure.nodes"], found), settings.exposure)
+    first, learned = (
+        {key.removeprefix(prefix): values for key, values in state.items() if key.startswith(prefix)}
+        for prefix in (FIRST_PREFIX, LEARNED_PREFIX)
+    )
     model = SplatModel(
         made,
         _sky(sky, settings, np.full(3, 0.5)),
         settings.antialiased,
-        exposures,
+        Exposures(first, settings.exposure, tuple(learned), state[NODES]) if NODES in state else None,
         settings.rolling_shutter,
         settings.max_scale,
     )
@@ -204,6 +205,16 @@ def random_subset(count: int, limit: int) -> np.ndarray:
     if count <= limit:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
+
+
+def _initial_exposures(init: ModelInit, settings: TrainSettings) -> Exposures | None:
+    if init.reference is None:
+        return None
+    record = init.record
+    nodes = exposure_nodes([record.seconds(i) for i in record.train_images], settings.exposure.interval)
+    first = {camera: torch.as_tensor(gains).float().clone() for camera, gains in init.exposed.items()}
+    exposures = Exposures(first, settings.exposure, (init.reference,), nodes, init.brightness)
+    return exposures if len(exposures.params) else None
 
 
 def _sky(kind: SkyKind, settings: TrainSettings, color: np.ndarray) -> Sky | None:

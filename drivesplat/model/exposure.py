@@ -1,7 +1,6 @@
 """Exposure and white balance of each camera: between the cameras of a rig, and over time."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -14,98 +13,85 @@ from drivesplat.settings.train_cameras import ExposureSettings
 CHANNELS = ("red", "green", "blue")
 CHANGE_RATIO = 2.0
 """Expected size of log gains over their expected change within a second, a random walk."""
-LEAK = 0.05
-"""Slope of colours beyond saturation, so that what is too bright keeps a gradient."""
 DARKEST = 1e-3
 """Smallest mean of an image to which exposures respond (1 = full scale)."""
 
 
-@dataclass(frozen=True)
-class ExposureStart:
-    """What exposures start from. `first`: gains (3,) of cameras beside the reference camera. At the k times `nodes`
-    (seconds, at even intervals) gains change; `found`, of each camera, (1 + k, 3): its response b and its log gains
-    there. `brightness`: the mean of an image (1 = full scale) at which the response is 0."""
-
-    first: Mapping[str, Tensor] = field(default_factory=dict)
-    nodes: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0))
-    found: Mapping[str, Float[Tensor, "r 3"]] = field(default_factory=dict)
-    brightness: float = 0.5
-
-
 class Learned(NamedTuple):
     """What is learned of a camera, in units of its expected size: log gain and offset (2, 3), or none (0, 3); the
-    response b and the log gains over time (1 + k, 3), as deviations from what was found, or none (0, 3)."""
+    response b (3,) and the log gains (k, 3) over time."""
 
     constants: Float[Tensor, "c 3"]
-    over_time: Float[Tensor, "r 3"]
+    response: Float[Tensor, "3"]
+    changing: Float[Tensor, "k 3"]
 
 
 class Exposures(nn.Module):
-    """Maps of every colour channel, by camera and time t: c becomes f exp(g(t) - b log(m / M) + g) c + o.
+    """An affine map of every colour channel, by camera and time t: c becomes f exp(g + g(t) - b log(m / M)) c + o.
 
-    Over time, splats without sky change, up to saturation; a bright sky stays as it is. Log gains g(t) are linear
-    between nodes and constant beyond. The automatic response b to the mean m of an image, relative to M, goes on
-    beyond: an ideal exposure control has b = 1. Both are what was found before the training (`ExposureStart`) plus what
-    is learned. Gain and offset of a camera in `first` apply to the image with sky.
+    `first` holds the initial gains f (3,) of the cameras with constants, estimated before the training. `params` is
+    what is learned of each camera, (r, 3), initially 0, in the order of `Learned`: log gain g and offset o, only of
+    these cameras; then, with k `nodes` (seconds), the camera's automatic response b to the mean m of its image in the
+    model's colours, relative to `brightness` M, and the log gains g(t) at the nodes, which follow it late or for other
+    reasons. Between nodes g(t) is linear, beyond them constant, while b goes on: an ideal exposure control has b = 1.
 
-    `params` is what is learned of each camera, (r, 3), initially 0, in the order of `Learned`.
-
-    Views without a camera, and cameras without parameters, keep the model's colours. The reference camera has no
+    Cameras without parameters, and views without a camera, keep the model's colours. The reference camera has no
     constants: it fixes the brightness of the scene.
     """
 
-    def __init__(self, start: ExposureStart, settings: ExposureSettings):
+    def __init__(
+        self,
+        first: Mapping[str, Tensor],
+        settings: ExposureSettings,
+        cameras: tuple[str, ...] = (),
+        nodes: Float[Tensor, " k"] | None = None,
+        brightness: float = 0.5,
+    ):
+        """`cameras` without constants, besides those in `first`."""
         super().__init__()
-        self.register_buffer("nodes", start.nodes.clone())
-        self.register_buffer("brightness", torch.tensor(start.brightness))
-        self.first, self.found = (
-            nn.ParameterDict({camera: nn.Parameter(it.clone(), requires_grad=False) for camera, it in values.items()})
-            for values in (start.first, start.found)
+        self.register_buffer("nodes", torch.zeros(0) if nodes is None else nodes)
+        self.register_buffer("brightness", torch.tensor(brightness))
+        self.first = nn.ParameterDict(
+            {camera: nn.Parameter(gains, requires_grad=False) for camera, gains in first.items()}
         )
-        cameras = sorted({*start.first, *start.found})
-        rows = {camera: 2 * (camera in self.first) + len(start.found.get(camera, ())) for camera in cameras}
-        self.params = nn.ParameterDict({camera: nn.Parameter(torch.zeros(count, 3)) for camera, count in rows.items()})
+        over_time = 1 + len(self.nodes) if len(self.nodes) else 0
+        rows = {**dict.fromkeys(cameras, over_time), **dict.fromkeys(first, 2 + over_time)}
+        self.params = nn.ParameterDict(
+            {camera: nn.Parameter(torch.zeros(rows[camera], 3)) for camera in sorted(rows) if rows[camera]}
+        )
         self._settings = settings
 
-    def over_time(
-        self, splats: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w 1"], view: View
-    ) -> Float[Tensor, "h w 3"]:
-        """Maps splats without sky from the model's colours to those at the view's time. For the mean of the image the
-        sky counts as white."""
-        if view.camera not in self.found:
-            return splats
-        found, settings, own = self.found[view.camera], self._settings, self.learned(view.camera).over_time
-        mean = 1.0 + (splats.detach() - alpha.detach()).mean()
-        brighter = (mean.clamp(min=DARKEST) / self.brightness).log()
-        response = found[0] + settings.sigma_response * own[0]
-        changing = found[1:] + settings.sigma_gain * own[1:]
-        exposed = splats * torch.exp(self._weights(view.moment) @ changing - response * brighter)
-        return torch.minimum(exposed, 1.0 + LEAK * (exposed - 1.0))
-
-    def of_camera(self, image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, "h w 3"]:
-        """Maps an image with sky from the colours of the reference camera to those of the view's camera."""
-        if view.camera not in self.first:
+    def applied(self, image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, "h w 3"]:
+        """Maps an image from the model's colours to those of the view's camera at its time."""
+        if view.camera not in self.params:
             return image
-        constants, settings = self.learned(view.camera).constants, self._settings
-        gains = self.first[view.camera] * torch.exp(settings.sigma_gain * constants[0])
-        return image * gains + settings.sigma_offset * constants[1]
+        own, settings = self.learned(view.camera), self._settings
+        log_gains, offsets = image.new_zeros(3), 0.0
+        if len(own.constants):
+            log_gains, offsets = settings.sigma_gain * own.constants[0], settings.sigma_offset * own.constants[1]
+            log_gains = log_gains + self.first[view.camera].log()
+        if len(own.changing):
+            brighter = (image.detach().mean().clamp(min=DARKEST) / self.brightness).log()
+            response = settings.sigma_response * own.response * brighter
+            log_gains = log_gains + settings.sigma_gain * self._weights(view.moment) @ own.changing - response
+        return image * torch.exp(log_gains) + offsets
 
     def penalty(self, camera: str | None) -> Float[Tensor, ""] | None:
-        """The weighted sum of the mean squares of what is learned of a camera: of its constants, of its response, of
-        its log gains over time and of their changes; None without parameters or weight."""
+        """The weighted sum of the mean squares of a camera's constants, of its response, of its log gains over time and
+        of their changes; None without parameters or weight."""
         if camera not in self.params or not self._settings.weight:
             return None
         own = self.learned(camera)
-        changing = own.over_time[1:]
-        squares = [rows.square().mean() for rows in (own.constants, own.over_time[:1], changing) if len(rows)]
-        if len(changing):
-            squares.append((CHANGE_RATIO * changing.diff(dim=0)).square().mean() / (self.nodes[1] - self.nodes[0]))
+        squares = [values.square().mean() for values in (own.constants, own.response, own.changing) if len(values)]
+        if len(own.changing):
+            squares.append((CHANGE_RATIO * own.changing.diff(dim=0)).square().mean() / (self.nodes[1] - self.nodes[0]))
         return self._settings.weight * torch.stack(squares).sum()
 
     def learned(self, camera: str) -> Learned:
-        """The parameters of a camera."""
-        values, constant = self.params[camera], 2 if camera in self.first else 0
-        return Learned(values[:constant], values[constant:])
+        """The parameters of a camera. Without nodes, `response` and `changing` are empty."""
+        values, count = self.params[camera], len(self.nodes)
+        constant = len(values) - (1 + count if count else 0)
+        return Learned(values[:constant], values[constant : constant + 1].flatten(), values[constant + 1 :])
 
     def _weights(self, seconds: Float[Tensor, ""]) -> Float[Tensor, " k"]:
         """The weight of each node at a time."""
@@ -128,11 +114,21 @@ class Exposures(nn.Module):
             if len(own.constants):
                 by_channel["gain"] = self.first[camera] * torch.exp(settings.sigma_gain * own.constants[0])
                 by_channel["offset"] = settings.sigma_offset * own.constants[1]
-            if len(own.over_time):
-                by_channel["response"] = self.found[camera][0] + settings.sigma_response * own.over_time[0]
-                changing = self.found[camera][1:] + settings.sigma_gain * own.over_time[1:]
-                figures[f"{camera}/factor_least"] = float(changing.min().exp())
-                figures[f"{camera}/factor_largest"] = float(changing.max().exp())
+            if len(own.changing):
+                by_channel["response"] = settings.sigma_response * own.response
+                factors = torch.exp(settings.sigma_gain * own.changing)
+                figures[f"{camera}/factor_least"] = float(factors.min())
+                figures[f"{camera}/factor_largest"] = float(factors.max())
             for name, values in by_channel.items():
                 figures |= {f"{camera}/{name}_{c}": v for c, v in zip(CHANNELS, values.tolist(), strict=True)}
         return figures
+
+
+def exposure_nodes(seconds: Sequence[float], interval: float | None) -> Float[Tensor, " k"]:
+    """The times of nodes, about `interval` seconds apart, from the first to the last of the training images at
+    `seconds`; none where exposures are constant (None) or the drive is shorter than half an interval."""
+    if interval is None or not len(seconds):
+        return torch.zeros(0)
+    first, last = min(seconds), max(seconds)
+    count = round((last - first) / interval) + 1
+    return torch.linspace(first, last, count) if count > 1 else torch.zeros(0)

@@ -139,11 +139,11 @@ class SplatModel(nn.Module):
                 with_surface_depth=with_surface_depth, objects=objects,
             )  # fmt: skip
         splats, alpha = rendering.image.squeeze(0), rendering.alpha.squeeze(0)  # an index would copy in its gradient
-        image = splats if self.exposure is None else self.exposure.over_time(splats, alpha, view)
+        image = splats
         if self.sky is not None:
-            image = self.sky.behind(image, alpha, seen_from)
+            image = self.sky.behind(splats, alpha, seen_from)
         if self.exposure is not None:
-            image = self.exposure.of_camera(image, view)
+            image = self.exposure.applied(image, view)
         depth = None if rendering.depth is None else depth_at_lines(rendering.depth.squeeze((0, 3)), seen_from)
         alone = None if rendering.objects_alpha is None else rendering.objects_alpha.squeeze((0, 3))
         surfaces = rendering.surface_depth

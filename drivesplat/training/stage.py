@@ -20,6 +20,7 @@ from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.machine.device import choose_device, explain_out_of_memory, flush_denormals
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
+from drivesplat.model.exposure import DARKEST
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.images import below_horizon
 from drivesplat.scene.masks import NO_MASKS, read_classes, read_labels, read_masks_record, read_sky_mask
@@ -31,7 +32,7 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.augmentation import choose_mirrored, dropout_share
-from drivesplat.training.exposure_init import exposure_start
+from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
 from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, evenly_spaced
 from drivesplat.training.road import road_of
@@ -172,16 +173,15 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     more = len(record.points) - len(inputs.record.points)
     resolved = {"cap_max": cap + more, "dropout": dropout_share(record, job.train)}
     settings = job.train.model_copy(update=resolved)
-    exposures = None
-    if job.reference_camera is not None:
-        exposed, interval = inputs.exposed(job), job.train.exposure.interval
-        exposures = exposure_start(inputs.record, views, exposed, job.reference_camera, interval)
+    exposed = inputs.exposed(job)
     init = ModelInit(
         record,
         inputs.actors,
         mean_sky_color(views),
         inputs.semantic_classes(job),
-        exposures,
+        initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
+        job.reference_camera,
+        mean_brightness(views, job.reference_camera),
         initial_lidar_logits(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
     )
@@ -258,6 +258,12 @@ def read_summary(path: str | Path) -> dict[str, Any]:
 def _of_each(images: Sequence[int], read: Callable[[int], np.ndarray]) -> dict[int, np.ndarray]:
     """Reads a value for each image, by its number."""
     return dict(zip(images, prefetch(read, images), strict=True))
+
+
+def mean_brightness(views: list[TrainingView], camera: str | None) -> float:
+    """The geometric mean of the means of a camera's training images (1 = full scale); 0.5 without images."""
+    means = [float(view.target().mean()) for view in views if view.view.camera == camera]
+    return float(np.exp(np.log(np.maximum(means, DARKEST)).mean())) if means else 0.5
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:

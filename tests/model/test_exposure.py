@@ -28,7 +28,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
-from drivesplat.model.exposure import Exposures, ExposureStart
+from drivesplat.model.exposure import Exposures, exposure_nodes
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.preprocess.lidar_seed import seed_points
@@ -39,16 +39,7 @@ from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.settings.train_cameras import ExposureSettings
-from drivesplat.training import exposure_init
-from drivesplat.training.exposure_init import (
-    DISTANCE_STEP,
-    Sightings,
-    exposure_nodes,
-    gains_over_time,
-    initial_gains,
-    log_colors,
-    log_gains,
-)
+from drivesplat.training.exposure_init import DISTANCE_STEP, Sightings, initial_gains, log_colors, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.schedule import Schedule
@@ -82,7 +73,7 @@ def exposed(settings: TrainSettings) -> SplatModel:
 
 def exposures_of(*cameras: str, settings: ExposureSettings) -> Exposures:
     """Of cameras that are found to be as the reference."""
-    return Exposures(ExposureStart({camera: torch.ones(3) for camera in cameras}), settings)
+    return Exposures({camera: torch.ones(3) for camera in cameras}, settings)
 
 
 def of(camera: str, views: list[TrainingView]) -> list[TrainingView]:
@@ -94,7 +85,7 @@ def test_exposure_applies_to_listed_cameras_and_not_to_the_reference():
     image, view = torch.rand(4, 5, 3), rig_views()[0].view
 
     def applied(exposures: Exposures, camera: str | None) -> torch.Tensor:
-        return exposures.of_camera(image, dataclasses.replace(view, camera=camera))
+        return exposures.applied(image, dataclasses.replace(view, camera=camera))
 
     torch.testing.assert_close(applied(exposures, "BACK"), image)
     with torch.no_grad():
@@ -105,80 +96,57 @@ def test_exposure_applies_to_listed_cameras_and_not_to_the_reference():
     figures = exposures.figures()
     assert figures["BACK/gain_blue"] == pytest.approx(0.8) and figures["BACK/offset_red"] == pytest.approx(OFFSET)
     assert len(figures) == 6
-    found = Exposures(ExposureStart({"BACK": GAINS}), AFFINE)
+    found = Exposures({"BACK": GAINS}, AFFINE)
     torch.testing.assert_close(applied(found, "BACK"), image * GAINS)
     assert not found.penalty("BACK").any(), "what was found is free"
 
 
-NODES = torch.tensor([1.0, 3.0, 5.0])
-OPAQUE = torch.ones(2, 2, 1)
-
-
-def over_time(first=(), nodes=NODES, brightness=0.5, settings=AFFINE) -> Exposures:
-    """Of FRONT, which only changes over time, and of the cameras in `first`; nothing is found."""
-    found = {camera: torch.zeros(1 + len(nodes), 3) for camera in ("FRONT", *first)}
-    return Exposures(ExposureStart(dict(first), nodes, found, brightness), settings)
-
-
 def test_gains_over_time_are_linear_between_nodes_and_constant_beyond():
-    exposures = over_time({"BACK": GAINS})
+    nodes = exposure_nodes([3.0, 1.0, 5.0], 2.0)
+    assert nodes.tolist() == [1.0, 3.0, 5.0]
+    exposures = Exposures({"BACK": GAINS}, AFFINE, ("FRONT",), nodes)
     assert exposures.params["FRONT"].shape == (4, 3) and exposures.params["BACK"].shape == (6, 3)
-    gains = torch.tensor([2.0, 4.0, 1.0]).log()
     with torch.no_grad():
-        exposures.found["FRONT"][1:, 0] = 0.25 * gains
-        exposures.learned("FRONT").over_time[1:, 0] = 0.75 * gains / AFFINE.sigma_gain
-    image, view = torch.full((2, 2, 3), 0.1), rig_views()[0].view
+        exposures.learned("FRONT").changing[:, 0] = torch.tensor([2.0, 4.0, 1.0]).log() / AFFINE.sigma_gain
+    image, view = torch.full((1, 1, 3), 0.1), rig_views()[0].view
     for seconds, gain in ((0.0, 2.0), (1.0, 2.0), (2.0, 8.0**0.5), (3.0, 4.0), (4.0, 2.0), (9.0, 1.0)):
         for known in (None, torch.tensor(seconds)):
             seen = dataclasses.replace(view, camera="FRONT", time=seconds, seconds=known)
-            expected = image * torch.tensor([gain, 1.0, 1.0])
-            torch.testing.assert_close(exposures.over_time(image, OPAQUE, seen), expected)
-            assert exposures.of_camera(image, seen) is image
+            torch.testing.assert_close(exposures.applied(image, seen), image * torch.tensor([gain, 1.0, 1.0]))
     figures = exposures.figures()
     assert figures["FRONT/factor_largest"] == pytest.approx(4.0) and figures["FRONT/factor_least"] == 1.0
-    for camera in ("LEFT", None):
-        assert exposures.over_time(image, OPAQUE, dataclasses.replace(view, camera=camera)) is image
+    copied = Exposures({"BACK": GAINS}, AFFINE, ("FRONT", "BACK"), nodes)
+    copied.load_state_dict(exposures.state_dict())
 
 
 def test_a_response_darkens_what_is_bright_also_beyond_the_last_node():
     """With a response of 1 and no other gain every image has the reference brightness."""
-    exposures = over_time(brightness=0.4)
+    exposures = Exposures({}, AFFINE, ("FRONT",), torch.tensor([0.0, 1.0]), brightness=0.4)
     with torch.no_grad():
-        exposures.found["FRONT"][0], exposures.learned("FRONT").over_time[0] = 0.8, 0.2 / AFFINE.sigma_response
-    seen = dataclasses.replace(rig_views()[0].view, camera="FRONT", time=70.0)
+        exposures.learned("FRONT").response[:] = 1.0 / AFFINE.sigma_response
+    seen = dataclasses.replace(rig_views()[0].view, camera="FRONT", time=7.0)
     for mean in (0.1, 0.4, 0.8):
-        exposed = exposures.over_time(torch.full((2, 2, 3), mean), OPAQUE, seen)
-        assert exposed.mean().item() == pytest.approx(0.4)
-    half = exposures.over_time(torch.full((2, 2, 3), 0.2), 0.5 * OPAQUE, seen)
-    assert half.mean().item() == pytest.approx(0.2 * 0.4 / 0.7), "the sky counts as white"
-    assert torch.isfinite(exposures.over_time(torch.zeros(2, 2, 3), OPAQUE, seen)).all()
+        assert exposures.applied(torch.full((2, 2, 3), mean), seen).mean().item() == pytest.approx(0.4)
+    assert torch.isfinite(exposures.applied(torch.zeros(2, 2, 3), seen)).all()
     assert exposures.figures()["FRONT/response_blue"] == pytest.approx(1.0)
     bright = torch.full((2, 2, 3), 0.8, requires_grad=True)
-    exposures.over_time(bright, OPAQUE, seen).sum().backward()
-    torch.testing.assert_close(bright.grad, torch.full((2, 2, 3), 0.5))  # the mean has no gradient
+    exposures.applied(bright, seen).sum().backward()
+    torch.testing.assert_close(bright.grad, torch.full((2, 2, 3), 0.5))  # the response has no gradient
 
 
-def test_saturated_colours_keep_a_small_gradient():
-    exposures = over_time()
-    with torch.no_grad():
-        exposures.found["FRONT"][1:] = math.log(2.0)
-    splats = torch.full((1, 1, 3), 0.8, requires_grad=True)
-    exposed = exposures.over_time(splats, OPAQUE[:1, :1], dataclasses.replace(rig_views()[0].view, camera="FRONT"))
-    exposed.sum().backward()
-    assert 1.0 <= exposed.max() <= 1.05 and 0.0 < splats.grad.max() <= 0.2
+@pytest.mark.parametrize(("seconds", "interval"), [([1.0, 3.0], None), ([], 1.0), ([1.0], 1.0), ([1.0, 1.4], 1.0)])
+def test_exposures_of_short_drives_are_constant(seconds, interval):
+    assert len(exposure_nodes(seconds, interval)) == 0
 
 
-def test_changes_of_gains_cost_more_than_gains_and_what_was_found_nothing():
+def test_changes_of_gains_cost_more_than_gains():
     nodes = torch.tensor([0.0, 0.5, 1.0])
-    exposures = over_time(nodes=nodes, settings=ExposureSettings(weight=1.0))
+    exposures = Exposures({}, ExposureSettings(weight=1.0), ("FRONT",), nodes)
     with torch.no_grad():
-        exposures.found["FRONT"][:] = 1.0
-    assert exposures.penalty("FRONT").item() == 0.0
-    with torch.no_grad():
-        exposures.learned("FRONT").over_time[1:] = 0.3
+        exposures.learned("FRONT").changing[:] = 0.3
     assert exposures.penalty("FRONT").item() == pytest.approx(0.09)
     with torch.no_grad():
-        exposures.learned("FRONT").over_time[2] = 0.0
+        exposures.learned("FRONT").changing[1] = 0.0
     assert exposures.penalty("FRONT").item() == pytest.approx(0.06 + (2.0 * 0.3) ** 2 / 0.5)
 
 
@@ -414,54 +382,3 @@ def test_cameras_of_a_synthetic_rig_have_the_configured_exposure():
         assert np.median(ratio**2.2) == pytest.approx(gain, rel=0.02)
     front = RIG["CAM_FRONT"]
     np.testing.assert_array_equal(plain.image(front, 0), other.image(front, 0))
-
-
-@pytest.mark.parametrize(("seconds", "interval"), [([1.0, 3.0], None), ([], 1.0), ([1.0], 1.0), ([1.0, 1.4], 1.0)])
-def test_exposures_of_short_drives_are_constant(seconds, interval):
-    assert len(exposure_nodes(seconds, interval)) == 0
-
-
-def driven_past(gains: np.ndarray, scene: np.ndarray, monkeypatch) -> list[TrainingView]:
-    """Images of 20 Hz whose mean is the `scene` (v,) times the `gains` (v,), and in each 300 of the points along the
-    way, whose colours change as one comes nearer; a tenth of the points moves and has any colour."""
-    random = np.random.default_rng(0)
-    colors = random.uniform(40.0, 120.0, (2000, 3))
-    seen, views = [], []
-    for i, gain in enumerate(gains):
-        points = np.arange(20 * i, 20 * i + 300)
-        distances = 5.0 + 0.3 * (points - 20 * i)
-        observed = gain * colors[points] * distances[:, None] ** 0.1 * random.normal(1.0, 0.02, (300, 3))
-        observed[random.random(300) < 0.1] = random.uniform(20.0, 200.0, 3)
-        seen.append(Sightings(points, distances, observed))
-        view = dataclasses.replace(rig_views()[0].view, camera="FRONT", time=0.5 * i)
-        views.append(TrainingView(view, torch.full((8, 8, 3), round(255 * gain * scene[i]), dtype=torch.uint8)))
-    known = {id(view): own for view, own in zip(views, seen, strict=True)}
-    monkeypatch.setattr(exposure_init, "_seen_in", lambda _, view: known[id(view)])
-    return views
-
-
-@pytest.mark.parametrize("automatic", [True, False])
-def test_gains_over_time_are_found_with_the_response_that_explains_them(automatic, monkeypatch):
-    """Of an automatic control, which keeps images at equal brightness, and of gains that have nothing to do with it."""
-    seconds = 0.5 * np.arange(40)
-    scene = 0.35 * np.exp(0.3 * np.sin(0.5 * seconds))
-    gains = scene.mean() / scene if automatic else np.exp(0.3 * np.sin(2.0 * seconds))
-    nodes = exposure_nodes(list(seconds), 0.5)
-    found = gains_over_time(np.zeros((0, 3)), driven_past(gains, scene, monkeypatch), nodes)
-    assert found.shape == (1 + len(nodes), 3)
-    if automatic:
-        assert found[0].min() > 0.9 and np.abs(found[1:]).max() < 0.06
-    else:
-        assert found[0].max() < 0.4
-    brightness = np.log(scene) - np.log(scene).mean()
-    explained = found[1:] - brightness[:, None] * found[0]
-    off = explained - (np.log(gains) - np.log(gains).mean())[:, None]
-    assert np.abs(off - off.mean()).max() < 0.06, "gains at the nodes"
-
-
-def test_without_shared_points_or_with_one_image_gains_stay_alike(monkeypatch):
-    views = driven_past(np.array([1.0, 2.0, 0.5]), np.full(3, 0.2), monkeypatch)
-    empty = Sightings(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
-    assert not gains_over_time(np.zeros((0, 3)), views[:1], np.array([0.0, 1.0])).any()
-    monkeypatch.setattr(exposure_init, "_seen_in", lambda *_: empty)
-    assert np.abs(gains_over_time(np.zeros((0, 3)), views, np.array([0.0, 1.0]))).max() < 1e-9

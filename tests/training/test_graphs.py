@@ -22,7 +22,7 @@ from helpers.trainings import (
 from drivesplat.kernels import triton_support
 from drivesplat.kernels.capacity import capacity_for
 from drivesplat.kernels.cuda_graphs import CudaGraph
-from drivesplat.model.exposure import Exposures, ExposureStart
+from drivesplat.model.exposure import Exposures
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN
 from drivesplat.model.view import RollingShutter
@@ -298,9 +298,8 @@ def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
     losses = []
     for replays in (False, True):
         model = untrained_street(settings, people=people)
-        found = {camera: torch.full((3, 3), 0.1) for camera in ("CAM_BACK", "CAM_FRONT")}
-        start = ExposureStart({"CAM_BACK": torch.full((3,), 0.9)}, torch.tensor([0.0, 1.0]), found)
-        model.exposure = Exposures(start, settings.exposure) if exposed else None
+        first, nodes = {"CAM_BACK": torch.full((3,), 0.9)}, torch.tensor([0.0, 1.0])
+        model.exposure = Exposures(first, settings.exposure, ("CAM_FRONT",), nodes) if exposed else None
         trainer = Trainer.begin(model, views, settings, 0, torch.device("cpu"))
         captured = replayed(monkeypatch, trainer) if replays else []
         losses.append([])
