@@ -27,6 +27,8 @@ JERK = np.array([5.0, 5.0, 0.5])
 brake, but follow the road up and down."""
 TURNING_JERK = np.array([1.0, 0.1, 0.1])
 """Expected change of the angular acceleration within a second (rad/s²): of heading, pitch and roll."""
+MIN_INTERVAL = 0.01
+"""Seconds between annotations below which their third differences are lost in rounding."""
 ROUNDS = 5
 """Rounds of reweighted least squares."""
 ORDER = 3
@@ -34,13 +36,14 @@ ORDER = 3
 
 
 def smoothed(motion: Motion) -> Motion:
-    """The motion with smoothed annotations. Runs of at most ORDER annotations stay as they are."""
+    """The motion with smoothed annotations. Runs of at most ORDER annotations, and those with some closer than
+    MIN_INTERVAL, stay as they are."""
     poses = motion.object_to_world.copy()
     for first, last in motion.runs:
         own = slice(first, last + 1)
-        if last - first < ORDER:
-            continue
         times, given = motion.times[own], poses[own]
+        if last - first < ORDER or np.diff(times).min() < MIN_INTERVAL:
+            continue
         given[:, :3, 3] = smooth(times, given[:, :3, 3], POSITION_ERROR, JERK)
         angles = np.unwrap(Rotation.from_matrix(given[:, :3, :3]).as_euler("ZYX"), axis=0)
         angles = smooth(times, angles, ANGLE_ERROR, TURNING_JERK)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivesplat.trajectories.motion import Motion
-from drivesplat.trajectories.smoothing import JERK, ORDER, POSITION_ERROR, smooth, smoothed
+from drivesplat.trajectories.smoothing import JERK, MIN_INTERVAL, ORDER, POSITION_ERROR, smooth, smoothed
 
 SECONDS = np.arange(0.0, 8.0, 0.1)
 
@@ -83,6 +83,16 @@ def test_runs_are_smoothed_apart_and_short_ones_kept():
     np.testing.assert_array_equal(result[own], given.object_to_world[own])
     alone = motion(positions[:40], headings(SECONDS[:40]), SECONDS[:40])
     np.testing.assert_array_equal(result[:40], smoothed(alone).object_to_world)
+
+
+@pytest.mark.parametrize("interval", [0.01, 0.02, 1e-3, 1e-6])
+def test_crowded_annotations_are_kept_or_smoothed_soundly(interval):
+    times = np.sort(np.concatenate([SECONDS, [2.0 + interval, 2.0 + 2.0 * interval]]))
+    given = motion(path(times), headings(times), times)
+    result = smoothed(given)
+    assert error(result, path(times)) < 0.005
+    if interval < MIN_INTERVAL:
+        np.testing.assert_array_equal(result.object_to_world, given.object_to_world)
 
 
 def test_the_spline_is_the_most_probable_motion():
