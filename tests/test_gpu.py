@@ -43,6 +43,7 @@ from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
 from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.background import Background
+from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
@@ -55,6 +56,7 @@ from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.shutter import Shutter
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainSettings
+from drivesplat.settings.train_cameras import ExposureSettings
 from drivesplat.settings.train_objects import DeformableSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training import step as step_module
@@ -453,10 +455,10 @@ def rolling(view: View) -> View:
 def trained_with(
     capture: bool, iterations: int = 30, iterations_done: int | None = None, shutters: bool = False,
     recorded: Sequence[RecordedScan] = (), people: bool = False, drifting: bool = False, night: bool = False,
-    **settings,
+    exposed: bool = False, **settings,
 ) -> tuple[Trainer, list[float]]:  # fmt: skip
     """A training of background and cars, people or drifting Gaussians, by every loss term, with or without CUDA graphs,
-    rolling shutters, scans, by day or by night."""
+    rolling shutters, scans, exposure over time, by day or by night."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
     logits = initial_lidar_logits(recorded) if recorded else None
     model = untrained_drifting(chosen) if drifting else untrained_street(chosen, logits, people)
@@ -468,6 +470,12 @@ def trained_with(
     if shutters:
         model.sky = CubemapSky(8, torch.full((3,), 0.5), 1e-2)
         views = [replace(view, view=rolling(view.view)) for view in views]
+    if exposed:
+        model.exposure = Exposures({}, chosen.exposure, ("CAM_FRONT",), torch.tensor([0.0, 0.5, 1.0]))
+        views = [
+            replace(it, view=replace(it.view, camera="CAM_FRONT", seconds=torch.tensor(it.view.time, device=GPU)))
+            for it in views
+        ]
     chosen = chosen.model_copy(update={"cuda_graphs": capture, "iterations": iterations})
     with capture_stream(GPU):
         trainer = Trainer.begin(model.to(GPU), views, chosen, 0, GPU, scans=load_scans(recorded, chosen.scans, GPU))
@@ -515,6 +523,13 @@ def test_a_training_by_cuda_graphs_learns_what_it_learns_without(shutters, night
         if moved.any() and not name.endswith(("scales", "quats")):
             apart = (captured.state.model.state_dict()[name] - value).abs().cpu()
             assert float(apart.quantile(0.5)) <= 0.1 * float(moved.max()), name
+
+
+def test_exposure_over_time_is_captured_and_learns_what_it_learns_without_graphs(caplog):
+    captured, eager, _ = with_and_without_graphs(caplog, 1, exposed=True, exposure=ExposureSettings(start=0.0))
+    mine, theirs = (trainer.state.model.exposure.params["CAM_FRONT"] for trainer in (captured, eager))
+    assert (mine.abs().amax(dim=1) > 0.0).all()
+    torch.testing.assert_close(mine, theirs, rtol=0.05, atol=0.05)
 
 
 @pytest.mark.parametrize("part", ["people", "drifting"])

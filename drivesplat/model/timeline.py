@@ -20,6 +20,8 @@ cache 100 MB."""
 BEND_STEP = 0.5
 """Seconds over which second differences of corrections are penalised, the interval of nuScenes' annotations. At other
 rates the penalty scales as a second derivative does, so that corrections are smooth over the same time."""
+MIN_STEP = 0.05
+"""Seconds between annotations below which the penalty grows no more."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class Timeline:
         """What makes squared second differences of corrections independent of the annotation rate: they count as over
         BEND_STEP seconds. The median over `neighbours`; 1 for annotations at 2 Hz."""
         times = torch.cat([torch.from_numpy(track.motion.times) for track in self.tracks])[self.neighbours]
-        steps = (times[:, 2] - times[:, 0]) / 2.0
+        steps = ((times[:, 2] - times[:, 0]) / 2.0).clamp(min=MIN_STEP)
         return float((BEND_STEP / steps).pow(4).median()) if len(steps) else 1.0
 
     def corrected(self, shifts: Float[np.ndarray, "m 3"], turns: Float[np.ndarray, " m"]) -> list[Motion]:

@@ -10,6 +10,7 @@ from drivesplat.io.array_file import read_arrays, write_arrays
 from drivesplat.io.typed_record import typed_record
 from drivesplat.model import timeline as timeline_module
 from drivesplat.model.timeline import ActorTrack, Timeline
+from drivesplat.trajectories.motion import Motion
 
 CPU = torch.device("cpu")
 
@@ -123,3 +124,16 @@ def test_a_time_state_of_30_actors_takes_less_than_10_kilobytes():
     shapes = [(30, 4), (30, 3), (30,), (30 * len(annotated.times),), (30, 5), (30,), (30,)]
     assert [tuple(value.shape) for value in state] == shapes
     assert sum(value.untyped_storage().nbytes() for value in state) < 10_000
+
+
+@pytest.mark.parametrize(("interval", "scale"), [(0.5, 1.0), (1.0, 1.0 / 16.0), (0.1, 625.0), (0.01, 1e4)])
+def test_bends_count_over_the_same_time_whatever_the_annotation_rate(interval, scale):
+    """Corrections along one curve cost the same at any rate: of half the interval second differences are a quarter."""
+    times = interval * np.arange(5)
+    motion = Motion(times, np.tile(np.eye(4), (5, 1, 1)), ((0, 4),), 0.5 * interval)
+    assert Timeline([ActorTrack("a", np.ones(3), motion)], 1).bend_scale == pytest.approx(scale)
+
+
+def test_without_three_annotations_in_a_row_bends_have_no_scale():
+    motion = Motion(np.array([0.0, 0.1]), np.tile(np.eye(4), (2, 1, 1)), ((0, 1),), 0.05)
+    assert Timeline([ActorTrack("a", np.ones(3), motion)], 1).bend_scale == 1.0
