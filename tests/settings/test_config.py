@@ -344,7 +344,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_any_st
 @pytest.mark.parametrize(
     ("change", "readers"),
     [
-        (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car train evaluate"),
+        (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car evaluate"),
         (
             {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
             "extract own_car train evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer "
@@ -355,7 +355,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_any_st
         (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth scans evaluate film"),
         (
             at("cameras", ["CAM_FRONT", "CAM_BACK"]) | at("holdout.cameras", ["CAM_BACK"]),
-            "extract own_car lidar_seed parser masks actors lidar_depth scans train evaluate film",
+            "extract own_car lidar_seed parser masks actors lidar_depth scans evaluate film",
         ),
         (at("extract.on_missing", "warn"), "extract"),
         (at("lidar_seed.on_missing", "warn"), "lidar_seed scans"),
