@@ -36,8 +36,8 @@ class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
     (3,) of every camera in `exposed`, whose exposure is learned, the `reference` camera, whose exposure is only learned
-    over time (None: not), the mean `brightness` (0 to 1) of its images, the initial `lidar_logits` of intensity and
-    return (None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
+    over time (None: not), the initial `lidar_logits` of intensity and return
+    (None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
@@ -45,7 +45,6 @@ class ModelInit:
     classes: int = 0
     exposed: dict[str, np.ndarray] = field(default_factory=dict)
     reference: str | None = None
-    brightness: float = 0.5
     lidar_logits: tuple[float, float] | None = None
     scans: int = 0
 
@@ -213,7 +212,7 @@ def _initial_exposures(init: ModelInit, settings: TrainSettings) -> Exposures | 
     record = init.record
     nodes = exposure_nodes([record.seconds(i) for i in record.train_images], settings.exposure.interval)
     first = {camera: torch.as_tensor(gains).float().clone() for camera, gains in init.exposed.items()}
-    exposures = Exposures(first, settings.exposure, (init.reference,), nodes, init.brightness)
+    exposures = Exposures(first, settings.exposure, (init.reference,), nodes)
     return exposures if len(exposures.params) else None
 
 

@@ -17,18 +17,14 @@ class ExposureSettings(Settings):
     (`interval`)."""
     interval: float | None = Field(1.0, ge=0.1, le=60)
     """Seconds between the times at which gains of every camera, eval_camera included, are learned; linear in between
-    and constant beyond the last training image. With them the automatic response of each camera to the brightness of
-    its image is learned. null: constant exposures."""
+    and constant beyond the last training image. null: constant exposures."""
     sigma_gain: float = Field(0.1, gt=0)
     """Expected deviation of a camera's gains from their initial values (natural logarithm)."""
     sigma_offset: float = Field(0.02, gt=0)
     """Expected deviation of a camera's offsets from 0 (1 = full scale)."""
-    sigma_response: float = Field(1.0, gt=0)
-    """Expected response of a camera: by which share of a change of brightness its gain changes in the other direction.
-    """
     weight: float = Field(0.002, ge=0)
-    """Loss weight of the mean square of log gains, offsets and responses, in units of these deviations."""
+    """Loss weight of the mean square of log gains and offsets, in units of these deviations."""
     start: float = Field(0.1, ge=0, le=1)
     """Fraction of the iterations after which exposures are learned."""
     learning_rate: float = Field(1e-2, gt=0)
-    """Learning rate of log gains, offsets and responses, in the same units. Decays exponentially to a hundredth."""
+    """Learning rate of log gains and offsets, in the same units. Decays exponentially to a hundredth."""

@@ -20,7 +20,6 @@ from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.machine.device import choose_device, explain_out_of_memory, flush_denormals
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
-from drivesplat.model.exposure import DARKEST
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.images import below_horizon
 from drivesplat.scene.masks import NO_MASKS, read_classes, read_labels, read_masks_record, read_sky_mask
@@ -181,7 +180,6 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
         job.reference_camera,
-        mean_brightness(views, job.reference_camera),
         initial_lidar_logits(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
     )
@@ -258,12 +256,6 @@ def read_summary(path: str | Path) -> dict[str, Any]:
 def _of_each(images: Sequence[int], read: Callable[[int], np.ndarray]) -> dict[int, np.ndarray]:
     """Reads a value for each image, by its number."""
     return dict(zip(images, prefetch(read, images), strict=True))
-
-
-def mean_brightness(views: list[TrainingView], camera: str | None) -> float:
-    """The geometric mean of the means of a camera's training images (1 = full scale); 0.5 without images."""
-    means = [float(view.target().mean()) for view in views if view.view.camera == camera]
-    return float(np.exp(np.log(np.maximum(means, DARKEST)).mean())) if means else 0.5
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:
