@@ -133,10 +133,8 @@ def refine_from_matches(
             log.info(
                 "scene %s: the refined poses are taken for cameras, LiDAR and boxes stay: %s", scene.name, by_lidar
             )
-            refined, record["cameras_alone_because"] = (
-                replace(scene, frames=refined.frames, poses=refined.poses),
-                by_lidar,
-            )
+            refined = replace(scene, frames=refined.frames, poses=refined.poses)
+            record["cameras_alone_because"] = by_lidar
         else:
             log.info("scene %s: the refined poses are taken", scene.name)
         return Refinement(refined, record, triangulated_points(images.indices, observations))

@@ -1,12 +1,12 @@
 """Annotated motions without the noise of their annotations.
 
-Boxes drawn ten times a second, or tracked, wander by centimetres within tenths of a second, as no vehicle does: a box
-follows the pitch of the ego vehicle, or the returns of one sweep. Held-out images then show the object a few pixels
-from where its box is, and no correction that is learned from other images can know.
+Boxes wander by centimetres from one annotation to the next, as no vehicle does: a box follows the pitch of the ego
+vehicle, the returns of one sweep, or the hand that drew it. Held-out images then show the object a few pixels from
+where its box is, and no correction that is learned from other images can know.
 
 The estimate is a smoothing spline of third order: a motion whose jerk is white noise, seen through annotations with
-errors that last `ERROR_DURATION` (Särkkä, Bayesian Filtering and Smoothing, 2013, chapter 12). Annotations that are
-farther apart than an object's acceleration lasts, such as those of 2 Hz, hardly change.
+errors that last `ERROR_DURATION` (Särkkä, Bayesian Filtering and Smoothing, 2013, chapter 12). Exact annotations of a
+vehicle that steers and brakes change by millimetres, at any rate.
 """
 
 from dataclasses import replace
