@@ -118,7 +118,7 @@ def refine_from_matches(
     objections = {judge.name: judge.objection(*judged[judge.name]) for judge in judges}
     by_lidar = objections.pop(SweepJudge.name, None)
     reason = flaw or no_gain(trial, limits) or next(filter(None, objections.values()), None)
-    if reason is None and sweeps is None:
+    if reason is None and (sweeps is None or by_lidar):
         reason = stretched(scene, refined, limits)
     if reason is None and by_lidar and not objections:  # nothing else that was withheld speaks for the images
         reason = by_lidar

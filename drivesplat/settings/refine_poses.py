@@ -71,7 +71,7 @@ class LimitSettings(Settings):
     min_gain: float = Field(0.05, ge=0, lt=1)
     """Minimum relative decrease of the median reprojection error of withheld points."""
     max_stretch: float = Field(0.01, gt=0, lt=1)
-    """Maximum relative change of the length of the path. Applies where no LiDAR judges."""
+    """Maximum relative change of the length of the path. Applies where no LiDAR agrees with it."""
     max_scale_drift: float = Field(1.2, ge=1)
     """Maximum factor by which the scale may change along the drive, with `start: images`. Images whose scale deviates
     more from their neighbours' are interpolated."""

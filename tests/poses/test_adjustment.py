@@ -280,3 +280,16 @@ def test_cameras_move_alone_where_lidar_alone_objects(
     assert (reason is None) == (record["images_kept_because"] is None) and (reason or "") in str(record["kept_because"])
     assert ("surfaces" in str(record["cameras_alone_because"])) == (cameras_move and not sweeps_move)
     assert set(record["judged"]) == {judge.name for judge in judges if judge}
+
+
+@pytest.mark.parametrize(("by_lidar", "dropped"), [(True, True), (False, False)])
+def test_cameras_move_alone_only_if_the_path_keeps_its_length(front, by_lidar, dropped, monkeypatch):
+    after = 2.0 if by_lidar else 0.5
+    monkeypatch.setattr(SweepJudge, "distance", lambda _, it: 1.0 if it is front.drive.scene else after)
+    monkeypatch.setattr(MatchJudge, "distance", lambda _, it: 1.0 if it is front.drive.scene else 0.5)
+    monkeypatch.setattr("drivesplat.poses.refine.stretched", lambda *_: "the path is longer")
+    job = job_of(priors_with_lidar=PriorSettings().model_dump())
+    judges = SweepJudge({}, []), MatchJudge([])
+    found = refine_from_matches(front.images, front.start, front.database, job, 1, *judges)
+    assert (found.record["images_kept_because"] == "the path is longer") == dropped
+    assert (found.scene.frames is front.drive.scene.frames) == dropped
