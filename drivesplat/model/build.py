@@ -36,8 +36,8 @@ class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
     (3,) of every camera in `exposed`, whose exposure is learned, the `reference` camera, whose exposure is only learned
-    over time (None: not), the initial `lidar_logits` of intensity and return
-    (None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images fits."""
+    over time (None: not), the initial `lidar_logits` of intensity and return (None: LiDAR is not rendered), and the
+    number of LiDAR `scans` that a training without images fits."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
@@ -97,15 +97,13 @@ def rebuild_model(
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         made.append(_rebuilt(params, definition, settings))
-    first, learned = (
-        {key.removeprefix(prefix): values for key, values in state.items() if key.startswith(prefix)}
-        for prefix in (FIRST_PREFIX, LEARNED_PREFIX)
-    )
+    first = {key.removeprefix(FIRST_PREFIX): gains for key, gains in state.items() if key.startswith(FIRST_PREFIX)}
+    learned = tuple(key.removeprefix(LEARNED_PREFIX) for key in state if key.startswith(LEARNED_PREFIX))
     model = SplatModel(
         made,
         _sky(sky, settings, np.full(3, 0.5)),
         settings.antialiased,
-        Exposures(first, settings.exposure, tuple(learned), state[NODES]) if NODES in state else None,
+        Exposures(first, settings.exposure, learned, state[NODES]) if NODES in state else None,
         settings.rolling_shutter,
         settings.max_scale,
     )
@@ -211,7 +209,7 @@ def _initial_exposures(init: ModelInit, settings: TrainSettings) -> Exposures | 
         return None
     record = init.record
     nodes = exposure_nodes([record.seconds(i) for i in record.train_images], settings.exposure.interval)
-    first = {camera: torch.as_tensor(gains).float().clone() for camera, gains in init.exposed.items()}
+    first = {camera: torch.as_tensor(gains).float() for camera, gains in init.exposed.items()}
     exposures = Exposures(first, settings.exposure, (init.reference,), nodes)
     return exposures if len(exposures.params) else None
 

@@ -35,9 +35,9 @@ class Exposures(nn.Module):
     ):
         """`cameras` without constants, besides those in `first`."""
         super().__init__()
-        self.register_buffer("nodes", torch.zeros(0) if nodes is None else nodes)
+        self.register_buffer("nodes", torch.zeros(0) if nodes is None else nodes.clone())
         self.first = nn.ParameterDict(
-            {camera: nn.Parameter(gains, requires_grad=False) for camera, gains in first.items()}
+            {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in first.items()}
         )
         rows = {
             **dict.fromkeys(first, 2 + len(self.nodes)),

@@ -44,10 +44,10 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
     for dynamic_object in sorted(dynamic_objects(scene), key=lambda item: item.track.id):
-        if job.actors.smoothed:
-            dynamic_object = replace(dynamic_object, motion=smoothed(dynamic_object.motion))
         parts = job.actors.parts_of(dynamic_object.track.object_class)
         if parts:
+            if job.actors.smoothed:
+                dynamic_object = replace(dynamic_object, motion=smoothed(dynamic_object.motion))
             random = np.random.default_rng((job.random_seed, order[dynamic_object.track.id]))
             points = gathered_points(scene, dynamic_object, sweeps, job.actors, random)
             seeds.append(Seed(dynamic_object, parts, *points))

@@ -40,8 +40,8 @@ class ActorSeedSettings(Settings):
     box_margin: float = Field(0.1, ge=0, le=2)
     """LiDAR returns closer than this (metres) to the sides or the roof of a box belong to its actor."""
     smoothed: bool = True
-    """Smooth annotated motions before anything is learned: annotation noise of a few tenths of a second, which no
-    vehicle or person follows (docs/street.md). Metrics keep the annotated boxes."""
+    """Smooth annotated motions before anything is learned: boxes wander by centimetres from one annotation to the next,
+    as no vehicle does (docs/street.md). Metrics keep the annotated boxes."""
 
     def parts_of(self, object_class: str) -> tuple[PartName, ...]:
         """The parts of moving objects that can represent a class, the best first; none for the background."""

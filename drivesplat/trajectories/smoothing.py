@@ -56,17 +56,16 @@ def smooth(
 ) -> Float[np.ndarray, "n d"]:
     """The smoothing spline of each column of `values` at increasing `times` (seconds, more than ORDER of them), with
     the expected `error` of a value and the expected change of its second derivative within a second, `jerk`."""
-    rows, spans = _third_differences(times)
-    weights = np.clip(np.gradient(times) / ERROR_DURATION, None, 1.0) / error**2
+    bands = _normal_bands(*_third_differences(times), len(times))
+    precise = np.clip(np.gradient(times) / ERROR_DURATION, None, 1.0) / error**2
     result = values.copy()
     for column in range(values.shape[1]):
-        bands = _normal_bands(rows, spans / jerk[column] ** 2, len(times))
-        own, trust = values[:, column], np.ones(len(times))
+        own, weights = values[:, column], precise
         for _ in range(ROUNDS):
-            system = bands.copy()
-            system[-1] += weights * trust
-            result[:, column] = solveh_banded(system, weights * trust * own)
-            trust = error / np.maximum(np.abs(result[:, column] - own), error)
+            system = bands / jerk[column] ** 2
+            system[-1] += weights
+            result[:, column] = solveh_banded(system, weights * own)
+            weights = precise * error / np.maximum(np.abs(result[:, column] - own), error)
     return result
 
 

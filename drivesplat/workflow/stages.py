@@ -197,8 +197,8 @@ def _training(at: JobScope) -> dict[str, Any]:
         scans = train.scans.model_copy(update=alone)
         return {"parts": method.parts, "sky": "none", "train": train.model_copy(update={"scans": scans})}
     exposure = train.exposure
-    compared = exposure.kind != "none" and (len(config.cameras) > 1 or exposure.interval is not None)
-    reference = config.eval_camera if compared else None
+    learned = exposure.kind != "none" and (len(config.cameras) > 1 or exposure.interval is not None)
+    reference = config.eval_camera if learned else None
     return {"parts": method.parts, "train": train, "reference_camera": reference}
 
 
