@@ -30,6 +30,7 @@ from helpers.trainings import (
     trained,
     untrained,
     untrained_drifting,
+    untrained_road,
     untrained_street,
     without_sky_masks,
 )
@@ -454,14 +455,15 @@ def rolling(view: View) -> View:
 
 def trained_with(
     capture: bool, iterations: int = 30, iterations_done: int | None = None, shutters: bool = False,
-    recorded: Sequence[RecordedScan] = (), people: bool = False, drifting: bool = False, night: bool = False,
-    exposed: bool = False, **settings,
+    recorded: Sequence[RecordedScan] = (), people: bool = False, drifting: bool = False, road: bool = False,
+    night: bool = False, exposed: bool = False, **settings,
 ) -> tuple[Trainer, list[float]]:  # fmt: skip
-    """A training of background and cars, people or drifting Gaussians, by every loss term, with or without CUDA graphs,
-    rolling shutters, scans, exposure over time, by day or by night."""
+    """A training of background and cars, people, drifting Gaussians or a road, by every loss term, with or without CUDA
+    graphs, rolling shutters, scans, exposure over time, by day or by night."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
     logits = initial_lidar_logits(recorded) if recorded else None
-    model = untrained_drifting(chosen) if drifting else untrained_street(chosen, logits, people)
+    static = untrained_road if road else untrained_drifting if drifting else None
+    model = static(chosen) if static else untrained_street(chosen, logits, people)
     for part in model.parts:  # no spheres, whose rotations learn from rounding
         part.params["scales"].data += 0.5 * torch.randn(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
@@ -532,11 +534,12 @@ def test_exposure_over_time_is_captured_and_learns_what_it_learns_without_graphs
     torch.testing.assert_close(mine, theirs, rtol=0.05, atol=0.05)
 
 
-@pytest.mark.parametrize("part", ["people", "drifting"])
-def test_people_and_drifting_gaussians_are_captured_and_learn_what_they_learn_without_graphs(part, caplog):
+@pytest.mark.parametrize("part", ["people", "drifting", "road"])
+def test_other_parts_are_captured_and_learn_what_they_learn_without_graphs(part, caplog):
     captured, _, mine = with_and_without_graphs(caplog, 1, **{part: True})
     assert part == "people" or mine[-1] < mine[0]
-    assert part == "drifting" or captured.state.model.parts[1].shared["lattice"].abs().max() > 1e-4
+    learned = {"people": "lattice", "road": "offsets"}.get(part)
+    assert learned is None or captured.state.model.parts[1].shared[learned].abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("limits", [{}, {"fine_tune": 0.3, "geometry": 0.1}, {"geometry": 0.0}])

@@ -108,15 +108,16 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     model, device = open_model(inputs.checkpoint, device_settings)
     unavailable, lpips_map = load_lpips(inputs.lpips_record, device)
     training = inputs.recording.record
+    known = known_truth(inputs, job)
     with explain_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
-        groups, objects = measure_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
+        groups, objects = measure_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths, known)
         if inputs.scans is not None:
             spread = inputs.checkpoint.job.train.scans.beam_spread_rad
             lidar = lidar_metrics(model, inputs.recording.scene, inputs.scans, spread, device)
             groups = {group: {**metrics, "lidar": lidar[group]} for group, metrics in groups.items()}
         aside = side_camera_metrics(model, inputs.recording, lpips_map, device)
-        against_truth = truth_metrics(model, inputs, job, lpips_map, device)
+        against_truth = truth_metrics(model, known, inputs, job, lpips_map, device)
         sample = render_sample_pair(model, inputs.recording, job.eval_camera, device)
     header = {"schema": 1, "scene": training.scene.name, "dataset": training.scene.dataset}
     record = {
@@ -137,21 +138,30 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     return Evaluation(record, {**header, "groups": objects}, sample)
 
 
+def known_truth(inputs: EvaluationInputs, job: EvaluateJob) -> DriveTruth | None:
+    """The truth of a synthetic world; None for a recorded drive."""
+    return None if inputs.truth is None or job.removal is None else DriveTruth.read(inputs.truth, inputs.recording)
+
+
 def truth_metrics(
-    model: SplatModel, inputs: EvaluationInputs, job: EvaluateJob, lpips_map: LpipsMap | None, device: torch.device
+    model: SplatModel,
+    known: DriveTruth | None,
+    inputs: EvaluationInputs,
+    job: EvaluateJob,
+    lpips_map: LpipsMap | None,
+    device: torch.device,
 ) -> dict[str, Any]:
-    """`lateral` and `removal` for a synthetic world, as far as it has truth for them, with `lidar` where the method
-    renders it; empty for a recorded drive."""
-    if inputs.truth is None or job.removal is None:
+    """`lateral` and `removal` for a synthetic world whose truth is `known`, as far as it has truth for them, with
+    `lidar` where the method renders it; empty for a recorded drive."""
+    if known is None or job.removal is None:
         return {}
-    known, margin = DriveTruth.read(inputs.truth, inputs.recording), job.removal.margin
-    truth = known.truth
+    truth, margin = known.truth, job.removal.margin
     lateral = lateral_metrics(model, known, job.eval_camera, lpips_map, device)
     removal = removal_metrics(model, known, job.eval_camera, margin, lpips_map, device)
     found = {"lateral": lateral or {}, "removal": removal or {}}
     if inputs.scans is not None and truth.scans:
         spread = inputs.checkpoint.job.train.scans.beam_spread_rad
-        scans = ScanTruth.of(truth, inputs.truth, inputs.recording.scene, inputs.scans, job.lidar.own_car_radius)
+        scans = ScanTruth.of(truth, known.path, inputs.recording.scene, inputs.scans, job.lidar.own_car_radius)
         found = merged(found, scan_truth_metrics(model, scans, margin, spread, device))
     return {name: figures for name, figures in found.items() if figures}
 

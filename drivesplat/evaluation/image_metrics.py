@@ -1,6 +1,6 @@
 """The metrics of the images of a recording that a model was not trained on, by group and region."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -19,7 +19,7 @@ from drivesplat.evaluation.metrics import (
     with_gap,
 )  # fmt: skip
 from drivesplat.evaluation.object_metrics import ObjectErrors, by_object, object_errors
-from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
+from drivesplat.evaluation.synthetic import SURFACES, DriveTruth, rendered, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.depth import depths_in, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
@@ -54,10 +54,16 @@ def measure_groups(
     lpips_map: LpipsMap | None,
     device: torch.device,
     depths: Mapping[int, PixelDepths],
+    truth: DriveTruth | None = None,
 ) -> tuple[dict[str, dict[str, Any]], dict[str, list[dict[str, Any]]]]:
-    """`evaluate_groups`, and for every group the records of its objects (`by_object`)."""
+    """`evaluate_groups`, and for every group the records of its objects (`by_object`). With the `truth` of a synthetic
+    world that has class images of this camera also its SURFACES."""
+    classes = truth.class_images(camera) if truth else {}
     of_group = partial(_group_metrics, model, recording, lpips_map, device, depths)
-    measured = {group: of_group(images) for group, images in measured_images(recording.record, camera).items()}
+    surfaces = (lambda index, static: truth.surfaces(classes[index], static)) if truth and classes else None
+    measured = {
+        group: of_group(images, surfaces) for group, images in measured_images(recording.record, camera).items()
+    }
     return {group: own for group, (own, _) in measured.items()}, {group: own for group, (_, own) in measured.items()}
 
 
@@ -80,11 +86,14 @@ def _group_metrics(
     device: torch.device,
     depths: Mapping[int, PixelDepths],
     images: list[int],
+    surfaces: Callable[[int, np.ndarray], dict[str, np.ndarray]] | None = None,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The metrics of a held-out group of `images`, and of its objects."""
+    """The metrics of a held-out group of `images`, and of its objects. `surfaces` gives the masks of SURFACES of an
+    image, by its index and its static pixels."""
     record = recording.record
     several_cameras = len(record.camera_names) > 1
-    metrics = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if several_cameras else ())))
+    more = (*(OVERLAP_REGIONS if several_cameras else ()), *(SURFACES if surfaces else ()))
+    metrics = RegionMetrics(lpips_map, (*REGIONS, *more))
     depth_errors: list[np.ndarray] = []
 
     def renderings() -> Iterator[tuple[int, np.ndarray]]:
@@ -100,6 +109,8 @@ def _group_metrics(
     def measure(one: tuple[int, np.ndarray]) -> tuple[dict[str, FrameErrors], list[ObjectErrors]]:
         (index, image), labels = one, recording.labels(one[0])
         masks, truth = region_masks(labels), recording.image(index)
+        if surfaces:
+            masks |= surfaces(index, masks["static"])
         if several_cameras:
             masks |= overlap_masks(record, index, masks["static"])
         return metrics.measure(image, truth, masks), object_errors(recording, index, image, truth, labels)

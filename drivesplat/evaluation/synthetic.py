@@ -43,7 +43,9 @@ from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at
 
-LATERAL_REGIONS = ("all", "static", "moving_vehicle")
+SURFACES = {"road": ("road", "marking"), "markings": ("marking",)}
+"""Regions of static pixels, each with its classes in true class images."""
+LATERAL_REGIONS = ("all", "static", "moving_vehicle", *SURFACES)
 REMOVAL_REGIONS = ("box", "outside")
 
 
@@ -90,6 +92,24 @@ class DriveTruth:
     def image(self, name: str, size: tuple[int, int]) -> np.ndarray:
         """A true image (h, w, 3) in [0, 1] at `size` (width, height)."""
         return read_image(truth_image(self.path, name), size) / 255.0
+
+    def class_images(self, camera: str) -> dict[int, str]:
+        """The names of the true class images of a camera's recorded key frames, by the indices of its images."""
+        recorded = self.truth.recorded(camera)
+        return {index: truth.classes for index, truth in self.frames(recorded)} if recorded else {}
+
+    def surfaces(self, name: str, static: np.ndarray) -> dict[str, np.ndarray]:
+        """The masks (h, w) bool of SURFACES among the `static` pixels (h, w) bool, by the class image `name`."""
+        path = truth_image(self.path, name)
+        try:
+            with Image.open(path) as image:
+                classes = np.asarray(image.convert("L"))
+        except (OSError, UnidentifiedImageError, SyntaxError) as error:
+            raise unreadable(path, RULE, f"not a class image ({error})", delete=self.path) from error
+        classes = cv2.resize(classes, static.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        labels = {int(number): label for number, label in self.truth.classes.items()}
+        found = {region: [n for n, label in labels.items() if label in own] for region, own in SURFACES.items()}
+        return {region: static & np.isin(classes, numbers) for region, numbers in found.items()}
 
     def depth(self, name: str, size: tuple[int, int], mask: np.ndarray) -> PixelDepths:
         """The true depth of the pixels of a mask (h, w) bool, at `size` (width, height) by nearest neighbour; without
@@ -162,6 +182,7 @@ def _lateral_view_metrics(
         index, frame, truth, image, depth = one
         size = recording.size(index)
         masks = region_masks(label_image(recording.scene, frame, size))
+        masks |= known.surfaces(truth.classes, masks["static"])
         errors = metrics.measure(image, known.image(truth.image, size), masks)
         return errors, relative_depth_errors(depth, known.depth(truth.depth, size, masks["static"]))
 

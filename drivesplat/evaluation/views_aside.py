@@ -11,9 +11,12 @@ LATERAL = "lateral"
 VIEW_FIGURES: Figures = {
     "static": ("static", "psnr"),
     "moving_vehicle": ("moving_vehicle", "psnr"),
+    "road": ("road", "psnr"),
+    "markings": ("markings", "psnr"),
     "depth_error": ("depth", "median_relative_error"),
 }
-"""The figures of such a view, each with its keys. A left-out camera has no error of depth."""
+"""The figures of such a view, each with its keys. A left-out camera has no error of depth, no road and no
+markings."""
 View = tuple[str, str]
 """The kind of a view, LATERAL or SIDE_CAMERA, and its key there: an offset to the left in metres, or a camera."""
 

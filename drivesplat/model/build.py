@@ -12,8 +12,10 @@ from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import drifting_seed
 from drivesplat.model.exposure import Exposures, exposure_nodes
+from drivesplat.model.height_field import HeightField
 from drivesplat.model.parameters import require_rows
 from drivesplat.model.part import Part, PartDefinition, Sky
+from drivesplat.model.road import EDGE, RoadPart, RoadSeed
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -34,10 +36,11 @@ MIN_SEED_POINTS = 4
 @dataclass(frozen=True)
 class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
-    wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
-    (3,) of every camera in `exposed`, whose exposure is learned, the `reference` camera, whose exposure is only learned
-    over time (None: not), the initial `lidar_logits` of intensity and return (None: LiDAR is not rendered), and the
-    number of LiDAR `scans` that a training without images fits."""
+    wanted), the seed of the `road` (None: it is unknown or not wanted), the mean colour (3,) in [0, 1] of its sky, the
+    number of semantic `classes` (0: none), the initial gains (3,) of every camera in `exposed`, whose exposure is
+    learned, the `reference` camera, whose exposure is only learned over time (None: not), the initial `lidar_logits` of
+    intensity and return (None: LiDAR is not rendered), and the number of LiDAR `scans` that a training without images
+    fits."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
@@ -47,6 +50,7 @@ class ModelInit:
     reference: str | None = None
     lidar_logits: tuple[float, float] | None = None
     scans: int = 0
+    road: RoadSeed | None = None
 
     @property
     def views(self) -> int:
@@ -94,10 +98,8 @@ def rebuild_model(
     if not parts:
         raise ValueError("it has no parts")
     for i, definition in enumerate(parts):
-        prefix = f"parts.{i}.params."
-        params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-        made.append(_rebuilt(params, definition, settings))
-    first = {key.removeprefix(FIRST_PREFIX): gains for key, gains in state.items() if key.startswith(FIRST_PREFIX)}
+        made.append(_rebuilt(_below(state, f"parts.{i}."), definition, settings))
+    first = _below(state, FIRST_PREFIX)
     learned = tuple(key.removeprefix(LEARNED_PREFIX) for key in state if key.startswith(LEARNED_PREFIX))
     model = SplatModel(
         made,
@@ -111,11 +113,19 @@ def rebuild_model(
     return model
 
 
-def _rebuilt(params: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
+def _below(state: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+
+
+def _rebuilt(state: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
+    params = _below(state, "params.")
     if definition.part not in OBJECTS:
         require_rows(params)
     if definition.part == Background.name:
         return Background(params, settings.gaussians, definition.extent)
+    if definition.part == RoadPart.name:
+        surface = HeightField(state["lower"], EDGE, state["heights"], state["covered"])
+        return RoadPart(params, surface, settings.road, settings.gaussians, definition.extent)
     own = getattr(settings, definition.part)
     if definition.part == Drifting.name:
         if definition.seconds is None:
@@ -154,7 +164,14 @@ def _init_drifting(init: ModelInit, settings: TrainSettings) -> Part | None:
     )
 
 
-_MAKERS = {Background.name: _init_background, Drifting.name: _init_drifting}
+def _init_road(init: ModelInit, settings: TrainSettings) -> Part | None:
+    if init.road is None:
+        return None
+    extent = init.record.scene_scale
+    return RoadPart.from_seed(init.road, settings.road, settings.gaussians, extent, init.classes, init.lidar_logits)
+
+
+_MAKERS = {Background.name: _init_background, RoadPart.name: _init_road, Drifting.name: _init_drifting}
 """What makes the parts that do not consist of objects, by name."""
 
 

@@ -133,7 +133,7 @@ class Part(nn.Module, ABC):
         return {}
 
     def confine(self) -> None:
-        """Fades Gaussians at places where this part must not have any."""
+        """Fades Gaussians at places where this part must not have any; may move others back to where they belong."""
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """The mask of a track's rows; None where this part does not know the track as an object."""

@@ -11,6 +11,8 @@ from drivesplat.report.statistics import mean_over_scenes
 TABLE_FIGURES = (
     {"key": "static", "title": "static ↑", "form": "{:.1f}", "kind": "first"},
     {"key": "moving_vehicle", "title": "moving ↑", "form": "{:.1f}", "kind": ""},
+    {"key": "road", "title": "road ↑", "form": "{:.1f}", "kind": ""},
+    {"key": "markings", "title": "markings ↑", "form": "{:.1f}", "kind": ""},
     {"key": "depth_error", "title": "depth error ↓", "form": "{:.1%}", "kind": ""},
 )
 """The columns of the table: key of the figure, title, format and CSS class."""

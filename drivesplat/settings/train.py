@@ -11,7 +11,7 @@ from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.settings.train_objects import ActorSettings, DeformableSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 
-PartName = Literal["background", "actors", "deformable", "drifting"]
+PartName = Literal["background", "road", "actors", "deformable", "drifting"]
 STAGE_OF_PART: dict[PartName, str] = {"actors": "actors", "deformable": "actors"}
 """The parts whose Gaussians are objects that move, and the stage that finds these objects in a scene."""
 MOVING_PARTS: tuple[PartName, ...] = (*STAGE_OF_PART, "drifting")
@@ -215,11 +215,16 @@ class TrainSettings(Settings):
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":
         """These settings with those at their defaults that have no effect on a method of `parts`: those of other moving
-        parts and, without any part that consists of objects, the loss weights of objects."""
+        parts and of the part `road`, and without any part that consists of objects the loss weights of objects."""
         fields = [part for part in MOVING_PARTS if part not in parts]
         if not set(STAGE_OF_PART) & set(parts):
             fields += ["entropy_weight", "dynamic_weight"]
-        return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
+        unused = {name: type(self).model_fields[name].default for name in fields}
+        if "road" not in parts:
+            own = RoadSettings()
+            offsets = {"lr_offsets": own.lr_offsets, "offsets_weight": own.offsets_weight}
+            unused["road"] = self.road.model_copy(update=offsets)
+        return self.model_copy(update=unused)
 
 
 class TrainJob(Settings):

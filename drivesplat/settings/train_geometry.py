@@ -19,7 +19,8 @@ class FloaterSettings(Settings):
 
 
 class RoadSettings(Settings):
-    """Selection of the background Gaussians that train.road_weight acts on."""
+    """The surface of the road: for the part `road`, whose Gaussians lie in it, and without this part for the background
+    Gaussians that train.road_weight acts on (docs/geometry.md)."""
 
     surface: Literal["path", "lidar", "lidar_or_path"] = "path"
     """'path': the road under the path of the vehicle, which follows from its poses. 'lidar': the ground wherever LiDAR
@@ -28,4 +29,11 @@ class RoadSettings(Settings):
     """Maximum lateral distance from the path of the vehicle's centre (metres) of the road under the path. The weight
     falls with this distance, since kerbs and grass may begin beside the vehicle."""
     reach: float = Field(0.3, gt=0, le=2)
-    """Maximum height of a centre above or below the road surface (metres)."""
+    """Maximum height of a centre above or below the road surface (metres) for train.road_weight. The part `road` keeps
+    other static Gaussians out of so much space below it."""
+    lr_offsets: float = Field(1e-3, gt=0)
+    """Initial learning rate of the vertical offsets of the part `road` (metres). It decays as that of positions does.
+    """
+    offsets_weight: float = Field(100.0, ge=0)
+    """Weight of the penalty on these offsets: the mean over the surface of their squares (metres) and of their squared
+    slopes. 0 = they may be any."""

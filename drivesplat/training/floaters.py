@@ -12,6 +12,7 @@ from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import SparseGrid, dilated
 from drivesplat.model.parameters import fade
 from drivesplat.model.part import Part
+from drivesplat.model.road import RoadPart
 
 LARGEST_STEP = 15.0
 """Maximum distance in metres between consecutive positions that a path connects."""
@@ -91,22 +92,25 @@ def cells_around(starts: Float[np.ndarray, "m 3"], ends: Float[np.ndarray, "m 3"
 
 @dataclass(frozen=True)
 class EmptySpace:
-    """Space in which nothing is seen: along the `path` of sensors, and below the `road`; each None where it is unknown
-    or not wanted."""
+    """Space without Gaussians of static parts: along the `path` of sensors, below the `road`, and around the surface of
+    the `road_part`, which alone has Gaussians there; each None where it is unknown or not wanted."""
 
     path: SensorPath | None = None
     road: Road | None = None
+    road_part: RoadPart | None = None
 
     @property
     def known(self) -> bool:
-        """Whether any space is known to be empty."""
-        return self.path is not None or self.road is not None
+        """Whether there is any such space."""
+        return any(it is not None for it in (self.path, self.road, self.road_part))
 
     def holds(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """The mask of points in empty space."""
         held = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         if self.path is not None:
             held = held | self.path.holds(points)
+        if self.road_part is not None:
+            held = held | self.road_part.owns(points)
         return held if self.road is None else held | self.road.is_above(points)
 
 
@@ -120,6 +124,6 @@ def fade_floaters(part: Part, empty: EmptySpace) -> None:
 
 
 def fade_in_empty_space(parts: Iterable[Part], empty: EmptySpace) -> None:
-    """Fades the Gaussians of all static `parts` whose centres lie in empty space, where any is known."""
-    for part in (part for part in parts if not part.moves and empty.known):
+    """Fades the Gaussians of all static `parts`, the road's excepted, whose centres lie in empty space."""
+    for part in (part for part in parts if not part.moves and part is not empty.road_part and empty.known):
         fade_floaters(part, empty)

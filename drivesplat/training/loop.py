@@ -20,6 +20,7 @@ from drivesplat.kernels.road_distance import Road
 from drivesplat.machine.device import device_name, explain_out_of_memory
 from drivesplat.model.picture import Picture
 from drivesplat.model.reach import bound_positions, reach_of
+from drivesplat.model.road import RoadPart
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN
 from drivesplat.settings.train import TrainSettings
@@ -114,7 +115,8 @@ def _iterate(run: "TrainingRun", monitor: Monitor) -> None:
     trainer, state, schedule = run.trainer, run.trainer.state, run.trainer.schedule
     settings, sensors = schedule.settings, trainer.sensor_positions
     driven = SensorPath.of(sensors, settings.floaters.radius) if settings.floaters.radius else None
-    empty = EmptySpace(driven, state.road if settings.floaters.below_road else None)
+    road_part = next((part for part in state.model.parts if isinstance(part, RoadPart)), None)
+    empty = EmptySpace(driven, state.road if settings.floaters.below_road else None, road_part)
     reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
     while state.step < schedule.steps:
         with state.clock.stage(ITERATION):
@@ -164,7 +166,7 @@ def _densify(run: "TrainingRun", picture: Picture | None, empty: EmptySpace) -> 
 
 
 def _confine(model: SplatModel) -> None:
-    """Fades Gaussians of objects outside their boxes."""
+    """Fades Gaussians where their parts must not have any, as outside the boxes of objects."""
     for part in model.parts:
         part.confine()
 

@@ -20,6 +20,7 @@ from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.machine.device import choose_device, explain_out_of_memory, flush_denormals
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
+from drivesplat.model.road import RoadPart
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.images import below_horizon
 from drivesplat.scene.masks import NO_MASKS, read_classes, read_labels, read_masks_record, read_sky_mask
@@ -35,6 +36,7 @@ from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
 from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, evenly_spaced
 from drivesplat.training.road import road_of
+from drivesplat.training.road_seed import layer_of, road_seed
 from drivesplat.training.scans import TrainingScan, initial_lidar_logits, load_scans, with_scan_points
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import Supervision, TrainingView, load_views
@@ -172,6 +174,14 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     more = len(record.points) - len(inputs.record.points)
     resolved = {"cap_max": cap + more, "dropout": dropout_share(record, job.train)}
     settings = job.train.model_copy(update=resolved)
+    known = len(record.train_images) and (settings.road_weight or RoadPart.name in job.parts)
+    road = road_of(inputs.record, settings.road) if known else None
+    wanted, reach = road is not None and RoadPart.name in job.parts, settings.road.reach
+    seed = road_seed(record, road, settings.cap_max, reach) if wanted else None
+    kept = None if seed is None else ~layer_of(seed.surface, record.points, reach)
+    if seed is not None and kept is not None and kept.any():
+        record = dataclasses.replace(record, points=record.points[kept], points_rgb=record.points_rgb[kept])
+        settings = settings.model_copy(update={"cap_max": settings.cap_max - len(seed.positions), "road_weight": 0.0})
     exposed = inputs.exposed(job)
     init = ModelInit(
         record,
@@ -182,6 +192,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         job.reference_camera,
         initial_lidar_logits(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
+        seed,
     )
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
         views = [dataclasses.replace(view, sky=None) for view in views]
@@ -192,8 +203,6 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         raise TrainingError("no LiDAR scan is there to train with; set train.scans.per_image to 0")
     model = build_model(init, job.parts, job.sky, settings)
     choose_mirrored(model, record, settings)
-    known = settings.road_weight and len(record.train_images)
-    road = road_of(inputs.record, settings.road) if known else None
     return Prepared(model, views, settings, road, curves, scans)
 
 

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 
 from drivesplat.errors import ResultError
-from drivesplat.evaluation.evaluate import EvaluationInputs, truth_metrics
+from drivesplat.evaluation.evaluate import EvaluationInputs, known_truth, truth_metrics
+from drivesplat.evaluation.image_metrics import measure_groups, measured_images
 from drivesplat.evaluation.metrics import RegionMetrics, measuring_threads
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.model.gaussians import Gaussians
@@ -130,7 +131,8 @@ def test_a_constant_colours_lateral_figures_follow_from_the_pngs(known):
     options = {"data_range": 1.0, "channel_axis": 2, "gaussian_weights": True, "sigma": 1.5}
     for left in OFFSETS:
         found = lateral_of_grey[str(left)]
-        assert found.keys() == {"all", "static", "moving_vehicle", "depth"}
+        assert found.keys() == {"all", "static", "moving_vehicle", "road", "markings", "depth"}
+        assert found["road"] is found["markings"] is None, "the class images show the sky alone"
         images, masks = [], []
         for frame, truth in lateral_frames(known, left):
             pose, boxes = pose_in_scene(known, truth), movable_boxes(known, frame)
@@ -268,6 +270,40 @@ def test_the_depth_error_is_the_median_over_static_pixels_of_known_depth(known, 
         assert min(abs(other - median) for other in others) > 1e-3 * median, "the offsets must differ"
 
 
+def with_class_images(known: DriveTruth) -> tuple[DriveTruth, np.ndarray]:
+    """The same truth with class images, all alike: rows of road, with a marking, below others; and that image."""
+    classes = np.full((90, 160), 7, dtype=np.uint8)
+    classes[60:] = 0
+    classes[70:75, 20:90] = 14
+    Image.fromarray(classes).save(known.path.parent / "classes.png")
+
+    def shown(view: TruthView) -> TruthView:
+        frames = tuple(dataclasses.replace(frame, classes="classes.png") for frame in view.frames)
+        return dataclasses.replace(view, frames=frames)
+
+    views = tuple(map(shown, known.truth.views))
+    numbers = {"0": "road", "7": "sign", "14": "marking"}
+    return dataclasses.replace(known, truth=dataclasses.replace(known.truth, classes=numbers, views=views)), classes
+
+
+def test_road_and_markings_are_static_pixels_by_the_true_class_images(known):
+    """From aside and, in held-out images, from the path."""
+    classified, classes = with_class_images(known)
+    aside = lateral_metrics(flat_model(), classified, "CAM_FRONT", None, CPU)["2.0"]
+    images = [pixels_of(known, truth.image) for _, truth in lateral_frames(known, 2.0)]
+    for region, numbers in (("road", (0, 14)), ("markings", (14,))):
+        masks = [static & np.isin(classes, numbers) for static in static_masks(known, 2.0)]
+        assert aside[region]["pixels"] == pytest.approx(np.sum(masks), rel=2e-3)
+        assert aside[region]["psnr"] == pytest.approx(by_hand(GREY, images, masks), abs=0.02)
+    groups, _ = measure_groups(flat_model(), known.recording, "CAM_FRONT", None, CPU, {}, classified)
+    unclassified, _ = measure_groups(flat_model(), known.recording, "CAM_FRONT", None, CPU, {})
+    for group, figures in groups.items():
+        assert figures.keys() - unclassified[group].keys() == {"road", "markings"}
+        held_out = measured_images(known.recording.record, "CAM_FRONT")[group]
+        static = [known.recording.labels(index) == LABELS["static"] for index in held_out]
+        assert figures["road"]["pixels"] == sum(int((own & (classes != 7)).sum()) for own in static)
+
+
 def test_moving_pixels_and_the_sky_have_no_part_in_the_depth_error(known, cast_depth):
     """Their depth, 5 m in the sky, is wrong ninefold; that of the rest by a random share."""
     random, spared = np.random.default_rng(0), {left: [] for left in OFFSETS}
@@ -371,7 +407,8 @@ def test_a_recorded_drive_is_not_compared_with_ground_truth(known):
     cameras = {"eval_camera": "CAM_FRONT", "cameras": ("CAM_FRONT", "CAM_BACK")}
     job = EvaluateJob(**cameras, sweeps=False, holdout=HOLDOUT, lpips=False, lidar=lidar, removal=None)
     inputs = EvaluationInputs(EMPTY_CHECKPOINT, {}, known.recording, EMPTY_MASKS, lpips_record=None, truth=known.path)
-    assert truth_metrics(flat_model(), inputs, job, None, CPU) == {}
+    truth = known_truth(inputs, job)
+    assert truth is None and truth_metrics(flat_model(), truth, inputs, job, None, CPU) == {}
 
 
 def test_figures_need_the_recorded_poses_and_a_leading_car(known):

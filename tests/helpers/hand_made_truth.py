@@ -20,7 +20,8 @@ UNMADE = "not made.png"
 def write_truth(root: Path, world: World, scene: Scene) -> Path:
     """Writes the truth of a tiny drive below its `root`; returns the path of truth.json.
 
-    Images of instances and classes are not made, nor those of a view of an edited drive and of one by another camera.
+    Images of instances are not made, nor any of a view of an edited drive and of one by another camera; class images
+    show the sky alone.
     """
     empty = replace(world, things=world.things[1:])
     views = [_view(root, replace(world, left=left), scene, f"lateral {left}") for left in (0.0, *OFFSETS)]
@@ -39,7 +40,7 @@ def write_truth(root: Path, world: World, scene: Scene) -> Path:
 
 
 def _unmade(frame: TruthFrame) -> TruthFrame:
-    return replace(frame, image=UNMADE, depth=UNMADE)
+    return replace(frame, image=UNMADE, depth=UNMADE, classes=UNMADE)
 
 
 def _view(root: Path, world: World, scene: Scene, folder: str) -> TruthView:
@@ -48,12 +49,13 @@ def _view(root: Path, world: World, scene: Scene, folder: str) -> TruthView:
 
 
 def _frame(root: Path, world: World, frame: Frame, folder: str) -> TruthFrame:
-    image, depth = (f"{folder}/{kind}/{frame.sample_index:04}.png" for kind in ("image", "depth"))
+    image, depth, classes = (f"{folder}/{kind}/{frame.sample_index:04}.png" for kind in ("image", "depth", "classes"))
     seconds = seconds_of(frame.timestamp)
     write_array(root / "truth" / image, world.image(seconds))
     write_array(root / "truth" / depth, depth_values(true_depths(world, frame)[..., 0]))
+    write_array(root / "truth" / classes, np.zeros((world.height, world.width), dtype=np.uint8))
     pose = rigid(CAMERA_TO_EGO, ORIGIN + world.ego_at(seconds) + CAMERA_AT)
-    return TruthFrame(frame.token, frame.sample_index, pose.tolist(), image, depth, UNMADE, UNMADE)
+    return TruthFrame(frame.token, frame.sample_index, pose.tolist(), image, depth, UNMADE, classes)
 
 
 def write_array(path: Path, values: np.ndarray) -> None:

@@ -20,6 +20,8 @@ from drivesplat.model.background import Background
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting
 from drivesplat.model.drifting_seed import DriftingSeed
+from drivesplat.model.height_field import HeightField
+from drivesplat.model.road import EDGE, RoadPart, RoadSeed
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -134,6 +136,19 @@ def untrained_drifting(settings: TrainSettings) -> SplatModel:
     seed = DriftingSeed(positions, velocities, peaks, colors, scales)
     drifting = Drifting.from_seed(seed, settings.drifting, settings.gaussians, 1.0, (0.0, 2.0))
     return SplatModel([*still.parts, drifting], still.sky)
+
+
+def untrained_road(settings: TrainSettings) -> SplatModel:
+    """Background, a road 4 metres before the cameras of `recorded_views`, whose axes it shares, and a sky."""
+    still, (positions, colors) = untrained(settings, sky=True), seed_points(40)
+    nodes = int(8.0 / EDGE) + 1
+    covered = torch.ones(nodes - 1, nodes - 1, dtype=torch.bool)
+    surface = HeightField(torch.full((2,), -4.0), EDGE, torch.full((nodes, nodes), 4.0), covered)
+    positions[:, 2] = 4.0
+    road = RoadPart.from_seed(
+        RoadSeed(surface, positions, np.full(40, 0.3), colors), settings.road, settings.gaussians, 1.0
+    )
+    return SplatModel([*still.parts, road], still.sky)
 
 
 def guided_views(device: torch.device = CPU) -> list[TrainingView]:

@@ -127,7 +127,8 @@ def record_aside(scene: str, better: float) -> dict[str, Any]:
 
     def of(more: float) -> dict[str, Any]:
         far, near = (
-            view(psnr + more, depth={"median_relative_error": off}) for psnr, off in ((20.0, 0.4), (22.0, 0.2))
+            view(psnr + more, road={"psnr": 21.5}, markings=None, depth={"median_relative_error": off})
+            for psnr, off in ((20.0, 0.4), (22.0, 0.2))
         )
         aside = {"lateral": {"4.0": far, "2.0": near}, "side_camera": {"CAM_BACK": view(18.0 + more)}}
         return {**method(group(24.0, 17.0), group(22.0, 14.0)), **aside}
@@ -156,8 +157,8 @@ def test_rows_are_by_scene_view_and_method_and_means_over_scenes(aside):
 def test_the_page_has_a_row_for_each_view_means_of_several_scenes_and_no_table_without_such_views(aside, tmp_path):
     rows = page_rows(report_page(aside, {}), "aside")
     assert len(rows) == 12 + 6
-    assert rows[1] == ["0061", "2 m to the left", "street", "23.0", "–", "20.0%"]
-    assert rows[5] == ["0061", "CAM_BACK, left out", "street", "19.0", "–", "–"]
+    assert rows[1] == ["0061", "2 m to the left", "street", "23.0", "–", "21.5", "–", "20.0%"]
+    assert rows[5] == ["0061", "CAM_BACK, left out", "street", "19.0", *"––––"]
     assert rows[13][:4] == ["mean", "2 m to the left", "street", "24.0"]
     one = report_of(tmp_path / "one", record_aside("0061", 1.0), methods=BOTH)
     assert len(page_rows(report_page(one, {}), "aside")) == 6

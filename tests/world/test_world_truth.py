@@ -7,6 +7,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drivesplat.readers.truth import Truth, TruthFrame, TruthView, read_truth
+from drivesplat.world.layout import CROSSING, LANE
 from drivesplat.world.optics.imaging import WorldCamera
 from drivesplat.world.optics.raycast import NO_HIT
 from drivesplat.world.output.truth import TruthPlan, key_frames_of
@@ -103,6 +104,28 @@ def test_depth_instances_and_classes_are_those_of_what_each_pixel_shows(
     assert (decoded[~sky & (found.depth > 256.0)] == 65535 / 256).all()
     heights = points_of(decoded, demo_recorder.camera(FRONT, time_of(index) * 1e-6))[-10:, :, 2]
     assert np.abs(np.median(heights)) < 0.02, "the lower rows show the road"
+
+
+def test_markings_are_the_paint_on_the_road(recorded, demo_root, demo_recorder):
+    """On the straight road of the demo: lane edges, dashes along the centre line, and the crossing."""
+    road, paint = (np.zeros((0, 2)) for _ in range(2))
+    for index, frame in enumerate(recorded.frames):
+        classes, decoded = png(demo_root, frame, "classes"), png(demo_root, frame, "depth") / 256.0
+        places = points_of(decoded, demo_recorder.camera(FRONT, time_of(index) * 1e-6))[..., :2]
+        near = decoded < 30.0
+        road = np.concatenate([road, places[near & (classes == SurfaceClass.ROAD)]])
+        paint = np.concatenate([paint, places[near & (classes == SurfaceClass.MARKING)]])
+    assert len(paint) > 200 and len(road) > 5000
+
+    def off(places: np.ndarray, grown: float) -> np.ndarray:
+        """Whether places are outside of all paint that is larger by so much on every side."""
+        s, t = places[:, 0], np.abs(places[:, 1])
+        edge = np.abs(t - LANE) < 0.08 + grown
+        dash = (t < 0.08 + grown) & ((s + grown) % 6.0 < 3.0 + 2.0 * grown)
+        return ~(edge | dash | ((s > CROSSING[0] - grown) & (s < CROSSING[1] + grown)))
+
+    assert off(paint, 0.06).mean() < 0.01, "depths are rounded, so places are off by centimetres"
+    assert off(road, -0.06)[~((road[:, 0] > CROSSING[0]) & (road[:, 0] < CROSSING[1]))].mean() > 0.99
 
 
 def ego_to_global(tables, sample_data: str) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivesplat.world.optics.lighting import Light, shade
+from drivesplat.world.optics.materials import find_paint
 from drivesplat.world.optics.raycast import NO_HIT, RayHits, StreetRays, StreetSnapshot
 from drivesplat.world.shapes.mesh import GAMMA, SurfaceClass
 
@@ -61,12 +62,14 @@ class WorldCamera:
 class StreetImage:
     """An image of the street. `radiance` (h, w, 3) float64 times the camera's gains. At pixel centres: `depth` (h, w)
     along the optical axis in metres, infinite for the sky; `objects` (h, w), the index of the visible object, -1 for
-    the sky; `classes` (h, w) uint8, values of `SurfaceClass`."""
+    the sky; `classes` (h, w) uint8, values of `SurfaceClass`; `markings` (h, w) bool, whether there is paint on the
+    road."""
 
     radiance: np.ndarray
     depth: np.ndarray
     objects: np.ndarray
     classes: np.ndarray
+    markings: np.ndarray
 
 
 def render(snapshot: StreetSnapshot, light: Light, camera: WorldCamera, samples: int) -> StreetImage:
@@ -98,6 +101,7 @@ def _through_centers(
     bool in which a surface ends or its light changes: they differ from one beside, above or below."""
     count, caster = camera.width * camera.height, snapshot.caster
     depth, objects, face = np.empty(count), np.empty(count, np.int32), np.empty(count, np.int64)
+    markings = np.zeros(count, dtype=bool)
     radiance, lit = np.empty((count if light else 0, 3)), np.zeros(count, dtype=bool)
     for block in _blocks(count, 1):
         y, x = np.divmod(np.arange(count)[block], camera.width)
@@ -106,11 +110,16 @@ def _through_centers(
         axes = camera.camera_to_street[rays.moment, :3, 2]
         depth[block] = hits.distance * np.einsum("ni,ni->n", rays.directions, axes)
         objects[block], face[block] = hits.object, hits.face
+        road = np.flatnonzero((hits.face >= 0) & (caster.surface_class[hits.face] == SurfaceClass.ROAD))
+        found = np.empty(len(road), dtype=bool)
+        find_paint(caster.texture_points(hits.face[road], hits.weights[road]), found)
+        markings[block][road] = found
         if light:
             radiance[block], lit[block] = _radiance(snapshot, light, camera, rays, hits)
     size = camera.height, camera.width
     classes = np.where(face >= 0, caster.surface_class[face], int(SurfaceClass.SKY)).astype(np.uint8)
-    picture = StreetImage(np.empty((0, 0, 3)), depth.reshape(size), objects.reshape(size), classes.reshape(size))
+    planes = (values.reshape(size) for values in (depth, objects, classes, markings))
+    picture = StreetImage(np.empty((0, 0, 3)), *planes)
     surfaces = np.where(face >= 0, caster.surface[face], NO_HIT).reshape(size)
     edges, lit, inverse_depth = np.zeros(size, dtype=bool), lit.reshape(size), 1.0 / picture.depth
     for axis in (0, 1) if light else ():

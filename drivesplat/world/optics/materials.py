@@ -46,16 +46,33 @@ def ground(x, y, footprint):
         tone *= 1 - 0.6 * stripes(x, 1.0, 0.012, footprint)
         return tone, tone, 0.98 * tone
     tone = 0.085 * asphalt(x, y, footprint) * iron(x, y, footprint)
-    white = coverage(a, LANE - 0.08, LANE + 0.08, footprint)
-    if a < 0.08 + footprint:
-        white = max(white, coverage(a, -0.08, 0.08, footprint) * stripes(x, 6.0, 3.0, footprint))
-    if CROSSING[0] - 1 < x < CROSSING[1] + 1:
-        white = max(white, coverage(x, CROSSING[0], CROSSING[1], footprint) * stripes(y, 1.0, 0.5, footprint))
+    white = paint(x, y, footprint)
     if white > 0.0:
         white *= 0.75 + 0.25 * plane_fractal(x, y, 0.6, footprint) + 0.1 * grain(x, y, 0.012, footprint)
         white *= 1 - 0.5 * max(0.0, 1.5 * grain(x, y, 0.07, footprint) - 0.6)
     tone = tone * (1 - white) + 0.6 * white
     return tone, tone, 1.03 * tone
+
+
+@compiled
+@no_type_check
+def paint(x, y, footprint):
+    """Share of a pixel on the road that is painted: lane edges, the dashed centre line, the crossing."""
+    a = abs(y)
+    white = coverage(a, LANE - 0.08, LANE + 0.08, footprint)
+    if a < 0.08 + footprint:
+        white = max(white, coverage(a, -0.08, 0.08, footprint) * stripes(x, 6.0, 3.0, footprint))
+    if CROSSING[0] - 1 < x < CROSSING[1] + 1:
+        white = max(white, coverage(x, CROSSING[0], CROSSING[1], footprint) * stripes(y, 1.0, 0.5, footprint))
+    return white
+
+
+@compiled
+@no_type_check
+def find_paint(points, out):
+    """Fills `out` (n,) bool: whether there is paint at `points` (n, 3) of the road's texture space."""
+    for i in range(len(points)):
+        out[i] = paint(points[i, 0], points[i, 1], 0.0) > 0.5
 
 
 @compiled

@@ -78,7 +78,7 @@ def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> 
     images = {
         "depth": np.clip(depth + 0.5, 0, DEPTH_LIMIT).astype(np.uint16),
         "instances": _numbers_of_objects(recorder, view)[picture.objects + 1],
-        "classes": picture.classes,
+        "classes": np.where(picture.markings, np.uint8(SurfaceClass.MARKING), picture.classes),
     }
     if not recorded:
         images["image"] = to_bytes(picture.radiance)

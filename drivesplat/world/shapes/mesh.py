@@ -48,6 +48,8 @@ class SurfaceClass(IntEnum):
     ANIMAL = 11
     OBJECT = 12
     SKY = 13
+    MARKING = 14
+    """Paint on the road. Only true images tell it from ROAD."""
 
 
 GAMMA = 2.2
