@@ -538,8 +538,7 @@ def test_exposure_over_time_is_captured_and_learns_what_it_learns_without_graphs
 def test_other_parts_are_captured_and_learn_what_they_learn_without_graphs(part, caplog):
     captured, _, mine = with_and_without_graphs(caplog, 1, **{part: True})
     assert part == "people" or mine[-1] < mine[0]
-    learned = {"people": "lattice", "road": "offsets"}.get(part)
-    assert learned is None or captured.state.model.parts[1].shared[learned].abs().max() > 1e-4
+    assert part != "people" or captured.state.model.parts[1].shared["lattice"].abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("limits", [{}, {"fine_tune": 0.3, "geometry": 0.1}, {"geometry": 0.0}])

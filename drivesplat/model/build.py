@@ -125,7 +125,7 @@ def _rebuilt(state: dict[str, torch.Tensor], definition: PartDefinition, setting
         return Background(params, settings.gaussians, definition.extent)
     if definition.part == RoadPart.name:
         surface = HeightField(state["lower"], EDGE, state["heights"], state["covered"])
-        return RoadPart(params, surface, settings.road, settings.gaussians, definition.extent)
+        return RoadPart(params, surface, settings.gaussians, definition.extent)
     own = getattr(settings, definition.part)
     if definition.part == Drifting.name:
         if definition.seconds is None:
@@ -168,7 +168,7 @@ def _init_road(init: ModelInit, settings: TrainSettings) -> Part | None:
     if init.road is None:
         return None
     extent = init.record.scene_scale
-    return RoadPart.from_seed(init.road, settings.road, settings.gaussians, extent, init.classes, init.lidar_logits)
+    return RoadPart.from_seed(init.road, settings.gaussians, extent, init.classes, init.lidar_logits)
 
 
 _MAKERS = {Background.name: _init_background, RoadPart.name: _init_road, Drifting.name: _init_drifting}

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -35,8 +35,7 @@ class HeightField:
         HeightSamples(heights=tensor([0.2500]), slopes=tensor([[0.5000, 0.0000]]))
         """
         columns = self.heights.shape[1]
-        along = (places - self.lower) / self.edge
-        cell = self._cells(along.detach())
+        along, cell = self._cells(places)
         x, y = (along - cell).unbind(dim=1)
         first, nodes = cell[:, 0] * columns + cell[:, 1], self.heights.flatten()
         low, in_y, in_x, far = (nodes.index_select(0, first + step) for step in (0, 1, columns, columns + 1))
@@ -47,8 +46,7 @@ class HeightField:
     @torch.no_grad()
     def covers(self, places: Float[Tensor, "n 2"]) -> Bool[Tensor, " n"]:
         """Whether places lie in cells in which the surface is known. Does not synchronise with the device."""
-        along = (places - self.lower) / self.edge
-        cell = self._cells(along)
+        along, cell = self._cells(places)
         inside = ((along - cell >= 0.0) & (along - cell <= 1.0)).all(dim=1)
         return inside & self.covered.flatten().index_select(0, cell[:, 0] * self.covered.shape[1] + cell[:, 1])
 
@@ -58,7 +56,9 @@ class HeightField:
         over = points[:, 2] - self.at(points[:, :2]).heights
         return self.covers(points[:, :2]) & (over > -below) & (over < above)
 
-    def _cells(self, along: Float[Tensor, "n 2"]) -> Tensor:
-        """The cells (n, 2) of places in units of edges from the first node, the nearest of the grid's cells."""
-        x, y = along.floor().long().unbind(dim=1)
-        return torch.stack([x.clamp(0, self.covered.shape[0] - 1), y.clamp(0, self.covered.shape[1] - 1)], dim=1)
+    def _cells(self, places: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 2"], Int[Tensor, "n 2"]]:
+        """Places in units of edges from the first node, and the nearest cells of the grid."""
+        along = (places - self.lower) / self.edge
+        x, y = along.detach().floor().long().unbind(dim=1)
+        limits = (count - 1 for count in self.covered.shape)
+        return along, torch.stack([at.clamp(0, limit) for at, limit in zip((x, y), limits, strict=True)], dim=1)

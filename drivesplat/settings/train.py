@@ -215,16 +215,11 @@ class TrainSettings(Settings):
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":
         """These settings with those at their defaults that have no effect on a method of `parts`: those of other moving
-        parts and of the part `road`, and without any part that consists of objects the loss weights of objects."""
+        parts and, without any part that consists of objects, the loss weights of objects."""
         fields = [part for part in MOVING_PARTS if part not in parts]
         if not set(STAGE_OF_PART) & set(parts):
             fields += ["entropy_weight", "dynamic_weight"]
-        unused = {name: type(self).model_fields[name].default for name in fields}
-        if "road" not in parts:
-            own = RoadSettings()
-            offsets = {"lr_offsets": own.lr_offsets, "offsets_weight": own.offsets_weight}
-            unused["road"] = self.road.model_copy(update=offsets)
-        return self.model_copy(update=unused)
+        return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
 
 
 class TrainJob(Settings):

@@ -29,11 +29,4 @@ class RoadSettings(Settings):
     """Maximum lateral distance from the path of the vehicle's centre (metres) of the road under the path. The weight
     falls with this distance, since kerbs and grass may begin beside the vehicle."""
     reach: float = Field(0.3, gt=0, le=2)
-    """Maximum height of a centre above or below the road surface (metres) for train.road_weight. The part `road` keeps
-    other static Gaussians out of so much space below it."""
-    lr_offsets: float = Field(1e-3, gt=0)
-    """Initial learning rate of the vertical offsets of the part `road` (metres). It decays as that of positions does.
-    """
-    offsets_weight: float = Field(100.0, ge=0)
-    """Weight of the penalty on these offsets: the mean over the surface of their squares (metres) and of their squared
-    slopes. 0 = they may be any."""
+    """Maximum height of a centre above or below the road surface (metres). The part `road` has a layer of its own."""

@@ -11,7 +11,7 @@ from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import dilated
 from drivesplat.model.build import random_subset
 from drivesplat.model.height_field import HeightField
-from drivesplat.model.road import ABOVE, EDGE, RoadSeed
+from drivesplat.model.road import EDGE, RoadSeed, in_layer
 from drivesplat.scene.training_record import TrainingRecord
 
 STIFFNESS = 1.0
@@ -29,18 +29,17 @@ MIN_POINTS = 4
 """LiDAR points that decide on a cell."""
 LARGEST_SHARE = 0.6
 """Share of the Gaussians of all that is static that the road has at most."""
-NEIGHBOURS = 4
-"""Seed points whose mean colour a Gaussian gets."""
 FINEST = 0.05
 """Metres between neighbouring Gaussians, at least."""
 MIN_DEPTH, MIN_RISE = 1.0, 0.2
 """Metres before a camera, and below it, that count where less would."""
 
 
-def road_seed(record: TrainingRecord, road: Road, cap: int, reach: float) -> RoadSeed | None:
+def road_seed(record: TrainingRecord, road: Road, cap: int) -> RoadSeed | None:
     """The surface through the planes of a `road`, as far as training images see it, and Gaussians in it: of a `cap` for
-    all that is static the share of pixels that the road fills, or as many as the seed points of the record that they
-    replace. None where nothing of a road is known or seen."""
+    all that is static the share of pixels that the road fills, or as many as the seed points that they replace where
+    these are more. They have the colours of the nearest seed points. None where nothing of a road is known or seen, or
+    all seed points are in its layer."""
     if not len(road.weights) or not record.train_images:
         return None
     surface = surface_of(road, record.points[: record.seed.lidar])
@@ -51,9 +50,9 @@ def road_seed(record: TrainingRecord, road: Road, cap: int, reach: float) -> Roa
     covered = torch.zeros_like(surface.covered)
     covered[tuple(cells[seen].T)] = True
     surface = HeightField(surface.lower, EDGE, surface.heights, covered)
-    replaced = int(layer_of(surface, record.points, reach).sum())
+    replaced = int(in_layer(surface, _tensor(record.points).float()).sum())
     count = int(min(LARGEST_SHARE * cap, max(replaced, cap * shown.sum() * EDGE**2 / every)))
-    if not count:
+    if not count or replaced == len(record.points):
         return None
     per_side = gaussians_per_side(finest[seen], count)
     places = np.concatenate([_spread(cells[seen][per_side == n], n) for n in np.unique(per_side).tolist()])
@@ -61,14 +60,13 @@ def road_seed(record: TrainingRecord, road: Road, cap: int, reach: float) -> Roa
     spacing = np.repeat(EDGE / np.sort(per_side), np.sort(per_side) ** 2)
     kept = random_subset(len(positions), count)
     positions, spacing = positions[kept], spacing[kept] * np.sqrt(len(positions) / len(kept))
-    _, nearest = cKDTree(record.points).query(positions, k=min(NEIGHBOURS, len(record.points)))
-    colors = record.points_rgb[nearest].reshape(len(positions), -1, 3).mean(axis=1) / 255.0
-    return RoadSeed(surface, positions, spacing, colors)
+    _, nearest = cKDTree(record.points).query(positions)
+    return RoadSeed(surface, positions, spacing, record.points_rgb[nearest] / 255.0)
 
 
-def layer_of(surface: HeightField, points: Float[np.ndarray, "n 3"], reach: float) -> Bool[np.ndarray, " n"]:
-    """The points (metres) in the layer that belongs to the road, `reach` metres deep."""
-    return surface.layer(_tensor(points).float(), reach, ABOVE).numpy()
+def in_layer_of(seed: RoadSeed, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether points (metres) lie in the layer of a seed's road."""
+    return in_layer(seed.surface, _tensor(points).float()).numpy()
 
 
 def surface_of(road: Road, points: Float[np.ndarray, "p 3"]) -> HeightField:

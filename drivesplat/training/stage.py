@@ -36,7 +36,7 @@ from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
 from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, evenly_spaced
 from drivesplat.training.road import road_of
-from drivesplat.training.road_seed import layer_of, road_seed
+from drivesplat.training.road_seed import in_layer_of, road_seed
 from drivesplat.training.scans import TrainingScan, initial_lidar_logits, load_scans, with_scan_points
 from drivesplat.training.unseen import fill_unseen
 from drivesplat.training.views import Supervision, TrainingView, load_views
@@ -176,10 +176,9 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     settings = job.train.model_copy(update=resolved)
     known = len(record.train_images) and (settings.road_weight or RoadPart.name in job.parts)
     road = road_of(inputs.record, settings.road) if known else None
-    wanted, reach = road is not None and RoadPart.name in job.parts, settings.road.reach
-    seed = road_seed(record, road, settings.cap_max, reach) if wanted else None
-    kept = None if seed is None else ~layer_of(seed.surface, record.points, reach)
-    if seed is not None and kept is not None and kept.any():
+    seed = None if road is None or RoadPart.name not in job.parts else road_seed(record, road, settings.cap_max)
+    if seed is not None:
+        kept = ~in_layer_of(seed, record.points)
         record = dataclasses.replace(record, points=record.points[kept], points_rgb=record.points_rgb[kept])
         settings = settings.model_copy(update={"cap_max": settings.cap_max - len(seed.positions), "road_weight": 0.0})
     exposed = inputs.exposed(job)

@@ -145,9 +145,7 @@ def untrained_road(settings: TrainSettings) -> SplatModel:
     covered = torch.ones(nodes - 1, nodes - 1, dtype=torch.bool)
     surface = HeightField(torch.full((2,), -4.0), EDGE, torch.full((nodes, nodes), 4.0), covered)
     positions[:, 2] = 4.0
-    road = RoadPart.from_seed(
-        RoadSeed(surface, positions, np.full(40, 0.3), colors), settings.road, settings.gaussians, 1.0
-    )
+    road = RoadPart.from_seed(RoadSeed(surface, positions, np.full(40, 0.3), colors), settings.gaussians, 1.0)
     return SplatModel([*still.parts, road], still.sky)
 
 

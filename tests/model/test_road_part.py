@@ -1,4 +1,4 @@
-"""Gaussians in the surface of a road: the surface, where they are on it, their gradients, checkpoint, and a fit."""
+"""Gaussians in the surface of a road: the surface, where they are on it, gradients, checkpoint, and a fit."""
 
 import dataclasses
 
@@ -16,7 +16,6 @@ from drivesplat.model.height_field import HeightField
 from drivesplat.model.road import ABOVE, EDGE, LARGEST, THICKNESS, RoadPart, RoadSeed
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import GaussianSettings, TrainSettings
-from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training.floaters import EmptySpace, fade_in_empty_space
 from drivesplat.training.loop import Trainer
 from drivesplat.training.resume_state import restore_model
@@ -49,7 +48,7 @@ def a_seed(count: int = 30, surface: HeightField | None = None) -> RoadSeed:
 
 def a_road(count: int = 30, surface: HeightField | None = None, **more: object) -> RoadPart:
     """Gaussians of any extent and rotation."""
-    part = RoadPart.from_seed(a_seed(count, surface), RoadSettings(), GaussianSettings(), 5.0, **more)
+    part = RoadPart.from_seed(a_seed(count, surface), GaussianSettings(), 5.0, **more)
     generator = torch.Generator().manual_seed(1)
     for name in ("quats", "scales", "opacities"):
         value = part.params[name].data
@@ -123,25 +122,6 @@ def test_gaussians_turn_about_the_normal():
     torch.testing.assert_close(torch.atan2(axes[:, 1, 0], axes[:, 0, 0]), angles)
 
 
-def test_offsets_raise_the_surface_and_cost_by_their_size_and_slope():
-    part = a_road()
-    before = sampled(part, 0.0).means.detach()
-    assert not part.penalties()["road_offsets"].any()
-    part.shared["offsets"].data += 0.02
-    raised = sampled(part, 0.0).means
-    torch.testing.assert_close(
-        raised.detach() - before, torch.tensor([0.0, 0.0, 0.02]).expand(30, 3), atol=1e-6, rtol=0
-    )
-    weight = RoadSettings().offsets_weight
-    assert part.penalties()["road_offsets"].item() == pytest.approx(weight * 0.02**2, rel=1e-5)
-    raised.sum().backward()
-    assert part.shared["offsets"].grad.sum() == pytest.approx(30.0, rel=1e-4)
-    part.shared["offsets"].data[4, 4] += 0.1
-    assert part.penalties()["road_offsets"].item() > weight * (4 * (0.1 / EDGE) ** 2) / (SIZE + 1) ** 2
-    free = RoadPart.from_seed(a_seed(), RoadSettings(offsets_weight=0.0), GaussianSettings(), 5.0)
-    assert free.penalties() == {}
-
-
 def test_what_cannot_be_learned_has_no_gradient_for_it():
     part = a_road(lidar_logits=(0.3, 0.9), classes=3)
     found = sampled(part, 0.0, EVERYTHING)
@@ -185,7 +165,6 @@ def test_a_model_has_a_road_where_its_surface_is_known_and_is_rebuilt_with_it():
     assert [part.name for part in model.parts] == ["background", "road"]
     road = model.parts[1]
     assert isinstance(road, RoadPart) and not road.moves and not road.has_objects and road.cap_max == 30
-    road.shared["offsets"].data.normal_(0.0, 0.01, generator=torch.Generator().manual_seed(0))
     state = {name: value.clone() for name, value in model.state_dict().items()}
     again = rebuild_model(state, definitions(model), "none", TrainSettings())
     mine, theirs = (it.at(0.0).tensors for it in (model, again))
@@ -193,9 +172,9 @@ def test_a_model_has_a_road_where_its_surface_is_known_and_is_rebuilt_with_it():
     assert torch.equal(again.parts[1].covered, road.covered)
 
 
-def test_a_training_resumes_with_the_surface_that_it_has_learned():
+def test_a_training_resumes_with_its_surface():
     model, other = an_untrained_model(a_seed()), an_untrained_model(a_seed())
-    model.parts[1].shared["offsets"].data += 0.03
+    model.parts[1].heights += 0.03
     model.parts[1].params["means"].data += 0.01
     restore_model(other, {name: value.detach().clone() for name, value in model.state_dict().items()})
     mine, theirs = model.at(0.0).tensors, other.at(0.0).tensors
@@ -214,7 +193,7 @@ def test_paint_is_learned_from_afar_and_seen_from_aside():
     )  # fmt: skip
     truth = RoadPart.from_seed(
         dataclasses.replace(seed, colors=np.where(np.abs(places[:, :1]) < 0.3, 0.9, 0.3).repeat(3, axis=1)),
-        RoadSettings(), GaussianSettings(sh_degree=0), 4.0,
+        GaussianSettings(sh_degree=0), 4.0,
     )  # fmt: skip
     truth.params["opacities"].data.fill_(4.0)
     recorded = SplatModel([truth], None)
@@ -227,7 +206,7 @@ def test_paint_is_learned_from_afar_and_seen_from_aside():
     settings = TrainSettings(iterations=80, opacity_reg=0, scale_reg=0, entropy_weight=0, sh_every=0)
     learned = RoadPart.from_seed(
         dataclasses.replace(seed, colors=random.uniform(0.4, 0.6, (len(places), 3))),
-        RoadSettings(), GaussianSettings(sh_degree=0, lr_sh0=2e-2), 4.0,
+        GaussianSettings(sh_degree=0, lr_sh0=2e-2), 4.0,
     )  # fmt: skip
     model = SplatModel([learned], None)
     trainer = Trainer.begin(model, [seen(x, 0.0) for x in (-5.0, -4.5, -4.0)], settings, 0, torch.device("cpu"))

@@ -15,7 +15,7 @@ from drivesplat.model.road import EDGE
 from drivesplat.scene.training_record import SeedInfo, TrainingRecord
 from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training.road import lidar_road, road_of
-from drivesplat.training.road_seed import finest_pixels, gaussians_per_side, road_seed, surface_of
+from drivesplat.training.road_seed import gaussians_per_side, pixels_of, road_seed, surface_of
 
 LIDAR = RoadSettings(surface="lidar")
 KERB, KERB_HEIGHT = 4.0, 0.1
@@ -99,8 +99,8 @@ def driven(images: int = 5, **fields: object) -> TrainingRecord:
 def test_the_finest_pixel_is_that_of_the_nearest_image_that_shows_a_place():
     record = driven(2)
     places = np.array([[6.0, 0.0, 0.0], [14.0, 1.0, 0.0], [-5.0, 0.0, 0.0], [7.0, 30.0, 0.0]])
-    found = finest_pixels(record, places)
-    assert np.isinf(found[2:]).all()
+    found, shown = pixels_of(record, places)
+    assert np.isinf(found[2:]).all() and not shown[2:].any()
     for place, pixel in zip(places[:2], found, strict=False):
         centre = record.camtoworlds[1][:3, 3]  # the second camera is nearer to both
         steps = np.array([[0.01, 0.0, 0.0], [0.0, 0.01, 0.0]])
@@ -108,6 +108,8 @@ def test_the_finest_pixel_is_that_of_the_nearest_image_that_shows_a_place():
         pixels = np.array([row[:2] / row[2] for row in rows])
         area = abs(np.linalg.det(pixels[1:] - pixels[0])) / 1e-4  # pixels per square metre
         assert pixel == pytest.approx(area**-0.5, rel=0.1)
+    one = pixels_of(driven(1), places)[0]
+    np.testing.assert_allclose(shown[:2], one[:2] ** -2.0 + found[:2] ** -2.0)
 
 
 @given(st.lists(st.floats(1e-3, 10.0), min_size=1, max_size=40), st.integers(1, 5000))
@@ -119,16 +121,16 @@ def test_cells_get_more_gaussians_the_finer_they_were_seen_up_to_their_number(fi
 
 def test_a_seed_covers_what_images_show_and_takes_its_colours_from_the_points_around():
     record = driven()
-    seed = road_seed(record, road_of(record, LIDAR), 3000)
-    assert 2000 < len(seed.positions) <= 3000
+    seed = road_seed(record, road_of(record, LIDAR), 10_000)
+    assert 3000 < len(seed.positions) <= 6000
     assert seed.surface.covers(torch.from_numpy(seed.positions[:, :2]).float()).all()
-    assert np.isfinite(finest_pixels(record, seed.positions)).mean() > 0.9
+    assert np.isfinite(pixels_of(record, seed.positions)[0]).mean() > 0.9
     assert np.abs(seed.positions[:, 2]).max() < 0.05 and seed.positions[:, 0].min() > 1.0
     left = np.abs(seed.positions[:, 1] - 2.0) < 1.5
     assert np.abs(seed.colors[left] - 200 / 255).max() < 1e-6
     near = seed.positions[:, 0] < 12.0
     assert seed.spacing[near].mean() < 0.7 * seed.spacing[~near].mean()
-    few = road_seed(record, road_of(record, LIDAR), 100)
+    few = road_seed(record, road_of(record, LIDAR), 167)
     assert len(few.positions) == 100 and few.spacing.min() > EDGE
     assert len(np.unique(few.positions[:, :2], axis=0)) == 100
 
