@@ -51,6 +51,14 @@ class HeightField:
         return inside & self.covered.flatten().index_select(0, cell[:, 0] * self.covered.shape[1] + cell[:, 1])
 
     @torch.no_grad()
+    def sums(self, places: Float[Tensor, "n 2"], values: Float[Tensor, " n"]) -> Float[Tensor, "x_less_1 y_less_1"]:
+        """The sums of the values at places in each cell; places beyond the grid count in the cell nearest to them."""
+        _, cell = self._cells(places)
+        found = values.new_zeros(self.covered.numel())
+        found.index_add_(0, cell[:, 0] * self.covered.shape[1] + cell[:, 1], values)
+        return found.reshape(self.covered.shape)
+
+    @torch.no_grad()
     def layer(self, points: Float[Tensor, "n 3"], below: float, above: float) -> Bool[Tensor, " n"]:
         """Whether points (metres) lie less than `below` metres below the known surface, or `above` metres above it."""
         over = points[:, 2] - self.at(points[:, :2]).heights

@@ -6,12 +6,15 @@ are learned, and the surface is given: it is that of LiDAR or of the vehicle's p
 synthetic worlds by pixels from 2 m aside (docs/tried.md).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from drivesplat.model.gaussians import Gaussians, no_colors
 from drivesplat.model.height_field import HeightField
@@ -26,6 +29,9 @@ THICKNESS = 0.002
 """Standard deviation of its Gaussians across the surface (metres)."""
 LARGEST = 0.5
 """Largest standard deviation in the surface (metres): where no image looks, longer ones reach into what is seen."""
+VISIBLE, FILLED_OPACITY, FILLED_SCALE = 0.3, 3.0, 0.3
+"""Of `gap_fillers`: the opacity from which a Gaussian is visible; of those that it adds the opacity (logit), and the
+standard deviation in units of EDGE, half of which is the distance between them."""
 INIT_SCALE, INIT_OPACITY = 0.4, 0.5
 """Initial standard deviations in units of the distance between neighbours, and initial opacity."""
 BELOW, ABOVE = 0.3, 0.1
@@ -110,6 +116,32 @@ class RoadPart(Part):
         means, surface = self.params["means"], self.surface
         means[:, 2] = surface.at(means[:, :2]).heights
         fade(self.params, ~surface.covers(means[:, :2]))
+
+    @torch.no_grad()
+    def gap_fillers(self) -> dict[str, Tensor]:
+        """Further rows of `params`: opaque Gaussians in covered cells of which its own hide less than half, copies of
+        the nearest visible ones in all but place and shape."""
+        p, surface = self.params, self.surface
+        opacities, scales = torch.sigmoid(p["opacities"]), torch.exp(p["scales"][:, :2])
+        areas = 2.0 * math.pi * opacities * scales.prod(dim=1)
+        hidden = 1.0 - torch.exp(-surface.sums(p["means"][:, :2], areas) / EDGE**2)
+        around = avg_pool2d(hidden[None], 3, stride=1, padding=1)[0]  # large Gaussians reach into cells beside theirs
+        visible = (opacities > VISIBLE).nonzero()[:, 0]
+        cells = (surface.covered & (torch.maximum(hidden, around) < 0.5)).nonzero()[: None if len(visible) else 0]
+        inside = torch.cartesian_prod(*[torch.tensor([0.25, 0.75], device=cells.device)] * 2)
+        places = self.lower + EDGE * (cells[:, None] + inside).reshape(-1, 2)
+        nearest = cKDTree(p["means"][visible, :2].cpu().numpy()).query(places.cpu().numpy())[1]
+        rows = visible[torch.from_numpy(nearest).to(visible.device)]
+        found = {name: values[rows].clone() for name, values in p.items()}
+        found["means"] = torch.cat([places, surface.at(places).heights[:, None]], dim=1)
+        found["scales"].fill_(math.log(FILLED_SCALE * EDGE))
+        found["opacities"].fill_(FILLED_OPACITY)
+        return found
+
+    def extend(self, rows: dict[str, Tensor], beyond: int) -> None:
+        """Replaces all rows of `params` `beyond` so many by others."""
+        own = {name: values.detach()[:beyond] for name, values in self.params.items()}
+        self.params = make_parameters({name: torch.cat([own[name], rows[name]]) for name in own})
 
     def owns(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """Whether points (metres) lie where no static Gaussian of another part may be."""

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
@@ -17,8 +17,11 @@ from drivesplat.scene.training_record import TrainingRecord
 STIFFNESS = 1.0
 """Weight of squared second differences of heights, in units of that of a plane's squared error, for nodes one metre
 apart."""
-MARGIN = 2
-"""Nodes around those of known cells that the surface has in addition, so that it is smooth at its border."""
+GAP = 3
+"""Cells on each side of a gap in the known ground, as behind a vehicle that LiDAR does not see through, up to which the
+surface continues in it."""
+MARGIN = GAP + 1
+"""Nodes around those of known cells that the surface has in addition."""
 ANCHOR = 1e-6
 """The same weight of a node's squared height above the mean, which decides where nothing is known."""
 NEAR, EVEN, UNEVEN = 0.15, 0.03, 2.0
@@ -42,7 +45,7 @@ def road_seed(record: TrainingRecord, road: Road, cap: int) -> RoadSeed | None:
     all seed points are in its layer."""
     if not len(road.weights) or not record.train_images:
         return None
-    surface = surface_of(road, record.points[: record.seed.lidar])
+    surface, known = surface_of(road, record.points[: record.seed.lidar])
     cells = np.argwhere(surface.covered.numpy())
     lower = surface.lower.double().numpy()
     finest, shown = pixels_of(record, _on(surface, lower + (cells + 0.5) * EDGE))
@@ -54,8 +57,9 @@ def road_seed(record: TrainingRecord, road: Road, cap: int) -> RoadSeed | None:
     count = int(min(LARGEST_SHARE * cap, max(replaced, cap * shown.sum() * EDGE**2 / every)))
     if not count or replaced == len(record.points):
         return None
-    per_side = gaussians_per_side(finest[seen], count)
-    places = np.concatenate([_spread(cells[seen][per_side == n], n) for n in np.unique(per_side).tolist()])
+    sown = seen & known[tuple(cells.T)]
+    per_side = gaussians_per_side(finest[sown], count)
+    places = np.concatenate([_spread(cells[sown][per_side == n], n) for n in np.unique(per_side).tolist()])
     positions = _on(surface, lower + places * EDGE)
     spacing = np.repeat(EDGE / np.sort(per_side), np.sort(per_side) ** 2)
     kept = random_subset(len(positions), count)
@@ -69,9 +73,10 @@ def in_layer_of(seed: RoadSeed, points: Float[np.ndarray, "n 3"]) -> Bool[np.nda
     return in_layer(seed.surface, _tensor(points).float()).numpy()
 
 
-def surface_of(road: Road, points: Float[np.ndarray, "p 3"]) -> HeightField:
+def surface_of(road: Road, points: Float[np.ndarray, "p 3"]) -> tuple[HeightField, Bool[np.ndarray, "x y"]]:
     """The smooth surface through the planes of a road with at least one cell, then through the LiDAR `points` (metres)
-    near it. It covers all cells but those in which these are uneven; there it may bend.
+    near it, and the cells in which it is known. It covers these, and gaps between them, but no cells in which the
+    points are uneven; there it may bend.
 
     Heights z of nodes minimise the sum of (z - known)² over cells, plus STIFFNESS times squared second differences
     along x and along y.
@@ -99,7 +104,9 @@ def surface_of(road: Road, points: Float[np.ndarray, "p 3"]) -> HeightField:
         surface = HeightField(surface.lower, EDGE, torch.from_numpy(heights).float(), surface.covered)
     missed = np.abs(_on(surface, middles)[:, 2] - known) > NEAR
     uneven[tuple(cells[missed].T)] = True
-    return HeightField(surface.lower, EDGE, surface.heights, _tensor(covered & ~uneven))
+    even = covered & ~uneven
+    closed = ndimage.binary_closing(even, iterations=GAP) & ~uneven
+    return HeightField(surface.lower, EDGE, surface.heights, _tensor(closed)), even
 
 
 def pixels_of(

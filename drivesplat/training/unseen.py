@@ -1,4 +1,4 @@
-"""Colours of what no training image shows: texels of the sky's cube map, and static Gaussians behind objects.
+"""What no training image shows: gaps of the road, and colours of the sky's cube map and of Gaussians behind objects.
 
 The only gradient of these comes from the little light that opaque surfaces let through, and Adam amplifies it: texels
 learn noise, and Gaussians behind a vehicle that was followed learn the colour of the vehicle. They show where Gaussians
@@ -6,6 +6,7 @@ leave a hole, where an object is removed, and from beside the path. After the tr
 surroundings.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +17,13 @@ from torch import Tensor
 
 from drivesplat.kernels.morton import morton_order
 from drivesplat.model.part import Part
+from drivesplat.model.road import RoadPart
 from drivesplat.model.sky import CubemapSky, logit_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view_colors import all_view_colors
 from drivesplat.training.views import TrainingView
+
+log = logging.getLogger(__name__)
 
 COVERED = 0.2
 """Share of a pixel that objects need for the pixel to show them rather than the static scene."""
@@ -35,11 +39,11 @@ NEIGHBOURS = {"texel": 16, "gaussian": 8}
 
 @torch.no_grad()
 def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
-    """Replaces colours that no training image shows, in place; without views does nothing.
+    """Fills gaps of the road, and replaces colours that no training image shows, in place; without views does nothing.
 
-    In a model with objects, static Gaussians whose weights in pixels of the static scene sum to less than `MIN_WEIGHT`
-    get the mean colour of the nearest other ones, the same from all sides. Most of them are behind objects in all
-    images; others are outside all images, or almost transparent.
+    In a model with objects, `fill_road` closes gaps, and static Gaussians whose weights in pixels of the static scene
+    sum to less than `MIN_WEIGHT` get the mean colour of the nearest other ones, the same from all sides. Most of them
+    are behind objects in all images; others are outside all images, or almost transparent.
 
     A texel of a cube map keeps its logits with the weight w² / (w² + SEEN²). w is the sum of squared transmittance over
     the pixels that interpolate it, in all views, divided by the number of pixels that a texel has in an image. The rest
@@ -53,7 +57,9 @@ def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
     texels = _TexelColors(model.sky) if isinstance(model.sky, CubemapSky) else None
     if not views or not (has_objects or texels):
         return
-    weights = torch.zeros(sum(part.row_count for part in model.parts), device=model.parts[0].params["means"].device)
+    if has_objects:
+        fill_road(model, views)
+    weights = _no_weights(model)
     for view in views:
         shown = _shown(model, view, has_objects)
         weights += shown.weights
@@ -65,6 +71,26 @@ def fill_unseen(model: SplatModel, views: list[TrainingView]) -> None:
                 _recolour(part, weights[rows] < MIN_WEIGHT)
     if texels is not None:
         texels.fill()
+
+
+@torch.no_grad()
+def fill_road(model: SplatModel, views: list[TrainingView]) -> None:
+    """Adds Gaussians to gaps of the road, in place, but for those that an image would show: their weights in pixels of
+    the static scene sum to `MIN_WEIGHT` or more."""
+    for number, part in enumerate(model.parts):
+        if isinstance(part, RoadPart):
+            count, fillers = len(part), part.gap_fillers()
+            part.extend(fillers, count)
+            weights = _no_weights(model)
+            for view in views if len(part) > count else ():
+                weights += _shown(model, view, has_objects=True).weights
+            unseen = weights[model.rows[number]][count:] < MIN_WEIGHT
+            part.extend({name: values[unseen] for name, values in fillers.items()}, count)
+            log.info("%d Gaussians fill gaps of the road that no image shows", int(unseen.sum()))
+
+
+def _no_weights(model: SplatModel) -> Float[Tensor, " n"]:
+    return torch.zeros(sum(part.row_count for part in model.parts), device=model.parts[0].params["means"].device)
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,34 @@ def test_gaussians_outside_of_what_is_covered_fade_and_the_others_are_put_onto_t
     torch.testing.assert_close(part.params["means"].data[0, 2], torch.tensor(plane(0.1, 0.1)).float())
 
 
+def test_gaps_get_opaque_copies_of_the_nearest_gaussians():
+    """None are in the cells with x above 0, of which one is not covered."""
+    part = RoadPart.from_seed(a_seed(400, a_surface(uncovered=(6, 6))), GaussianSettings(), 5.0)
+    part.params["opacities"].data.fill_(2.0)
+    left = part.params["means"][:, 0] < 0.0
+    part.params = torch.nn.ParameterDict({name: values.detach()[left] for name, values in part.params.items()})
+    count, fillers = len(part), part.gap_fillers()
+    x, y, z = fillers["means"].double().numpy().T
+    right = (x > 0.0).sum()
+    assert right >= 4 * (SIZE // 2 - 1) * SIZE - 4 and right > 0.85 * len(x)
+    assert not ((x > 1.0) & (x < 1.5) & (y > 1.0) & (y < 1.5)).any()
+    np.testing.assert_allclose(z, plane(x, y), atol=1e-6)
+    means, colors = part.params["means"].detach(), part.params["sh0"].detach()
+    nearest = torch.cdist(fillers["means"][:, :2], means[:, :2]).argmin(dim=1)
+    torch.testing.assert_close(fillers["sh0"], colors[nearest])
+    part.extend(fillers, count)
+    assert len(part) == count + len(x) and all(len(values) == len(part) for values in part.params.values())
+    assert (sampled(part, 0.0).opacities[count:] > 0.9).all() and len(part.gap_fillers()["means"]) == 0
+    part.extend({name: values[:2] for name, values in fillers.items()}, count)
+    assert len(part) == count + 2
+
+
+def test_an_invisible_road_has_nothing_to_copy():
+    part = a_road()
+    part.params["opacities"].data.fill_(-5.0)
+    assert len(part.gap_fillers()["means"]) == 0
+
+
 def test_other_static_gaussians_fade_near_the_surface_and_those_of_the_road_do_not():
     road = a_road()
     over = [-0.2, 0.05, ABOVE + 0.05]

@@ -30,7 +30,7 @@ def points_of(height, noise: float = NOISE, count: int = 60_000) -> np.ndarray:
 
 
 def surface_through(points: np.ndarray) -> HeightField:
-    return surface_of(lidar_road(points, LIDAR), points)
+    return surface_of(lidar_road(points, LIDAR), points)[0]
 
 
 def heights_on(surface: HeightField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -70,11 +70,33 @@ def test_what_stands_on_the_road_does_not_raise_it():
     def with_car(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.where((np.abs(x - 12.0) < 2.0) & (np.abs(y + 3.0) < 0.8), 0.9, 0.0)
 
-    surface = surface_through(points_of(with_car))
+    points = points_of(with_car)
+    surface, even = surface_of(lidar_road(points, LIDAR), points)
     x, y = np.tile(np.linspace(6.0, 18.0, 25), 9), np.repeat(np.linspace(-5.0, -1.0, 9), 25)
-    known = surface.covers(torch.from_numpy(np.column_stack([x, y])).float()).numpy()
+    of_points = HeightField(surface.lower, EDGE, surface.heights, torch.from_numpy(even))
+    known = of_points.covers(torch.from_numpy(np.column_stack([x, y])).float()).numpy()
     away = (np.abs(x - 12.0) > 2.6) | (np.abs(y + 3.0) > 1.4)
     assert known[away].all() and np.abs(heights_on(surface, x, y)[known & away]).max() < 0.01
+
+
+def test_gaps_between_known_ground_are_covered_and_not_sown():
+    """A strip without points, as LiDAR leaves it behind a vehicle; a wide one stays open."""
+    points = points_of(lambda x, y: 0.01 * x)
+    surface, known = surface_of(lidar_road(points, LIDAR), points)
+    narrow = (np.abs(points[:, 1] - 1.0) > 1.9) | (points[:, 0] < 8.0)
+    through, even = surface_of(lidar_road(points[narrow], LIDAR), points[narrow])
+    gap = np.column_stack([np.linspace(12.0, 20.0, 17), np.full(17, 1.0)])
+    assert known.sum() - even.sum() > 20 and surface.covered.sum() - through.covered.sum() < 5
+    assert through.covers(torch.from_numpy(gap).float()).all()
+    assert (
+        not HeightField(through.lower, EDGE, through.heights, torch.from_numpy(even))
+        .covers(torch.from_numpy(gap).float())
+        .any()
+    )
+    assert np.abs(heights_on(through, *gap.T) - 0.01 * gap[:, 0]).max() < 0.01
+    wide = (np.abs(points[:, 1]) > 4.2) | (points[:, 0] < 8.0)
+    opened, _ = surface_of(lidar_road(points[wide], LIDAR), points[wide])
+    assert not opened.covers(torch.tensor([[14.0, 0.0], [18.0, 0.0]])).any()
 
 
 # ---- where it is sown

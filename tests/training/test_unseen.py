@@ -11,7 +11,9 @@ from helpers.trainings import CPU, PROVENANCE, files_in, inputs_in, job_of
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
+from drivesplat.model.height_field import HeightField
 from drivesplat.model.part import Part
+from drivesplat.model.road import EDGE, RoadPart, RoadSeed
 from drivesplat.model.sky import ConstantSky, CubemapSky, logit_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -179,6 +181,28 @@ def test_static_gaussians_hidden_by_an_object_get_the_colour_around_them_unless_
     assert torch.allclose(wall["sh0"][hidden], before[0].expand_as(before[hidden]), atol=1e-4)
     assert not wall["shN"][hidden].any()
     assert torch.equal(wall["sh0"][~hidden], before[~hidden]) and torch.equal(van["sh0"], blue)
+
+
+def test_gaps_of_a_road_are_filled_where_an_object_hides_them_in_all_images():
+    """A surface 4 m ahead with a gap behind the van and one beside it."""
+    model, _ = behind_a_van()
+    points = grid((-4.0, 4.0), (-3.0, 3.0), 4.0, 0.1)
+    hidden = (np.abs(points[:, 0]) < 1.0) & (np.abs(points[:, 1]) < 0.7)
+    beside = (np.abs(points[:, 0] - 3.0) < 0.6) & (np.abs(points[:, 1]) < 0.6)
+    points = points[~(hidden | beside)]
+    surface = HeightField(
+        torch.tensor([-4.0, -3.0]), EDGE, torch.full((17, 13), 4.0), torch.ones(16, 12, dtype=torch.bool)
+    )
+    seed = RoadSeed(surface, points, np.full(len(points), 0.1), np.tile(RED, (len(points), 1)))
+    road = made_opaque(RoadPart.from_seed(seed, GaussianSettings(), 1.0), 0.08)
+    fill_unseen(SplatModel([road, model.parts[1]], None), [a_view()])
+    added = road.params["means"][len(points) :].detach()
+    assert len(added) >= 8 and (added[:, :2].abs() < torch.tensor([1.3, 1.0])).all()
+    torch.testing.assert_close(added[:, 2], torch.full((len(added),), 4.0))
+    torch.testing.assert_close(road.params["sh0"][len(points) :], road.params["sh0"][:1].expand(len(added), 1, 3))
+    alone = RoadPart.from_seed(seed, GaussianSettings(), 1.0)
+    fill_unseen(SplatModel([alone], None), [a_view()])
+    assert len(alone) == len(points), "without objects nothing hides it"
 
 
 def test_what_stands_before_an_object_keeps_its_colour():
