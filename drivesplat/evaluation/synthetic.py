@@ -100,13 +100,7 @@ class DriveTruth:
 
     def surfaces(self, name: str, static: np.ndarray) -> dict[str, np.ndarray]:
         """The masks (h, w) bool of SURFACES among the `static` pixels (h, w) bool, by the class image `name`."""
-        path = truth_image(self.path, name)
-        try:
-            with Image.open(path) as image:
-                classes = np.asarray(image.convert("L"))
-        except (OSError, UnidentifiedImageError, SyntaxError) as error:
-            raise unreadable(path, RULE, f"not a class image ({error})", delete=self.path) from error
-        classes = cv2.resize(classes, static.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        classes = self._values(name, np.uint8, "L", "a class image", (static.shape[1], static.shape[0]))
         labels = {int(number): label for number, label in self.truth.classes.items()}
         found = {region: [n for n, label in labels.items() if label in own] for region, own in SURFACES.items()}
         return {region: static & np.isin(classes, numbers) for region, numbers in found.items()}
@@ -117,17 +111,24 @@ class DriveTruth:
 
         Raises ResultError that names the image if it is not one of 16-bit depth.
         """
+        values = self._values(name, np.uint16, "I", "a 16-bit depth image", size)
+        rows, columns = np.nonzero(mask & (values > 0) & (values < DEPTH_LIMIT))
+        return PixelDepths(rows, columns, values[rows, columns] / DEPTH_UNITS_PER_METRE)
+
+    def _values(
+        self, name: str, dtype: type[np.unsignedinteger], mode: str, kind: str, size: tuple[int, int]
+    ) -> np.ndarray:
+        """The values of a true image whose mode begins with `mode`, at `size` (width, height) by nearest neighbour.
+        Raises ResultError that names the image if it is not of that `kind`."""
         path = truth_image(self.path, name)
         try:
             with Image.open(path) as image:
-                if not image.mode.startswith("I"):
+                if not image.mode.startswith(mode):
                     raise ValueError(f"its mode is {image.mode}")
-                values = np.asarray(image).astype(np.uint16)
+                values = np.asarray(image).astype(dtype)
         except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
-            raise unreadable(path, RULE, f"not a 16-bit depth image ({error})", delete=self.path) from error
-        values = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        rows, columns = np.nonzero(mask & (values > 0) & (values < DEPTH_LIMIT))
-        return PixelDepths(rows, columns, values[rows, columns] / DEPTH_UNITS_PER_METRE)
+            raise unreadable(path, RULE, f"not {kind} ({error})", delete=self.path) from error
+        return cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
 
     def leading_in(self, index: int) -> tuple[Box, np.ndarray] | None:
         """The box of the leading car in an image and the pixels (h, w) bool of its hull; None if it is not visible."""

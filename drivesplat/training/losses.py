@@ -108,10 +108,9 @@ def surface_terms(
 ) -> dict[str, Float[Tensor, ""]]:
     """The weighted loss terms of the surfaces of static parts, from the `sets` of Gaussians of all parts at one
     time."""
-    if road is None or not settings.road_weight:
-        road = None
-        if not settings.flatness_weight:
-            return {}
+    road = road if settings.road_weight else None
+    if not settings.flatness_weight and road is None:
+        return {}
     parts = [(part, own) for part, own in zip(model.parts, sets, strict=True) if not part.moves]
     static = concatenate([own for _, own in parts])
     terms: Means = {}

@@ -1,5 +1,7 @@
 """The seed of the part `road`: a smooth surface through the planes of the ground, and Gaussians spread over it."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -52,12 +54,12 @@ def road_seed(record: TrainingRecord, road: Road, cap: int) -> RoadSeed | None:
     seen, every = np.isfinite(finest), record.image_sizes[record.train_images].prod(axis=1).sum()
     covered = torch.zeros_like(surface.covered)
     covered[tuple(cells[seen].T)] = True
-    surface = HeightField(surface.lower, EDGE, surface.heights, covered)
-    replaced = int(in_layer(surface, _tensor(record.points).float()).sum())
+    surface = replace(surface, covered=covered)
+    replaced = int(in_layer_of(surface, record.points).sum())
     count = int(min(LARGEST_SHARE * cap, max(replaced, cap * shown.sum() * EDGE**2 / every)))
-    if not count or replaced == len(record.points):
-        return None
     sown = seen & known[tuple(cells.T)]
+    if not count or not sown.any() or replaced == len(record.points):
+        return None
     per_side = gaussians_per_side(finest[sown], count)
     places = np.concatenate([_spread(cells[sown][per_side == n], n) for n in np.unique(per_side).tolist()])
     positions = _on(surface, lower + places * EDGE)
@@ -68,9 +70,9 @@ def road_seed(record: TrainingRecord, road: Road, cap: int) -> RoadSeed | None:
     return RoadSeed(surface, positions, spacing, record.points_rgb[nearest] / 255.0)
 
 
-def in_layer_of(seed: RoadSeed, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Whether points (metres) lie in the layer of a seed's road."""
-    return in_layer(seed.surface, _tensor(points).float()).numpy()
+def in_layer_of(surface: HeightField, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether points (metres) lie in the layer of a road with this surface."""
+    return in_layer(surface, _tensor(points).float()).numpy()
 
 
 def surface_of(road: Road, points: Float[np.ndarray, "p 3"]) -> tuple[HeightField, Bool[np.ndarray, "x y"]]:
@@ -100,13 +102,14 @@ def surface_of(road: Road, points: Float[np.ndarray, "p 3"]) -> tuple[HeightFiel
         means[own] = over
         uneven |= _beside_a_step(means, limit)
         even = ~uneven[own]
-        heights = heights + _smooth_heights(places[even], over[even], uneven)
-        surface = HeightField(surface.lower, EDGE, torch.from_numpy(heights).float(), surface.covered)
+        if even.any():
+            heights = heights + _smooth_heights(places[even], over[even], uneven)
+            surface = replace(surface, heights=torch.from_numpy(heights).float())
     missed = np.abs(_on(surface, middles)[:, 2] - known) > NEAR
     uneven[tuple(cells[missed].T)] = True
     even = covered & ~uneven
     closed = ndimage.binary_closing(even, iterations=GAP) & ~uneven
-    return HeightField(surface.lower, EDGE, surface.heights, _tensor(closed)), even
+    return replace(surface, covered=_tensor(closed)), even
 
 
 def pixels_of(

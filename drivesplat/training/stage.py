@@ -178,7 +178,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     road = road_of(inputs.record, settings.road) if known else None
     seed = None if road is None or RoadPart.name not in job.parts else road_seed(record, road, settings.cap_max)
     if seed is not None:
-        kept = ~in_layer_of(seed, record.points)
+        kept = ~in_layer_of(seed.surface, record.points)
         record = dataclasses.replace(record, points=record.points[kept], points_rgb=record.points_rgb[kept])
         settings = settings.model_copy(update={"cap_max": settings.cap_max - len(seed.positions), "road_weight": 0.0})
     exposed = inputs.exposed(job)

@@ -165,6 +165,19 @@ def test_without_lidar_the_surface_is_that_of_the_path():
     assert np.abs(seed.positions[:, 1]).max() < 3.3 and np.abs(seed.positions[:, 2]).max() < 1e-5
 
 
+def test_there_is_no_road_where_no_ground_is_even_or_images_show_none():
+    record = driven()
+    road = road_of(record, LIDAR)
+    steps = np.floor(2.0 * record.points[:, :2]).sum(axis=1) % 2
+    uneven = record.points + np.column_stack([0.0 * steps, 0.0 * steps, 0.1 * steps]).astype(np.float32)
+    surface, _ = surface_of(road, uneven)
+    inside = torch.from_numpy(np.random.default_rng(0).uniform([3.0, -4.0], [21.0, 4.0], (200, 2))).float()
+    assert not surface.covers(inside).any() and torch.isfinite(surface.heights).all()
+    away = record.camtoworlds.copy()
+    away[:, 2, 3] -= 10.0
+    assert road_seed(dataclasses.replace(record, camtoworlds=away), road, 1000) is None
+
+
 def test_there_is_no_road_without_training_images_or_gaussians():
     record = driven()
     road = road_of(record, LIDAR)

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivesplat.world.optics.lighting import Light, shade
-from drivesplat.world.optics.materials import find_paint
+from drivesplat.world.optics.lighting import Light, find_paint, shade
 from drivesplat.world.optics.raycast import NO_HIT, RayHits, StreetRays, StreetSnapshot
 from drivesplat.world.shapes.mesh import GAMMA, SurfaceClass
 
@@ -112,7 +111,7 @@ def _through_centers(
         objects[block], face[block] = hits.object, hits.face
         road = np.flatnonzero((hits.face >= 0) & (caster.surface_class[hits.face] == SurfaceClass.ROAD))
         found = np.empty(len(road), dtype=bool)
-        find_paint(caster.texture_points(hits.face[road], hits.weights[road]), found)
+        find_paint(hits.face[road], hits.weights[road], caster.texture, found)
         markings[block][road] = found
         if light:
             radiance[block], lit[block] = _radiance(snapshot, light, camera, rays, hits)

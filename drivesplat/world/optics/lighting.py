@@ -5,7 +5,7 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from drivesplat.world.optics.materials import LEAVES, ROAD_, surface
+from drivesplat.world.optics.materials import LEAVES, ROAD_, paint, surface
 from drivesplat.world.optics.patterns import compiled, fractal, value_noise
 
 
@@ -149,6 +149,15 @@ def shade(
             received = sunny * light.sun[c] + ambient + lamp[c] + emission * light.emission
             value = albedo[c] * received + fresnel * reflection[c]
             out[i, c] = value + haze * (light.horizon[c] - value)
+
+
+@compiled
+@no_type_check
+def find_paint(face, weights, texture, out):
+    """Fills `out` (n,) bool: whether there is paint at places of the road, given as of `shade`."""
+    for i in range(len(face)):
+        x, y, _ = texture_point(texture[face[i]], weights[i])
+        out[i] = paint(x, y, 0.0) > 0.5
 
 
 @compiled

@@ -69,14 +69,6 @@ def paint(x, y, footprint):
 
 @compiled
 @no_type_check
-def find_paint(points, out):
-    """Fills `out` (n,) bool: whether there is paint at `points` (n, 3) of the road's texture space."""
-    for i in range(len(points)):
-        out[i] = paint(points[i, 0], points[i, 1], 0.0) > 0.5
-
-
-@compiled
-@no_type_check
 def asphalt(x, y, footprint):
     """Tone of asphalt around 1: stains, repaired patches, seams of tar, cracks, stones."""
     tone = 1 + 0.5 * plane_fractal(x, y, 3.0, footprint) + 0.5 * plane_fractal(x, y, 0.5, footprint)

@@ -145,11 +145,6 @@ class RayCaster:
         key = np.ravel_multi_index(tuple(columns), columns.max(axis=1) + 1)
         self.surface = np.unique(key, return_inverse=True)[1]
 
-    def texture_points(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """The points (n, 3) in texture space at barycentric `weights` (n, 2) of faces `face` (n,)."""
-        shares = np.concatenate([1.0 - weights.sum(axis=1, keepdims=True), weights], axis=1)
-        return np.einsum("nk,nki->ni", shares, self.texture[face])
-
     def at(self, seconds: np.ndarray, without: Collection[str] = ()) -> "StreetSnapshot":
         """The street at the times `seconds` (m,), without the moving objects of these names."""
         return StreetSnapshot(self, seconds, without)
