@@ -12,8 +12,8 @@ After Street Gaussians (Yan et al. 2024, arXiv 2401.01339). What a camera sees a
 (`Part.densify`), `evaluate` measures static and moving pixels of held-out images. World: metres, z up. Cameras: OpenCV
 axes. Quaternions: w, x, y, z. Shapes: n Gaussians, a actors with m annotations in all, images of h rows and w columns.
 
-The rest of the repository makes this fast, exact and measured, and a test compares it with this file. It adds rolling
-shutters, exposures, reduced images, unknown skies, colours where no image looks, other parts, LiDAR scans and resuming.
+The rest of the repository makes this fast, exact and measured, and a test compares it with this file. It adds the road
+as a part, rolling shutters, exposures, reduced images, colours where no image looks, LiDAR scans, resuming and more.
 """
 
 import json

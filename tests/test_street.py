@@ -123,8 +123,9 @@ def psnrs_of_rule(model: SplatModel, drive: EvaluationData) -> dict[str, float |
 
 
 def job_of(iterations: int, **changes: Any) -> TrainJob:
-    """The default settings of the method `street`, without exposures, which street.py leaves out."""
-    job = settings_of(load(TINY), "0001", "train", TrainJob, "street").model_copy(update={"reference_camera": None})
+    """The default settings of the method `street`, without exposures and the road, which street.py leaves out."""
+    left_out = {"reference_camera": None, "parts": ("background", "actors")}
+    job = settings_of(load(TINY), "0001", "train", TrainJob, "street").model_copy(update=left_out)
     changes = {"iterations": iterations, "psnr_every": 0, **changes}
     return job.model_copy(update={"train": job.train.model_copy(update=changes)})
 

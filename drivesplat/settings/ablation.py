@@ -30,12 +30,13 @@ def _default_variants() -> dict[str, VariantSettings | None]:
         return VariantSettings(overrides={"train": train})
 
     return {
-        "actors": VariantSettings(parts=("background",)),
+        "actors": VariantSettings(parts=("background", "road")),
         "track_correction": trained(actors={"tracks": {"corrected": False}}),
         "sky": VariantSettings(overrides={"sky": "none", "train": {"sky_bce_weight": 0.0}}),
         "sky_loss": trained(sky_bce_weight=0.0),
         "depth": trained(depth_weight=0.0),
-        "ground": trained(road_weight=0.0),
+        "road": VariantSettings(parts=("background", "actors")),
+        "ground": VariantSettings(parts=("background", "actors"), overrides={"train": {"road_weight": 0.0}}),
         "dropout": trained(dropout=0.0),
         "entropy": trained(entropy_weight=0.0),
         "colours_in_time": trained(actors={"fourier": 1}),

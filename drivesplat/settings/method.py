@@ -71,7 +71,8 @@ def default_methods() -> dict[str, MethodSettings]:
             "dropout": 0.2,
         }
     }
-    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=overrides)}
+    parts: Parts = ("background", "road", "actors")
+    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=parts, overrides=overrides)}
 
 
 def built(methods: Mapping[Any, Any], shipped: Mapping[str, Mapping[str, Any]]) -> dict[Any, Any]:

@@ -35,7 +35,7 @@ def test_a_method_inherits_what_it_does_not_give_and_replaces_or_merges_what_it_
     }
     made = methods_of(given)
     found = {name: (made[name].parts, made[name].tracks, made[name].overrides) for name in (*given, "street")}
-    base, road = (("background", "actors"), "annotated", STREET), {"surface": "lidar", "reach": 0.2}
+    base, road = (("background", "road", "actors"), "annotated", STREET), {"surface": "lidar", "reach": 0.2}
     over = {"sky": "none", "train": {**STREET["train"], "road": road, "dropout": 0.0}}
     assert found == {
         "same": base, "static": (("background",), "none", STREET), "merged": (*base[:2], over), "street": base
@@ -126,16 +126,16 @@ def test_an_equal_method_has_equal_settings_however_it_is_written():
 def test_the_ablation_takes_the_method_as_built():
     config = load(merged(DEFAULTS, {"methods": {"mine": {"of": "street"}}, "ablation": {"of": "mine", "seeds": [7]}}))
     complete = config.ablated["mine-seed7"]
-    assert complete.parts == ("background", "actors") and complete.overrides == {**STREET, "random_seed": 7}
+    assert complete.parts == ("background", "road", "actors") and complete.overrides == {**STREET, "random_seed": 7}
 
 
 PRESETS = {
-    "lidar": ("street_lidar", ("background", "actors"), "annotated", ("flatness_weight", "gaussians", "scans")),
-    "people": ("street_people", ("background", "actors", "deformable"), "annotated", ()),
+    "lidar": ("street_lidar", ("background", "road", "actors"), "annotated", ("flatness_weight", "gaussians", "scans")),
+    "people": ("street_people", ("background", "road", "actors", "deformable"), "annotated", ()),
     "off_the_lane": (
-        "street_aside", ("background", "actors"), "annotated", ("antialiased", "smoothness_weight", "floaters"),
+        "street_aside", ("background", "road", "actors"), "annotated", ("antialiased", "smoothness_weight", "floaters"),
     ),
-    "without_boxes": ("street_discovered", ("background", "actors"), "discovered", ()),
+    "without_boxes": ("street_discovered", ("background", "road", "actors"), "discovered", ()),
 }  # fmt: skip
 
 
