@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from drivesplat.model.gaussians import Gaussians, no_colors
-from drivesplat.model.height_field import HeightField
+from drivesplat.model.height_field import HeightField, bilinear
 from drivesplat.model.parameters import fade, init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part
 from drivesplat.model.states import IMAGE, State, Want
@@ -72,6 +72,8 @@ class RoadPart(Part):
         self.cap_max = cap_max
         for name in ("lower", "heights", "covered"):
             self.register_buffer(name, getattr(surface, name))
+        self.register_buffer("tiles", surface.tiles(), persistent=False)
+        self.register_buffer("turns", _turns(self.tiles, EDGE), persistent=False)
         self._settings = settings
 
     @classmethod
@@ -97,11 +99,12 @@ class RoadPart(Part):
     def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
         p = self.params
         places = p["means"][:, :2]
-        heights, slopes = self.surface.at(places)
+        cells, inside = self.surface.locate(places)
+        heights, turns = bilinear(self.tiles.index_select(0, cells), inside), self.turns.index_select(0, cells)
         scales = torch.exp(p["scales"][:, :2]).clamp(max=LARGEST)
         return Gaussians(
             torch.cat([places, heights[:, None]], dim=1),
-            _tilted(p["quats"], slopes.detach()),
+            (p["quats"][:, ::3, None] * turns).sum(dim=1),
             torch.cat([scales, torch.full_like(scales[:, :1], THICKNESS)], dim=1),
             torch.sigmoid(p["opacities"]),
             *((p["sh0"], p["shN"]) if want.colors else no_colors(p["means"])),
@@ -114,7 +117,7 @@ class RoadPart(Part):
     @torch.no_grad()
     def confine(self) -> None:
         means, surface = self.params["means"], self.surface
-        means[:, 2] = surface.at(means[:, :2]).heights
+        means[:, 2] = surface.at(means[:, :2])
         fade(self.params, ~surface.covers(means[:, :2]))
 
     @torch.no_grad()
@@ -133,7 +136,7 @@ class RoadPart(Part):
         nearest = cKDTree(p["means"][visible, :2].cpu().numpy()).query(places.cpu().numpy())[1]
         rows = visible[torch.from_numpy(nearest).to(visible.device)]
         found = {name: values[rows].clone() for name, values in p.items()}
-        found["means"] = torch.cat([places, surface.at(places).heights[:, None]], dim=1)
+        found["means"] = torch.cat([places, surface.at(places)[:, None]], dim=1)
         found["scales"].fill_(math.log(FILLED_SCALE * EDGE))
         found["opacities"].fill_(FILLED_OPACITY)
         return found
@@ -153,9 +156,12 @@ def in_layer(surface: HeightField, points: Float[Tensor, "n 3"]) -> Bool[Tensor,
     return surface.layer(points, BELOW, ABOVE)
 
 
-def _tilted(quats: Float[Tensor, "n 4"], slopes: Float[Tensor, "n 2"]) -> Float[Tensor, "n 4"]:
-    """The rotations about the vertical of `quats`, followed by the shortest one that turns the vertical to the normals
-    of surfaces with these slopes. The results have any length."""
-    tilt = 1.0 + torch.sqrt(1.0 + slopes.square().sum(dim=1))
-    (to_x, to_y), scalar, turn = slopes.unbind(dim=1), quats[:, 0], quats[:, 3]
-    return torch.stack([tilt * scalar, to_y * scalar - to_x * turn, -to_x * scalar - to_y * turn, tilt * turn], dim=1)
+def _turns(tiles: Float[Tensor, "cells 4"], edge: float) -> Float[Tensor, "cells 2 4"]:
+    """Quaternions (w, x, y, z) of any length: with a rotation (w, 0, 0, z) about the vertical, w times the first of a
+    cell plus z times the second is this rotation, followed by the shortest one that turns the vertical to the surface's
+    normal in the middle of the cell."""
+    _, in_x, in_y, both = tiles.unbind(dim=1)
+    to_x, to_y = (in_x + 0.5 * both) / edge, (in_y + 0.5 * both) / edge
+    tilt, nothing = 1.0 + torch.sqrt(1.0 + to_x.square() + to_y.square()), torch.zeros_like(to_x)
+    first, second = [tilt, to_y, -to_x, nothing], [nothing, -to_x, -to_y, tilt]
+    return torch.stack([torch.stack(first, dim=1), torch.stack(second, dim=1)], dim=1)

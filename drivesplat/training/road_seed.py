@@ -226,7 +226,7 @@ def _spread(cells: Int[np.ndarray, "k 2"], per_side: int) -> Float[np.ndarray, "
 
 def _on(surface: HeightField, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     """Places with their heights on a surface."""
-    return np.column_stack([places, surface.at(_tensor(places).float()).heights.double().numpy()])
+    return np.column_stack([places, surface.at(_tensor(places).float()).double().numpy()])
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:

@@ -34,7 +34,7 @@ def surface_through(points: np.ndarray) -> HeightField:
 
 
 def heights_on(surface: HeightField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return surface.at(torch.from_numpy(np.column_stack([x, y])).float()).heights.double().numpy()
+    return surface.at(torch.from_numpy(np.column_stack([x, y])).float()).double().numpy()
 
 
 def hill(x: np.ndarray, y: np.ndarray) -> np.ndarray:
