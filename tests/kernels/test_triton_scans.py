@@ -21,6 +21,8 @@ from drivesplat.kernels.triton import scan_tiles
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 ON_GPU = [pytest.mark.gpu, pytest.mark.skipif(DEVICE.type == "cpu", reason="no GPU")]
+SLOW = [pytest.mark.slow] if DEVICE.type == "cpu" else []
+"""Marks of what takes seconds in the interpreter, beside a test of the same kernels that is always run."""
 RAYS = ("azimuths", "elevations", "offsets_s")
 INPUTS = ("means", "quats", "scales", "opacities", "values")
 SEEN = ("range", "alpha", "values", "alpha_before")
@@ -79,7 +81,7 @@ def disagreements(scene: ScanScene, motion: ScanMotion | None = None) -> dict[st
     return wrong
 
 
-@pytest.mark.parametrize(("beams", "firings"), [(1, 1), (9, 40)])
+@pytest.mark.parametrize(("beams", "firings"), [(1, 1), pytest.param(9, 40, marks=SLOW)])
 def test_every_size_of_scan_agrees(beams, firings):
     scene = random_scan(0, n=60, rays=even_rays(beams, firings))
     assert not disagreements(scene)
@@ -100,7 +102,7 @@ def test_the_cuda_source_compiled_for_a_processor_agrees(monkeypatch, tmp_path):
     assert ran == ["scans"]
 
 
-@pytest.mark.parametrize("firings", [41, 3, 1])
+@pytest.mark.parametrize("firings", [41, *(pytest.param(few, marks=SLOW) for few in (3, 1))])
 def test_moving_sensor_and_gaussians_agree(firings):
     """Also where the halves of a revolution have different numbers of firings, and where there is one half."""
     scene = random_scan(6, n=50, rays=uneven_rays(6, 4, firings))
@@ -111,9 +113,9 @@ def test_moving_sensor_and_gaussians_agree(firings):
 @pytest.mark.parametrize(
     "order",
     [
-        pytest.param(torch.arange(79, -1, -1).roll(37), id="clockwise, beginning anywhere"),
-        pytest.param(torch.arange(97) % 80, id="more than a turn"),
-        pytest.param(torch.arange(20, 55), id="less than half a turn"),
+        pytest.param(torch.arange(79, -1, -1).roll(37), id="clockwise, beginning anywhere", marks=SLOW),
+        pytest.param(torch.arange(97) % 80, id="more than a turn", marks=SLOW),
+        pytest.param(torch.arange(20, 55), id="less than half a turn", marks=SLOW),
     ],
 )
 def test_firings_in_any_order_agree(order):
@@ -122,7 +124,7 @@ def test_firings_in_any_order_agree(order):
     assert not disagreements(random_scan(4, n=50, rays=part))
 
 
-@pytest.mark.parametrize("channels", [0, 9])
+@pytest.mark.parametrize("channels", [0, pytest.param(9, marks=SLOW)])
 def test_any_number_of_channels_agrees(channels):
     scene = random_scan(7, n=30, rays=even_rays(3, 40))
     scene.values = torch.from_numpy(np.random.default_rng(channels).normal(size=(30, channels)))
@@ -169,7 +171,7 @@ def test_the_last_rows_of_gaussians_are_left_out_where_they_do_not_fit():
     assert [int(needed) for needed in counted.needed] == [5, 8]
 
 
-@pytest.mark.parametrize("opacity", [0.02, 0.9])
+@pytest.mark.parametrize("opacity", [pytest.param(share, marks=SLOW) for share in (0.02, 0.9)])
 def test_lists_of_several_chunks_agree(opacity):
     """Of transparent Gaussians, where all chunks are seen, and of opaque ones, where rays end in the first."""
     scene = random_scan(32, n=600, rays=even_rays(1, 32))
@@ -178,9 +180,10 @@ def test_lists_of_several_chunks_agree(opacity):
     assert not disagreements(scene)
 
 
-def test_extreme_gaussians_agree():
+@pytest.mark.parametrize("seed", [pytest.param(30, marks=SLOW)])
+def test_extreme_gaussians_agree(seed):
     """Points, giants, needles and sheets; faint and opaque; near, far and at the poles."""
-    scene = random_scan(30, n=64, rays=uneven_rays(30, 6, 70))
+    scene = random_scan(seed, n=64, rays=uneven_rays(seed, 6, 70))
     scene.world_to_sensor = torch.eye(4, dtype=torch.float64)
     s = scene.scales
     s[:8], s[8:12], s[16:24, 1:], s[24:32, 0] = 1e-5, 4.0, 1e-2, 1e-3
