@@ -5,6 +5,7 @@ are imported by name.
 """
 
 from pathlib import Path
+from typing import Any
 
 _INSTALLED = Path(__file__).parent / "_workflow"
 """The workflow's files where pip has installed them (pyproject.toml); a checkout has no such folder."""
@@ -12,3 +13,19 @@ IS_CHECKOUT = not _INSTALLED.is_dir()
 WORKFLOW = Path(__file__).parents[1] if IS_CHECKOUT else _INSTALLED
 """The folder of the Snakefile, with config.yaml, presets and profiles."""
 SNAKEFILE = WORKFLOW / "Snakefile"
+
+_PUBLIC = {
+    "open": ("drivesplat.drive.trained_drive", "open_drive"),
+    "TrainedDrive": ("drivesplat.drive.trained_drive", "TrainedDrive"),
+    "Camera": ("drivesplat.drive.cameras", "PoseableCamera"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """The names of docs/python.md, imported when they are first used."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    module, own = _PUBLIC[name]
+    return getattr(import_module(module), own)

@@ -28,5 +28,9 @@ class DeviceError(DriveSplatError):
     """The compute device is absent, full or unusable."""
 
 
+class RequestError(DriveSplatError, ValueError):
+    """A call of the Python interface asks for what a drive cannot give."""
+
+
 class TrainingError(DriveSplatError):
     """The optimisation cannot go on."""

@@ -37,6 +37,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     modules = sorted((list(module) for _, module in groupby(runs, key=lambda item: item.path)), key=len, reverse=True)
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     shares = [[item for module in modules[i::workers] for item in module] for i in range(workers)]
+    for share in shares[1:]:  # the first worker makes the finished run; until it is there, others do something else
+        share.sort(key=lambda item: "finished_run" in getattr(item, "fixturenames", ()))
     for i, share in enumerate(shares):
         room = max(0, len(items) * (i + 1) // workers - len(items) * i // workers - len(share))
         share += others[:room]

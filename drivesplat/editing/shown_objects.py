@@ -85,10 +85,18 @@ class ShownObjects:
         (placements,) = actor_placements(present, now)
         want = Want(placements=tuple(placements))
         sets = self.model.sample(self.model.states(view.time, want), want)
-        gaussians, found = concatenate(sets), []
+        found = self.others_in(view, sets)
         if with_actors:
-            rows = [gaussians.placement == i for i in range(len(present))]
-            found += [_seen_object(self.model, gaussians, *one, view) for one in zip(rows, present, strict=True)]
+            gaussians, boxes = concatenate(sets), [box_of(actor, view.time) for actor in present]
+            own = (seen_object(self.model, gaussians, i, box, view) for i, box in enumerate(boxes))
+            found = [*(item for item in own if item is not None), *found]
+        return found
+
+    @torch.no_grad()
+    def others_in(self, view: View, sets: Sequence[Gaussians]) -> list[SeenObject]:
+        """Those of the others that a view shows, by the `sets` of Gaussians of the model's parts."""
+        now, found = np.array([view.time]), []
+        gaussians = concatenate(sets)
         means, names = gaussians.means, [part.name for part in self.model.parts]
         part_of_row = torch.cat([torch.full((len(own),), i, device=means.device) for i, own in enumerate(sets)])
         for item, parts in zip(self.others, self.parts, strict=True):
@@ -101,7 +109,7 @@ class ShownObjects:
             low, high = (torch.from_numpy(corner).to(means) for corner in (-half - floor, half + MARGIN))
             of_parts = torch.tensor([name in parts for name in names], device=means.device)[part_of_row]
             rows = ((local > low) & (local < high)).all(dim=1) & of_parts
-            found.append(_seen_object(self.model, gaussians, rows, item, view))
+            found.append(_seen_object(self.model, gaussians, rows, box_of(item, view.time), view))
         return [item for item in found if item is not None]
 
 
@@ -114,12 +122,20 @@ def parts_that_may_show(track: Track, model: SplatModel) -> frozenset[str]:
     return frozenset(part.name for part in model.parts if not part.has_objects and part.moves == travels)
 
 
+def box_of(item: EditedActor, time: float) -> Box:
+    """The box of an object of a drive at a time in film seconds."""
+    return Box(item.id, ObjectClass.VEHICLE, item.category, item.size, item.poses(np.array([time]))[0], 0.0, 0)
+
+
+def seen_object(model: SplatModel, gaussians: Gaussians, placement: int, box: Box, view: View) -> SeenObject | None:
+    """The object in a view that the Gaussians of a placement show; None where the image does not show it."""
+    return _seen_object(model, gaussians, gaussians.placement == placement, box, view)
+
+
 def _seen_object(
-    model: SplatModel, gaussians: Gaussians, rows: Bool[Tensor, " n"], item: EditedActor, view: View
+    model: SplatModel, gaussians: Gaussians, rows: Bool[Tensor, " n"], box: Box, view: View
 ) -> SeenObject | None:
     """An object in a view that the `rows` of the Gaussians show; None where the image does not show it."""
-    pose = item.poses(np.array([view.time]))[0]
-    box = Box(item.id, ObjectClass.VEHICLE, item.category, item.size, pose, 0.0, 0)
     polygon = hull_of(box, view.viewmat.cpu().double().numpy(), view.K.cpu().double().numpy())
     if polygon is None or not bool(rows.any()):
         return None
@@ -136,7 +152,7 @@ def _seen_object(
         return None
     own = gaussians[rows]
     alone = model.composited(own, own.means.new_ones(len(own), 1), whole).alpha.sum()
-    return SeenObject(item.id, tuple(corners.tolist()), min(1.0, float(share / alone)))
+    return SeenObject(box.track_id, tuple(corners.tolist()), min(1.0, float(share / alone)))
 
 
 def _cropped(view: View, low: np.ndarray, high: np.ndarray) -> View:

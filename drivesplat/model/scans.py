@@ -9,15 +9,11 @@ from torch import Tensor
 from drivesplat.errors import ResultError
 from drivesplat.kernels.view_colors import lidar_response
 from drivesplat.model.gaussians import Gaussians, GaussianSets
+from drivesplat.model.groups import NOTHING, strongest_group
 from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import RecordedScan
-
-NOTHING = 1e-6
-"""Alpha below which a ray has met nothing."""
-CHANNELS = 4
-"""Number of groups of Gaussians whose shares of rays are composited together."""
 
 
 @dataclass(frozen=True)
@@ -93,16 +89,7 @@ def scan_picture(sets: GaussianSets, view: ScanView, before: Float[Tensor, "b a"
 
 def group_met(gaussians: Gaussians, view: ScanView, groups: Int[Tensor, " n"]) -> Int[Tensor, "b a"]:
     """The one of `groups`, numbers from -1, whose Gaussians contribute most to each ray; -1 where nothing is met."""
-    numbers, own = groups.unique(return_inverse=True)
-    most = gaussians.means.new_zeros(view.rays.azimuths.shape)
-    found = torch.full_like(most, -1, dtype=groups.dtype)
-    for first in range(0, len(numbers), CHANNELS):  # a fixed number, since kernels are compiled for each
-        shares = own[:, None] == torch.arange(first, first + CHANNELS, device=own.device)
-        weight, number = _rasterized(gaussians, view, shares.to(gaussians.means)).values.max(dim=-1)
-        better = weight > most.clamp(min=NOTHING)
-        found = torch.where(better, numbers[(first + number).clamp(max=len(numbers) - 1)], found)
-        most = torch.where(better, weight, most)
-    return found
+    return strongest_group(groups, lambda shares: _rasterized(gaussians, view, shares.to(gaussians.means)).values)
 
 
 def _rasterized(

@@ -7,36 +7,42 @@ from pydantic import Field, model_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.method import MethodSettings, Seeds, with_seed, with_seeds
-from drivesplat.settings.train import Parts
+from drivesplat.settings.train import PartName, Parts
 
 
 class VariantSettings(Settings):
     """A method without one of its components."""
 
     parts: Parts | None = None
-    """:printed: Parts of the variant's model. null = the method's parts."""
+    """Parts of the variant's model. null = the method's, without those of `drop`."""
+    drop: tuple[PartName, ...] = ()
+    """:printed: Parts of the method that the variant's model lacks."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """:printed: Settings laid over the method's overrides, as a tree. Only `sky` and `train` may be set."""
 
     @model_validator(mode="after")
     def _removes_something(self) -> "VariantSettings":
-        if self.parts is None and not self.overrides:
-            raise ValueError("it removes nothing: set parts or overrides")
+        if self.parts is None and not (self.drop or self.overrides):
+            raise ValueError("it removes nothing: set drop, parts or overrides")
         return self
+
+    def parts_of(self, complete: MethodSettings) -> Parts:
+        """The parts of the variant of a method."""
+        return self.parts or tuple(part for part in complete.parts if part not in self.drop)
 
 
 def _default_variants() -> dict[str, VariantSettings | None]:
-    def trained(**train: Any) -> VariantSettings:
-        return VariantSettings(overrides={"train": train})
+    def trained(*drop: PartName, **train: Any) -> VariantSettings:
+        return VariantSettings(drop=drop, overrides={"train": train} if train else {})
 
     return {
-        "actors": VariantSettings(parts=("background", "road")),
+        "actors": trained("actors", "deformable"),
         "track_correction": trained(actors={"tracks": {"corrected": False}}),
         "sky": VariantSettings(overrides={"sky": "none", "train": {"sky_bce_weight": 0.0}}),
         "sky_loss": trained(sky_bce_weight=0.0),
         "depth": trained(depth_weight=0.0),
-        "road": VariantSettings(parts=("background", "actors")),
-        "ground": VariantSettings(parts=("background", "actors"), overrides={"train": {"road_weight": 0.0}}),
+        "road": trained("road"),
+        "ground": trained("road", road_weight=0.0),
         "dropout": trained(dropout=0.0),
         "entropy": trained(entropy_weight=0.0),
         "colours_in_time": trained(actors={"fourier": 1}),
@@ -62,7 +68,7 @@ class AblationSettings(Settings):
     def methods(self, complete: MethodSettings) -> dict[str, MethodSettings]:
         """The methods to train, by name: `complete` and every variant, each with every seed."""
         variants = {
-            self.job.variant(name): complete.varied(variant.parts, variant.overrides)
+            self.job.variant(name): complete.varied(variant.parts_of(complete), variant.overrides)
             for name, variant in self.without.items()
             if variant is not None
         }

@@ -31,14 +31,20 @@ def read_edits(path: str | Path) -> dict[str, Edit]:
     found = {}
     for name, steps in edits.items():
         _require_name(name, f"{path}: edit")
-        where = f"{path}: edit {name!r}"
-        if not isinstance(steps, list) or not steps:
-            raise ConfigError(
-                f"{where} is {quoted(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}"
-            )
-        checked = (_step(step, f"{where}, step {number}") for number, step in enumerate(steps, start=1))
-        found[name] = Edit(steps=tuple(checked))
+        found[name] = edit_of(steps, f"{path}: edit {name!r}")
     return found
+
+
+def edit_of(steps: Any, where: str) -> Edit:
+    """The edit with the steps of an entry of an edits file. Raises ConfigError, which starts with `where` and names the
+    step, where they are invalid.
+
+    >>> edit_of([{"remove": {"track": "6e5c"}}], "my edit").steps[0].kind
+    'remove'
+    """
+    if not isinstance(steps, list) or not steps:
+        raise ConfigError(f"{where} is {quoted(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}")
+    return Edit(steps=tuple(_step(step, f"{where}, step {number}") for number, step in enumerate(steps, start=1)))
 
 
 def _step(step: Any, where: str) -> Step:

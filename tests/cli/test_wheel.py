@@ -75,6 +75,7 @@ def test_its_dependencies_are_those_of_the_requirements(wheel):
     assert record["Version"] == project["version"] and record["Requires-Python"] == "<3.14,>=3.11"
 
 
+@pytest.mark.slow
 def test_an_installed_copy_has_the_code_digests_of_the_checkout_and_its_own_pages(site, tmp_path):
     """A result is not out of date where another installation made it."""
     code = (

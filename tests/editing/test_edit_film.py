@@ -183,6 +183,7 @@ def test_labels_hold_the_attributes_of_every_object(busy):
     assert busy.track(AHEAD)["color_matrix"] is None
 
 
+@pytest.mark.slow
 def test_the_caption_says_where_an_object_shows_a_side_that_no_camera_saw(scene, model, tmp_path):
     """The car ahead was seen from behind only; turned round from second 2 on it faces the camera."""
     turn = {"shift": {"track": AHEAD, "yaw": 180.0, "start": 2.0, "duration": 0.0}}

@@ -131,7 +131,13 @@ DELETE = re.compile(r"(results/\S+): .*; delete (\S+) and rerun: the rule '(\w+)
 @pytest.mark.parametrize(
     ("path", "rule", "lost", "target"),
     [
-        ("results/0001/masks/regions/CAM_FRONT/*.png", "masks", True, "results/0001/street/checkpoint.npz"),
+        pytest.param(
+            "results/0001/masks/regions/CAM_FRONT/*.png",
+            "masks",
+            True,
+            "results/0001/street/checkpoint.npz",
+            marks=pytest.mark.slow,
+        ),
         pytest.param("results/0001/seed.ply", "lidar_seed", False, "results/0001/parser.npz", marks=pytest.mark.slow),
     ],
 )

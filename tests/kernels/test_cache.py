@@ -147,6 +147,7 @@ def test_the_users_cache_replaces_a_read_only_installation_also_where_files_cann
     assert len(list((home / ".cache" / "drivesplat").glob("kernels-caller-*"))) == 1
 
 
+@pytest.mark.slow
 def test_processes_that_compile_other_signatures_at_the_same_time_share_the_cache(tmp_path):
     """They begin together, and each waits for a second between its reading and writing of the index."""
     small_package(tmp_path, 3.0)

@@ -213,7 +213,7 @@ def before_one_tile(generator: torch.Generator) -> tuple[list[torch.Tensor], Til
 
 
 @pytest.mark.usefixtures("anywhere")
-@pytest.mark.parametrize("length", [256, 48])
+@pytest.mark.parametrize("length", [pytest.param(256, marks=pytest.mark.slow), 48])
 def test_rays_end_before_the_last_gaussian(length):
     """In two batches of a block, or in chunks."""
     generator, objects = torch.Generator().manual_seed(0), slice(60, 150)

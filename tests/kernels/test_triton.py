@@ -398,6 +398,7 @@ def test_an_image_over_a_cube_map_and_its_gradients_agree_with_torch(seed):
     assert_same_gradients([[expected], [found]], inputs, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_exploration_has_the_covariance_of_equation_8_and_leaves_opaque_gaussians_in_place():
     """Over many draws: strength² times the squared covariance of the Gaussian, for a faint one."""
     torch.manual_seed(0)
@@ -454,7 +455,7 @@ def test_placed_gaussians_and_their_gradients_agree_with_torch():
     assert_same_gradients(results, [*local, objects.quats, objects.translations], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), (3, 2)])
+@pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), pytest.param(3, 2, marks=pytest.mark.slow)])
 def test_time_varying_colors_and_their_gradients_agree_with_torch(degree, terms):
     torch.manual_seed(1)
     objects, owner, owns = some_objects(requires_grad=False)

@@ -131,6 +131,7 @@ def test_any_number_of_channels_agrees(channels):
     assert not disagreements(scene)
 
 
+@pytest.mark.slow
 def test_lists_of_planned_capacity_give_the_same_scan():
     """Those of a CUDA graph, with room for more Gaussians and entries than there are."""
     scene = random_scan(6, n=120, rays=uneven_rays(6, 4, 21))
@@ -144,6 +145,7 @@ def test_lists_of_planned_capacity_give_the_same_scan():
         torch.testing.assert_close(found[name], values, rtol=1e-5, atol=1e-6 * float(values.abs().max()), msg=name)
 
 
+@pytest.mark.slow
 def test_lists_that_overflow_give_a_part_of_the_scan_and_say_what_they_need(monkeypatch):
     monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
     monkeypatch.setattr(capacity, "MARGIN", 1.0)
@@ -209,6 +211,7 @@ def test_the_gradient_of_the_pose_is_computed_without_triton():
     assert pose.grad is not None and pose.grad.any()
 
 
+@pytest.mark.slow
 def test_alpha_before_ranges_of_another_type_is_the_same():
     scene = random_scan(7, n=30, rays=even_rays(3, 40)).float()
     on_device = {name: getattr(scene, name).to(DEVICE) for name in (*INPUTS, "world_to_sensor")}

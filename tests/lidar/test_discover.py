@@ -33,7 +33,7 @@ def offsets(item: Discovered, mover: Mover, seconds: np.ndarray | None = None) -
     [
         pytest.param(Mover((12.0, 0.0), (7.0, 0.0)), id="ahead", marks=pytest.mark.slow),
         pytest.param(Mover((55.0, 3.5), (-10.0, 0.0)), id="oncoming", marks=pytest.mark.slow),
-        pytest.param(Mover((14.0, -8.0), (2.0, 4.0)), id="crossing"),
+        pytest.param(Mover((14.0, -8.0), (2.0, 4.0)), id="crossing", marks=pytest.mark.slow),
         pytest.param(Mover((14.0, 0.5), (7.0, 0.0), size=(8.5, 2.5, 3.2)), id="truck"),
     ],
 )

@@ -70,7 +70,11 @@ def test_a_focal_length_that_straight_motion_leaves_open_is_not_warned_of(tmp_pa
 
 @pytest.mark.parametrize(
     ("k1", "path", "points"),
-    [(-0.25, straight, street_points(600)), (-0.08, straight, street_points(600)), (0.1, curve, points_around())],
+    [
+        (-0.25, straight, street_points(600)),
+        pytest.param(-0.08, straight, street_points(600), marks=pytest.mark.slow),
+        pytest.param(0.1, curve, points_around(), marks=pytest.mark.slow),
+    ],
 )
 def test_distortion_that_is_not_stated_is_warned_of_with_its_coefficient(tmp_path, k1, path, points):
     trial = trial_of(tmp_path, path, points, k1=k1)
@@ -82,6 +86,7 @@ def test_distortion_that_is_not_stated_is_warned_of_with_its_coefficient(tmp_pat
     assert abs(float(found[2]) - abs(k1) * corner**3 * trial.stated.focal) < 6.0
 
 
+@pytest.mark.slow
 def test_a_matrix_of_another_image_size_is_warned_of_with_the_right_one(tmp_path):
     trial = trial_of(tmp_path, curve, points_around(), scale=1.0 / 0.75)
     sentence = trial.warning()

@@ -342,6 +342,7 @@ def test_a_scene_without_lidar_seed_points_or_training_images_is_refused(tiny_sc
     assert (note["lidar"], note["far"]) == (0, 200)
 
 
+@pytest.mark.slow
 def test_the_real_scene_is_seeded_from_its_only_sweep_and_a_file(real_scene_root):
     scene = scene_at(real_scene_root, dataset="nuscenes", scene="0061", sweeps=False)
     with pytest.raises(DatasetError, match=r"LIDAR_TOP.*on_missing"):

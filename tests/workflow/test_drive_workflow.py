@@ -32,6 +32,7 @@ def copy(finished_run, tmp_path_factory) -> WorkflowCopy:
     return made
 
 
+@pytest.mark.slow
 def test_a_drive_folder_gives_the_seed_and_the_metrics_of_its_tables(copy):
     done = copy.run("results/monday/metrics.json")
     assert done.returncode == 0, done.stdout

@@ -159,6 +159,7 @@ def test_people_riders_and_unknown_tracks_are_refused_with_the_tracks_there_are(
     assert "is the id of another track" in refusal({"duplicate": {"track": ONCOMING, "as": person}}, cyclists=1)
 
 
+@pytest.mark.slow
 def test_a_vehicle_placed_inside_a_parked_one_is_refused():
     parked = pose_at(named(recorder_of(key_frames=12), "parked 0"), 0.0)[:3, 3]
     ahead = np.linalg.inv(recorder_of(key_frames=12).ego_pose(FILM_START)) @ [*parked, 1.0]

@@ -3,6 +3,7 @@
 import multiprocessing
 
 import numpy as np
+import pytest
 from helpers.demo_worlds import FRONT, names_of, world_of
 from helpers.patience import PATIENCE_S
 
@@ -50,6 +51,7 @@ def _in_child(results) -> None:
     results.put(shown(Recorder(world_of(cyclists=1))))
 
 
+@pytest.mark.slow
 def test_a_forked_process_casts_rays_of_its_own():
     """The parent has cast rays before it forks, as for the check of placed vehicles."""
     recorder = Recorder(world_of(cyclists=1))

@@ -41,6 +41,7 @@ def test_a_straight_level_road_is_the_street_itself():
 
 
 @pytest.mark.parametrize(("bend", "grade"), [pytest.param(0.0, 0.0, marks=pytest.mark.slow), (-60.0, -0.12)])
+@pytest.mark.slow
 def test_objects_stand_on_the_ground(bend, grade):
     """A ray straight down from half a metre above an object's origin meets the ground at the origin."""
     recorder = recorder_of(

@@ -27,6 +27,7 @@ def test_rows_are_read_downwards_over_the_readout_time_about_the_timestamp():
     np.testing.assert_allclose(camera.pose, recorder_of().camera(FRONT, SECONDS).pose, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_each_row_is_that_of_a_global_shutter_at_its_own_time():
     side = RIG["CAM_BACK_LEFT"]
     rolling, still = (

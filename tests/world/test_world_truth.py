@@ -186,6 +186,7 @@ def test_the_view_without_the_leading_vehicle_shows_all_others(truth, recorded, 
     assert (behind[own] >= depths[0][own]).all()
 
 
+@pytest.mark.slow
 def test_key_frames_at_which_the_camera_would_be_inside_an_object_are_left_out():
     """4 m to the left is the lane of the oncoming vehicle, which passes the ego vehicle after five seconds."""
     recorder = recorder_of(key_frame_hz=10, image_hz=10, key_frames=80, pedestrians=0, parked=0)

@@ -15,6 +15,7 @@ from drivesplat.world.optics.imaging import to_bytes
 from drivesplat.world.recorder import Viewpoint
 
 
+@pytest.mark.slow
 def test_where_nothing_moves_no_vehicle_leads_and_images_are_equal_and_a_new_world_replaces_the_old_one(tmp_path):
     """With LiDAR sweeps between key frames, and without."""
     still = {"width": 64, "key_frames": 2, "vehicles": 0, "pedestrians": 0, "ego": "stands"}

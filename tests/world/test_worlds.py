@@ -82,7 +82,7 @@ def test_shapes_and_textures_are_those_of_the_stored_digests():
     assert (shape_digests(), texture_digests()) == (STORED["shapes"], STORED["textures"]), f"they {HOW_TO}"
 
 
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("name", [n if n == "day" else pytest.param(n, marks=pytest.mark.slow) for n in PICTURES])
 def test_recordings_are_those_that_are_stored_but_for_rounding(name):
     """Shading, textures, shadows, haze, noise; classes; returns of each beam. Processors differ in pixels at edges."""
     found, stored = pictures(name), STORED["pictures"][name]

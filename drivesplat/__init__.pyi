@@ -1,0 +1,13 @@
+"""What type checkers know of the package: `drivesplat.__getattr__` imports these names when they are first used."""
+
+from pathlib import Path
+
+from drivesplat.drive.cameras import PoseableCamera as Camera
+from drivesplat.drive.trained_drive import TrainedDrive as TrainedDrive
+from drivesplat.drive.trained_drive import open_drive as open
+
+IS_CHECKOUT: bool
+WORKFLOW: Path
+SNAKEFILE: Path
+
+__all__ = ["Camera", "TrainedDrive", "open"]

@@ -1,0 +1,54 @@
+"""What a camera sees of a drive."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float, Int16
+from torch import Tensor
+
+from drivesplat.rendering.frames import uint8_image
+
+
+@dataclass(frozen=True)
+class ObjectBox:
+    """The box of an object that an image shows.
+
+    `size` is length, width, height in metres, at `object_to_world` (4, 4) (object: x forward, y left, z up, at the
+    centre). `corners` is the projected box, clipped to the image: left, top, right, bottom in continuous pixels;
+    `visible` is the share of the object, also of what lies outside the image, that the image shows.
+    """
+
+    id: str
+    category: str
+    size: np.ndarray
+    object_to_world: np.ndarray
+    corners: tuple[float, float, float, float]
+    visible: float
+
+
+@dataclass(frozen=True)
+class DriveView:
+    """A rendering, as tensors on the model's device. What was not asked for is None.
+
+    `rgb` in [0, 1]; `depth` along the camera's axis in metres, 0 where there is no surface; `alpha`, how opaque the
+    scene is there without the sky; `instance`, the index into `objects` of the object that contributes most to a pixel,
+    -1 where this is none of them; `boxes` of the objects that the image shows. `objects` are the ids of the objects of
+    which the model has Gaussians.
+    """
+
+    objects: tuple[str, ...]
+    rgb: Float[Tensor, "h w 3"] | None = None
+    depth: Float[Tensor, "h w"] | None = None
+    alpha: Float[Tensor, "h w"] | None = None
+    instance: Int16[Tensor, "h w"] | None = None
+    boxes: tuple[ObjectBox, ...] | None = None
+
+    @property
+    def image(self) -> np.ndarray:
+        """`rgb` as an image (h, w, 3) uint8, with the bytes of a film's frame."""
+        return uint8_image(self.rgb)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The tensors by name as arrays in main memory."""
+        named = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: values.cpu().numpy() for name, values in named.items() if isinstance(values, Tensor)}

@@ -1,0 +1,227 @@
+"""A trained drive: the model of a method, with its scene."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+
+from drivesplat.drive.cameras import Matrix, PoseableCamera, require_pose
+from drivesplat.drive.drive_view import DriveView
+from drivesplat.drive.world_state import WorldState
+from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
+from drivesplat.editing.ego import EgoEdit
+from drivesplat.editing.sensor_path import recorded_ego
+from drivesplat.editing.shown_objects import ShownObjects
+from drivesplat.errors import RequestError
+from drivesplat.model.checkpoint import open_model, read_checkpoint
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
+from drivesplat.scene.scene import REFINED, Frame, Scene, Track, read_scene
+from drivesplat.scene.tracks import box_at, ever_moves
+from drivesplat.scene.training_record import TrainingRecord, read_training_record
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.edit import Edit
+from drivesplat.trajectories.camera_path import recorded_frames, smooth_poses
+from drivesplat.trajectories.edited_actors import EditedActor
+from drivesplat.workflow.edits_file import edit_of
+
+if TYPE_CHECKING:
+    import pandas
+
+COLUMNS = [
+    "id", "class", "category", "length", "width", "height", "first", "last", "speed", "editable", "why_not",
+]  # fmt: skip
+"""Those of `TrainedDrive.actors`."""
+Outside = Literal["refuse", "clamp"]
+"""What happens to a time outside of the recording."""
+
+
+def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "TrainedDrive":
+    """The drive whose model a method has trained, from the method's result folder.
+
+    Args:
+        folder: `results/{scene}/{method}`, with `checkpoint.npz`; scene and training record lie beside it.
+        device: 'any' (the GPU where there is one), 'cuda' or 'cpu', or settings as under `device` in config.yaml.
+
+    Raises RequestError where the folder has no checkpoint, ResultError for files that are none of this version, and
+    DeviceError where the device is missing or its memory is exhausted.
+
+    >>> drive = open_drive("results/demo/street")
+    >>> drive.render("CAM_FRONT", time=4.2).image.shape
+    (225, 400, 3)
+    """
+    folder = Path(folder)
+    if not (folder / "checkpoint.npz").is_file():
+        raise RequestError(
+            f"{folder} has no checkpoint.npz: name the folder of a method that has been trained, such as "
+            "results/demo/street"
+        )
+    checkpoint = read_checkpoint(folder / "checkpoint.npz")
+    refined = "refine_poses" in checkpoint.provenance.get("stages", {})
+    scene = read_scene(folder.parent / (REFINED if refined else "scene.json"))
+    record = read_training_record(folder.parent / "parser.npz")
+    settings = device if isinstance(device, DeviceSettings) else DeviceSettings.model_validate(device)
+    model, chosen = open_model(checkpoint, settings)
+    return TrainedDrive(folder, scene, record, model, chosen)
+
+
+@dataclass(frozen=True)
+class TrainedDrive:
+    """A drive that can be rendered at any time from any pose: see `open_drive`. Times are seconds since the first
+    image, as in films and edits; world coordinates are metres, z up; `edit` is what `edited` has changed."""
+
+    folder: Path
+    scene: Scene
+    record: TrainingRecord
+    model: SplatModel
+    device: torch.device
+    edit: Edit | None = None
+
+    @property
+    def cameras(self) -> list[str]:
+        """The names of the recorded cameras."""
+        return list(dict.fromkeys(frame.camera for frame in self.scene.frames))
+
+    @property
+    def duration(self) -> float:
+        """The time of the last image in seconds."""
+        return max(self.scene.seconds(frame.timestamp) for frame in self.scene.frames)
+
+    @property
+    def where(self) -> str:
+        """The scene and the method, for messages."""
+        return f"scene {self.scene.name}, method {self.folder.name}"
+
+    @cached_property
+    def edited_actors(self) -> list[EditedActor]:
+        """The objects of which the model has Gaussians, after the edit."""
+        if self.edit is None:
+            return trained_actors(self.model, self.scene, self.where)
+        return recorded_and_edited(self.model, self.scene, self.cameras[0], self.edit, self.where)[1]
+
+    @cached_property
+    def _static(self) -> ShownObjects:
+        """The annotated objects that the model shows in its static part, if at all."""
+        dynamic = {track.id for track in self.scene.tracks if track.object_class.is_dynamic}
+        trained = trained_actors(self.model, self.scene, self.where)
+        others = [item for item in other_objects(self.scene, trained) if item.id in dynamic]
+        return ShownObjects.of_scene(self.scene, self.model, [], others)
+
+    @property
+    def actors(self) -> "pandas.DataFrame":
+        """A table of the annotated objects, by `id`: `class` and the dataset's `category`; `length`, `width` and
+        `height` in metres; `first` and `last`, the seconds of their annotations; `speed`, the largest horizontal one in
+        m/s; whether they are `editable`, which has objects moved and removed one by one, and `why_not`."""
+        from pandas import DataFrame  # here: it takes long to import
+
+        editable = {actor.id for actor in trained_actors(self.model, self.scene, self.where)}
+        rows = [_row(self.scene, track, editable) for track in self.scene.tracks if track.object_class.is_dynamic]
+        table = DataFrame(rows, columns=COLUMNS).set_index("id")
+        return table.sort_values(["editable", "first"], ascending=[False, True])
+
+    def edited(self, edit: Edit | list[dict[str, Any]]) -> "TrainedDrive":
+        """The drive after an edit: its steps as in an edits file (docs/editing.md), applied to this drive as recorded.
+
+        Raises ConfigError for steps that are none, or do not fit the drive.
+
+        >>> gone = open_drive("results/demo/street").edited([{"remove": {"track": "bf53"}}])
+        """
+        checked = edit if isinstance(edit, Edit) else edit_of(edit, f"{self.where}, edit")
+        changed = replace(self, edit=checked)
+        _ = changed.edited_actors  # an edit that does not fit is refused here
+        return changed
+
+    def camera(self, name: str, exposure: bool = False) -> PoseableCamera:
+        """A recorded camera: its intrinsics at the size of its training images and its mount; with its learned
+        `exposure`, if wanted. Raises RequestError for an unknown camera."""
+        index, frame = self._first_image(name)
+        width, height = self.record.image_size(index)
+        K = self.record.Ks[index].astype(np.float64)
+        return PoseableCamera(width, height, K, frame.camera_to_ego, name if exposure else None)
+
+    def ego_to_world(self, time: float) -> np.ndarray:
+        """The pose (4, 4) of the ego vehicle; its origin is on the ground below the rear axle."""
+        if (change := self._ego_edit(self.cameras[0])) is not None:
+            return change.poses(recorded_frames(self.scene, self.cameras[0]), np.array([time]))[1][0]
+        return recorded_ego(self.scene, self.cameras[0])(np.array([time]))[0]
+
+    def camera_to_world(self, name: str, time: float) -> np.ndarray:
+        """The pose (4, 4) of a recorded camera: on the smooth path through its images, which films take, too."""
+        self._first_image(name)
+        frames = recorded_frames(self.scene, name)
+        if (change := self._ego_edit(name)) is not None:
+            return change.poses(frames, np.array([time]))[0][0]
+        recorded = np.array([self.scene.seconds(frame.timestamp) for frame in frames]) * 1e6
+        poses = np.stack([frame.camera_to_world for frame in frames])
+        return smooth_poses(recorded, poses, np.array([time]) * 1e6)[0]
+
+    def view(
+        self,
+        camera: str | PoseableCamera,
+        time: float,
+        ego_to_world: Matrix | None = None,
+        camera_to_world: Matrix | None = None,
+    ) -> View:
+        """A camera at a time and a pose, as the model renders it; see `WorldState.render`."""
+        known = self.camera(camera) if isinstance(camera, str) else camera
+        if camera_to_world is not None:
+            if ego_to_world is not None:
+                raise RequestError("a camera has one pose: give ego_to_world or camera_to_world, not both")
+            pose = require_pose(camera_to_world, "the camera")
+        elif isinstance(camera, str) and ego_to_world is None:
+            pose = self.camera_to_world(camera, time)
+        elif known.camera_to_ego is None:
+            raise RequestError("a camera of one's own without camera_to_ego needs camera_to_world")
+        else:
+            ego = self.ego_to_world(time) if ego_to_world is None else require_pose(ego_to_world, "the ego vehicle")
+            pose = ego @ known.camera_to_ego
+        return known.view(pose, time, self.device)
+
+    def state(self, time: float, outside: Outside = "refuse") -> WorldState:
+        """The drive at a time. One outside of the recording is refused by a RequestError, or clamped to it."""
+        if not np.isfinite(time):
+            raise RequestError(f"a time is a number of seconds, not {time}")
+        if outside == "refuse" and not 0.0 <= time <= self.duration:
+            raise RequestError(
+                f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s; outside='clamp' takes "
+                "the nearest of these times"
+            )
+        now = float(min(max(time, 0.0), self.duration))
+        return WorldState(self.model, self.edited_actors, self._static, self.view, now, self.edit is None)
+
+    def render(
+        self,
+        camera: str | PoseableCamera,
+        time: float,
+        *,
+        ego_to_world: Matrix | None = None,
+        camera_to_world: Matrix | None = None,
+        outputs: Sequence[str] = ("rgb",),
+        outside: Outside = "refuse",
+    ) -> DriveView:
+        """What a camera sees at a time: `state(time, outside).render(...)`."""
+        state = self.state(time, outside)
+        return state.render(camera, ego_to_world=ego_to_world, camera_to_world=camera_to_world, outputs=outputs)
+
+    def _first_image(self, name: str) -> tuple[int, Frame]:
+        for index, frame in enumerate(self.scene.frames):
+            if frame.camera == name:
+                return index, frame
+        raise RequestError(f"{self.where} has no camera {name!r}; there are: {', '.join(self.cameras) or 'none'}")
+
+    def _ego_edit(self, camera: str) -> EgoEdit | None:
+        return None if self.edit is None else EgoEdit.of(self.scene, camera, self.edit, self.where)
+
+
+def _row(scene: Scene, track: Track, editable: set[str]) -> list[Any]:
+    boxes = (box_at(track, int(timestamp), 0.0) for timestamp in track.timestamps)
+    speed = max((box.speed for box in boxes if box is not None), default=0.0)
+    first, last = (scene.seconds(track.timestamps[i]) for i in (0, -1))
+    own = track.id in editable
+    why_not = "" if own else "the method has no Gaussians of its own for it" if ever_moves(track) else "it stands"
+    size = [round(float(edge), 3) for edge in track.size]
+    return [track.id, track.object_class.value, track.category, *size, first, last, round(speed, 2), own, why_not]

@@ -1,0 +1,198 @@
+"""A drive at one time, whose objects can be moved one by one."""
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from drivesplat.drive.cameras import Matrix, PoseableCamera, require_pose
+from drivesplat.drive.drive_view import DriveView, ObjectBox
+from drivesplat.editing.actors import actor_placements
+from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_object
+from drivesplat.errors import RequestError
+from drivesplat.model.actor_placements import ActorPlacement
+from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.groups import strongest_group
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import Want
+from drivesplat.model.view import View
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.tracks import Box
+from drivesplat.trajectories.edited_actors import EditedActor
+
+ViewOf = Callable[[str | PoseableCamera, float, Matrix | None, Matrix | None], View]
+"""The view of a camera at a time, with the pose of the vehicle or of the camera, if given."""
+
+OUTPUTS = ("rgb", "depth", "alpha", "instance", "boxes")
+"""What `WorldState.render` can give."""
+
+
+class WorldActor:
+    """An object of a world: `id`, `category`, and `size`, its length, width and height in metres."""
+
+    def __init__(self, actor: EditedActor, placement: ActorPlacement, time: float):
+        self.id, self.category, self.size = actor.id, actor.category, actor.size
+        self._actor, self._placement, self._time = actor, placement, time
+        self.changed = False
+
+    @property
+    def placement(self) -> ActorPlacement:
+        """Where and how its Gaussians are rendered."""
+        return self._placement
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Object to world (4, 4), at the centre of its box, x forward, y left, z up. May be set: its limbs and colours
+        stay those of the time. Raises RequestError for a matrix that is no pose."""
+        placed = self._placement.object_to_world
+        return self._actor.poses(np.array([self._time]))[0] if placed is None else placed.copy()
+
+    @pose.setter
+    def pose(self, object_to_world: Matrix) -> None:
+        pose = require_pose(object_to_world, f"object {self.id}")
+        self._placement = replace(self._placement, object_to_world=pose, around=None)
+        self.changed = True
+
+    def copied(self, name: str) -> "WorldActor":
+        """Another object with the same Gaussians."""
+        return WorldActor(replace(self._actor, id=name), self._placement, self._time)
+
+
+class ActorsById(Mapping[str, WorldActor]):
+    """Objects by their ids, or by the first characters of an id that only one begins with. Raises RequestError, which
+    names those that there are."""
+
+    def __init__(self, actors: Mapping[str, WorldActor]):
+        self._actors = dict(actors)
+
+    def __getitem__(self, name: str) -> WorldActor:
+        found = [name] if name in self._actors else [known for known in self._actors if known.startswith(name)]
+        if len(found) != 1 or not name:
+            count = "no object has" if not found else f"{len(found)} objects have"
+            raise RequestError(f"{count} an id starting with {name!r}; there are: {', '.join(self) or 'none'}")
+        return self._actors[found[0]]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._actors
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._actors)
+
+    def __len__(self) -> int:
+        return len(self._actors)
+
+
+class WorldState:
+    """A drive at one time, as `TrainedDrive.state` gives it, to be changed and rendered: `actors` are the objects that
+    are present and of which the model has Gaussians, by id.
+
+    >>> world = drivesplat.open("results/demo/street").state(time=4.2)
+    >>> pose = world.actors["bf53"].pose
+    >>> pose[:3, 3] += 2.0 * pose[:3, 1]  # two metres to its left
+    >>> world.actors["bf53"].pose = pose
+    >>> world.remove("cbdd")
+    >>> image = world.render("CAM_FRONT").image
+    """
+
+    def __init__(
+        self,
+        model: SplatModel,
+        actors: Sequence[EditedActor],
+        static: ShownObjects,
+        view_of: ViewOf,
+        time: float,
+        as_recorded: bool,
+    ):
+        """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of."""
+        self.time, now = time, np.array([time])
+        self._model, self._static, self._view_of, self._as_recorded = model, static, view_of, as_recorded
+        present = [actor for actor in actors if actor.present(now)[0]]
+        (placed,) = actor_placements(present, now)
+        own = zip(present, placed, strict=True)
+        self.actors = ActorsById({actor.id: WorldActor(actor, placement, time) for actor, placement in own})
+
+    def remove(self, name: str) -> None:
+        """Removes an object, named as in `actors`."""
+        gone = self.actors[name].id
+        self.actors = ActorsById({known: actor for known, actor in self.actors.items() if known != gone})
+        self._as_recorded = False
+
+    def add(self, source: str, name: str, object_to_world: Matrix) -> WorldActor:
+        """Adds a copy `name` of the object `source` at a pose (4, 4)."""
+        if name in self.actors:
+            raise RequestError(f"an object is named {name!r} already; choose another name for the copy")
+        copy = self.actors[source].copied(name)
+        copy.pose = object_to_world
+        self.actors = ActorsById({**self.actors, name: copy})
+        return copy
+
+    @torch.no_grad()
+    def render(
+        self,
+        camera: str | PoseableCamera,
+        *,
+        ego_to_world: Matrix | None = None,
+        camera_to_world: Matrix | None = None,
+        outputs: Sequence[str] = ("rgb",),
+    ) -> DriveView:
+        """What a camera sees.
+
+        Args:
+            camera: The name of a recorded camera, or a camera of one's own.
+            ego_to_world: Pose (4, 4) of the vehicle that carries the camera; None: that of the drive at this time.
+            camera_to_world: Pose (4, 4) of the camera itself, in place of a vehicle's.
+            outputs: Names from OUTPUTS.
+
+        Raises RequestError for an unknown camera or output, and for poses that are none or are given twice; ResultError
+        for a rendering that contains NaN, DeviceError where memory is exhausted.
+        """
+        if unknown := [name for name in outputs if name not in OUTPUTS]:
+            raise RequestError(f"there is no output {unknown[0]!r}; there are: {', '.join(OUTPUTS)}")
+        view = self._view_of(camera, self.time, ego_to_world, camera_to_world)
+        return self._rendered(view, outputs)
+
+    def _rendered(self, view: View, outputs: Collection[str]) -> DriveView:
+        model, actors = self._model, tuple(self.actors.values())
+        as_recorded = self._as_recorded and not any(actor.changed for actor in actors)
+        placed = None
+        if not as_recorded or "instance" in outputs:
+            placed = model.at(view.time, Want(placements=tuple(actor.placement for actor in actors)))
+        gaussians = None if as_recorded else placed
+        picture = surfaces = None
+        if "rgb" in outputs or "alpha" in outputs:
+            picture = model.render(view, gaussians=gaussians)
+        if "depth" in outputs:
+            surfaces = model.render(view, gaussians=gaussians, with_surface_depth=True).surface_depth
+        return DriveView(
+            tuple(self.actors),
+            picture.image if picture is not None and "rgb" in outputs else None,
+            surfaces,
+            picture.alpha if picture is not None and "alpha" in outputs else None,
+            self._instances(view, placed) if placed is not None and "instance" in outputs else None,
+            tuple(self._boxes(view)) if "boxes" in outputs else None,
+        )
+
+    def _instances(self, view: View, gaussians: Gaussians) -> Tensor:
+        if gaussians.placement is None:
+            return torch.full((view.height, view.width), -1, dtype=torch.int16, device=view.K.device)
+
+        def composited(shares: Tensor) -> Tensor:
+            return self._model.composited(gaussians, shares.to(gaussians.means), view).image.squeeze(0)
+
+        return strongest_group(gaussians.placement, composited).to(torch.int16)
+
+    def _boxes(self, view: View) -> Iterator[ObjectBox]:
+        model, actors = self._model, tuple(self.actors.values())
+        want = Want(placements=tuple(actor.placement for actor in actors))
+        sets = model.sample(model.states(view.time, want), want)
+        gaussians = concatenate(sets)
+        boxes = [Box(a.id, ObjectClass.VEHICLE, a.category, a.size, a.pose, 0.0, 0) for a in actors]
+        seen = [seen_object(model, gaussians, i, box, view) for i, box in enumerate(boxes)]
+        seen += self._static.others_in(view, sets)
+        boxes += [box_of(item, view.time) for item in self._static.others]
+        by_id = {box.track_id: box for box in boxes}
+        for item in (item for item in seen if item is not None):
+            box = by_id[item.id]
+            yield ObjectBox(item.id, box.category, box.size, box.object_to_world, item.corners, item.visible)
