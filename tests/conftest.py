@@ -37,11 +37,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     modules = sorted((list(module) for _, module in groupby(runs, key=lambda item: item.path)), key=len, reverse=True)
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     shares = [[item for module in modules[i::workers] for item in module] for i in range(workers)]
-    for share in shares[1:]:  # the first worker makes the finished run; until it is there, others do something else
-        share.sort(key=lambda item: "finished_run" in getattr(item, "fixturenames", ()))
     for i, share in enumerate(shares):
         room = max(0, len(items) * (i + 1) // workers - len(items) * i // workers - len(share))
-        share += others[:room]
+        # the first worker makes the finished run; others come to it at their end, and need not wait for it
+        late = [item for item in share if i and "finished_run" in getattr(item, "fixturenames", ())]
+        share[:] = [*(item for item in share if item not in late), *others[:room], *late]
         others = others[room:]
     items[:] = [item for share in shares for item in share] + others
 

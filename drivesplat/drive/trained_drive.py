@@ -17,7 +17,7 @@ from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.sensor_path import recorded_ego
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.errors import RequestError
-from drivesplat.model.checkpoint import open_model, read_checkpoint
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.scene import REFINED, Frame, Scene, Track, read_scene
@@ -25,6 +25,7 @@ from drivesplat.scene.tracks import box_at, ever_moves
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
+from drivesplat.settings.tracks import FOUND, TRACK_FOLDERS, Tracks
 from drivesplat.trajectories.camera_path import recorded_frames, smooth_poses
 from drivesplat.trajectories.edited_actors import EditedActor
 from drivesplat.workflow.edits_file import edit_of
@@ -61,9 +62,7 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
             "results/demo/street"
         )
     checkpoint = read_checkpoint(folder / "checkpoint.npz")
-    refined = "refine_poses" in checkpoint.provenance.get("stages", {})
-    scene = read_scene(folder.parent / (REFINED if refined else "scene.json"))
-    record = read_training_record(folder.parent / "parser.npz")
+    scene, record = _recording(folder.parent, checkpoint)
     settings = device if isinstance(device, DeviceSettings) else DeviceSettings.model_validate(device)
     model, chosen = open_model(checkpoint, settings)
     return TrainedDrive(folder, scene, record, model, chosen)
@@ -88,8 +87,9 @@ class TrainedDrive:
 
     @property
     def duration(self) -> float:
-        """The time of the last image in seconds."""
-        return max(self.scene.seconds(frame.timestamp) for frame in self.scene.frames)
+        """The time of the last image in seconds; of the last sweep without images."""
+        recordings = self.scene.frames or self.scene.sweeps
+        return max(self.scene.seconds(recording.timestamp) for recording in recordings)
 
     @property
     def where(self) -> str:
@@ -101,7 +101,7 @@ class TrainedDrive:
         """The objects of which the model has Gaussians, after the edit."""
         if self.edit is None:
             return trained_actors(self.model, self.scene, self.where)
-        return recorded_and_edited(self.model, self.scene, self.cameras[0], self.edit, self.where)[1]
+        return recorded_and_edited(self.model, self.scene, self._reference, self.edit, self.where)[1]
 
     @cached_property
     def _static(self) -> ShownObjects:
@@ -145,9 +145,9 @@ class TrainedDrive:
 
     def ego_to_world(self, time: float) -> np.ndarray:
         """The pose (4, 4) of the ego vehicle; its origin is on the ground below the rear axle."""
-        if (change := self._ego_edit(self.cameras[0])) is not None:
-            return change.poses(recorded_frames(self.scene, self.cameras[0]), np.array([time]))[1][0]
-        return recorded_ego(self.scene, self.cameras[0])(np.array([time]))[0]
+        if self.edit is not None and (change := self._ego_edit(self._reference)) is not None:
+            return change.poses(recorded_frames(self.scene, self._reference), np.array([time]))[1][0]
+        return recorded_ego(self.scene, self.cameras[0] if self.cameras else None)(np.array([time]))[0]
 
     def camera_to_world(self, name: str, time: float) -> np.ndarray:
         """The pose (4, 4) of a recorded camera: on the smooth path through its images, which films take, too."""
@@ -207,6 +207,13 @@ class TrainedDrive:
         state = self.state(time, outside)
         return state.render(camera, ego_to_world=ego_to_world, camera_to_world=camera_to_world, outputs=outputs)
 
+    @property
+    def _reference(self) -> str:
+        """The camera whose images edits count from."""
+        if not self.cameras:
+            raise RequestError(f"{self.where} has no camera, and edits need one")
+        return self.cameras[0]
+
     def _first_image(self, name: str) -> tuple[int, Frame]:
         for index, frame in enumerate(self.scene.frames):
             if frame.camera == name:
@@ -215,6 +222,17 @@ class TrainedDrive:
 
     def _ego_edit(self, camera: str) -> EgoEdit | None:
         return None if self.edit is None else EgoEdit.of(self.scene, camera, self.edit, self.where)
+
+
+def _recording(folder: Path, checkpoint: TrainedCheckpoint) -> tuple[Scene, TrainingRecord]:
+    """The scene with the tracks of a model, and the training record, from the result folder of a scene."""
+    tracks = [track.id for part in checkpoint.parts for track in part.tracks]
+    refined = "refine_poses" in checkpoint.provenance["stages"]
+    own: Tracks = "discovered" if any(track.startswith(FOUND) for track in tracks) else "annotated"
+    scene = folder / (REFINED if refined and own == "annotated" else Path(TRACK_FOLDERS[own], "scene.json"))
+    parsers = [folder / TRACK_FOLDERS[of] / "parser.npz" for of in (own, "none")]  # the images of both are the same
+    parser = next((path for path in parsers if path.is_file()), parsers[0])
+    return read_scene(scene), read_training_record(parser)
 
 
 def _row(scene: Scene, track: Track, editable: set[str]) -> list[Any]:

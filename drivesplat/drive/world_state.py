@@ -157,7 +157,7 @@ class WorldState:
         model, actors = self._model, tuple(self.actors.values())
         as_recorded = self._as_recorded and not any(actor.changed for actor in actors)
         placed = None
-        if not as_recorded or "instance" in outputs:
+        if "instance" in outputs or not (as_recorded or set(outputs) <= {"boxes"}):
             placed = model.at(view.time, Want(placements=tuple(actor.placement for actor in actors)))
         gaussians = None if as_recorded else placed
         picture = surfaces = None

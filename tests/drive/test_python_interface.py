@@ -1,8 +1,11 @@
 """`drivesplat.open` and what it gives, on a finished workflow."""
 
+import dataclasses
 import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +20,12 @@ from drivesplat.drive.world_state import WorldState
 from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.errors import ConfigError, DriveSplatError, RequestError, ResultError
+from drivesplat.model.checkpoint import read_checkpoint, write_checkpoint
 from drivesplat.rendering.film import recorded_shot
+from drivesplat.scene.scene import read_scene, write_scene
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import EditJob
+from drivesplat.settings.tracks import FOUND
 
 pytestmark = pytest.mark.workflow
 CAMERA, TIME = "CAM_FRONT", 1.0
@@ -232,6 +238,29 @@ def test_folders_without_a_training_and_foreign_files_are_named(tmp_path, street
         drivesplat.open(tmp_path / "street")
     with pytest.raises(AttributeError):
         _ = drivesplat.nothing
+
+
+def test_methods_without_labels_open_with_their_own_files(tmp_path, street):
+    """Discovered tracks have a scene of their own; a method without tracks may have no other training record."""
+    checkpoint, scene = read_checkpoint(street / "checkpoint.npz"), read_scene(street.parent / "scene.json")
+    found = FOUND + CAR
+
+    def renamed(of: Sequence) -> list:
+        return [dataclasses.replace(item, id=found) if item.id == CAR else item for item in of]
+
+    parts = [dataclasses.replace(part, tracks=tuple(renamed(part.tracks))) for part in checkpoint.parts]
+    for folder in ("mine", "blind", "discovered", "unlabelled"):
+        (tmp_path / folder).mkdir()
+    write_checkpoint(tmp_path / "mine/checkpoint.npz", dataclasses.replace(checkpoint, parts=parts))
+    write_scene(tmp_path / "discovered/scene.json", dataclasses.replace(scene, tracks=tuple(renamed(scene.tracks))))
+    shutil.copy(street.parent / "parser.npz", tmp_path / "discovered")
+    assert list(drivesplat.open(tmp_path / "mine", "cpu").state(TIME).actors) == [found]
+    shutil.copy(street.parent / "vanilla/checkpoint.npz", tmp_path / "blind")
+    shutil.copy(street.parent / "scene.json", tmp_path)
+    shutil.copy(street.parent / "parser.npz", tmp_path / "unlabelled")
+    blind = drivesplat.open(tmp_path / "blind", "cpu")
+    view = blind.render(CAMERA, TIME, outputs=["rgb", "instance"])
+    assert not view.objects and (view.instance == -1).all() and not blind.actors["editable"].any()
 
 
 # ---- the guide
