@@ -16,9 +16,14 @@ SNAKEFILE = WORKFLOW / "Snakefile"
 
 _PUBLIC = {
     "open": ("drivesplat.drive.trained_drive", "open_drive"),
+    "render_poses": ("drivesplat.drive.render_files", "render_poses"),
     "TrainedDrive": ("drivesplat.drive.trained_drive", "TrainedDrive"),
     "Camera": ("drivesplat.drive.cameras", "PoseableCamera"),
 }
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PUBLIC})
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from drivesplat.drive.cameras import PoseableCamera as Camera
+from drivesplat.drive.render_files import render_poses as render_poses
 from drivesplat.drive.trained_drive import TrainedDrive as TrainedDrive
 from drivesplat.drive.trained_drive import open_drive as open
 
@@ -10,4 +11,4 @@ IS_CHECKOUT: bool
 WORKFLOW: Path
 SNAKEFILE: Path
 
-__all__ = ["Camera", "TrainedDrive", "open"]
+__all__ = ["Camera", "TrainedDrive", "open", "render_poses"]

@@ -32,5 +32,11 @@ class RequestError(DriveSplatError, ValueError):
     """A call of the Python interface asks for what a drive cannot give."""
 
 
+class UnknownObjectError(RequestError, KeyError):
+    """A call of the Python interface names an object that is not there."""
+
+    __str__ = Exception.__str__  # that of KeyError puts its text in quotes
+
+
 class TrainingError(DriveSplatError):
     """The optimisation cannot go on."""

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import drivesplat
 from drivesplat import SNAKEFILE, WORKFLOW
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
@@ -60,6 +61,15 @@ def _parser() -> argparse.ArgumentParser:
     viewer.add_argument("method", nargs="?", help="by default one with moving objects")
     viewer.add_argument("--results", type=Path, help="folder of the results (results_dir of config.yaml)")
 
+    render = commands.add_parser("render", help="render a trained drive from the poses of a file (docs/python.md)")
+    render.add_argument("folder", type=Path, help="of the method, such as results/demo/street")
+    render.add_argument("--poses", type=Path, required=True, help=".csv, .json (nerfstudio) or TUM's text format")
+    render.add_argument("--camera", required=True, help="a recorded camera")
+    render.add_argument("--ego", action="store_true", help="the poses are those of the vehicle, not of the camera")
+    render.add_argument("--outputs", default="rgb", help="rgb,depth,instance (rgb)")
+    render.add_argument("--out", type=Path, required=True, help="folder to write images into")
+    render.add_argument("--device", default="any", choices=["any", "cuda", "cpu"], help="any: a GPU where there is one")
+
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
 
@@ -96,6 +106,11 @@ def run_command(parsed: argparse.Namespace) -> int:
         from drivesplat.world.warm_up import main as make_tiny_world
 
         return compile_gsplat([]) or train_briefly() or make_tiny_world()
+    if parsed.command == "render":
+        drive, outputs = drivesplat.open(parsed.folder, parsed.device), parsed.outputs.split(",")
+        count = drivesplat.render_poses(drive, parsed.poses, parsed.camera, outputs, parsed.out, parsed.ego)
+        print(f"{parsed.out}: {count} images each of {', '.join(outputs)}, and render.json")
+        return 0
     if parsed.command == "open":
         print(open_viewer(parsed.results or results_folder(), parsed.scene, parsed.method))
     else:  # config

@@ -11,13 +11,13 @@ from jaxtyping import Float64
 
 from drivesplat.errors import DatasetError, RequestError
 from drivesplat.model.view import View
-from drivesplat.readers.checks import checked_intrinsics, checked_transform
+from drivesplat.readers.checks import checked_intrinsics, checked_size, checked_transform
 
 Matrix = np.ndarray | torch.Tensor | Sequence[Sequence[float]]
 """What a pose may be given as."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseableCamera:
     """A pinhole camera with a global shutter.
 
@@ -25,9 +25,9 @@ class PoseableCamera:
     `camera_to_ego` is its mount on the ego vehicle (ego: x forward, y left, z up; camera: x right, y down, z forward),
     None for a camera that is always placed by its own pose. With `exposure_of`, images have the exposure that was
     learned for this recorded camera; otherwise the model's own colours, as films have. Raises RequestError for
-    intrinsics or a mount that are none.
+    an invalid size, invalid intrinsics or an invalid mount.
 
-    >>> PoseableCamera.of_field(640, 360, 90.0).K.tolist()
+    >>> PoseableCamera.from_fov(640, 360, 90.0).K.tolist()
     [[320.0, 0.0, 320.0], [0.0, 320.0, 180.0], [0.0, 0.0, 1.0]]
     """
 
@@ -38,21 +38,23 @@ class PoseableCamera:
     exposure_of: str | None = None
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise RequestError(f"a camera of {self.width} x {self.height} pixels sees nothing")
+        try:
+            checked_size(self.width, self.height, "the camera")
+        except DatasetError as error:
+            raise RequestError(str(error)) from None
         object.__setattr__(self, "K", _checked(checked_intrinsics, self.K, "the camera"))
         if self.camera_to_ego is not None:
             object.__setattr__(self, "camera_to_ego", require_pose(self.camera_to_ego, "the camera's mount"))
 
     @classmethod
-    def of_field(
-        cls, width: int, height: int, horizontal_deg: float, camera_to_ego: np.ndarray | None = None
+    def from_fov(
+        cls, width: int, height: int, horizontal_fov: float, camera_to_ego: np.ndarray | None = None
     ) -> "PoseableCamera":
         """A camera with square pixels, its axis through the middle of the image, and this horizontal field of view in
         degrees."""
-        if not 0.0 < horizontal_deg < 180.0:
-            raise RequestError(f"a pinhole camera cannot have a field of view of {horizontal_deg:g} degrees")
-        focal = width / 2 / math.tan(math.radians(horizontal_deg) / 2)
+        if not 0.0 < horizontal_fov < 180.0:
+            raise RequestError(f"a pinhole camera cannot have a field of view of {horizontal_fov:g} degrees")
+        focal = width / 2 / math.tan(math.radians(horizontal_fov) / 2)
         K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
         return cls(width, height, K, camera_to_ego)
 
@@ -75,8 +77,8 @@ def require_pose(pose: Matrix, of: str) -> Float64[np.ndarray, "4 4"]:
 
 
 def _checked(check: Callable[[Any, str], np.ndarray], matrix: Matrix, of: str) -> np.ndarray:
-    values = matrix.detach().cpu().numpy() if isinstance(matrix, torch.Tensor) else np.asarray(matrix)
     try:
+        values = matrix.detach().cpu().numpy() if isinstance(matrix, torch.Tensor) else np.asarray(matrix)
         return check(values.astype(np.float64) if values.dtype.kind in "fiu" else values, of)
-    except DatasetError as error:
-        raise RequestError(str(error)) from None
+    except (DatasetError, ValueError) as error:  # NumPy's for rows of different lengths
+        raise RequestError(str(error) if isinstance(error, DatasetError) else f"{of}: {error}") from None

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int16
 from torch import Tensor
 
+from drivesplat.errors import RequestError
 from drivesplat.rendering.frames import uint8_image
 
 
@@ -14,26 +15,26 @@ class ObjectBox:
     """The box of an object that an image shows.
 
     `size` is length, width, height in metres, at `object_to_world` (4, 4) (object: x forward, y left, z up, at the
-    centre). `corners` is the projected box, clipped to the image: left, top, right, bottom in continuous pixels;
-    `visible` is the share of the object, also of what lies outside the image, that the image shows.
+    centre). `box_2d` is the projected box, clipped to the image: left, top, right, bottom in continuous pixels;
+    `visible_share` is the share of the object, also of what lies outside the image, that the image shows.
     """
 
     id: str
     category: str
     size: np.ndarray
     object_to_world: np.ndarray
-    corners: tuple[float, float, float, float]
-    visible: float
+    box_2d: tuple[float, float, float, float]
+    visible_share: float
 
 
 @dataclass(frozen=True)
 class DriveView:
     """A rendering, as tensors on the model's device. What was not asked for is None.
 
-    `rgb` in [0, 1]; `depth` along the camera's axis in metres, 0 where there is no surface; `alpha`, how opaque the
+    `rgb` in [0, 1]; `depth` along the camera's axis in metres, 0 where no Gaussian is met; `alpha`, how opaque the
     scene is there without the sky; `instance`, the index into `objects` of the object that contributes most to a pixel,
-    -1 where this is none of them; `boxes` of the objects that the image shows. `objects` are the ids of the objects of
-    which the model has Gaussians.
+    -1 where something else does; `boxes` of the objects that the image shows. `objects` are the ids of the objects that
+    are present and of which the model has Gaussians.
     """
 
     objects: tuple[str, ...]
@@ -45,7 +46,10 @@ class DriveView:
 
     @property
     def image(self) -> np.ndarray:
-        """`rgb` as an image (h, w, 3) uint8, with the bytes of a film's frame."""
+        """`rgb` as an image (h, w, 3) uint8, with the bytes of a film's frame. Raises ResultError where it contains
+        NaN, RequestError where `rgb` was not asked for."""
+        if self.rgb is None:
+            raise RequestError("the rendering has no rgb: ask for it in `outputs`")
         return uint8_image(self.rgb)
 
     def arrays(self) -> dict[str, np.ndarray]:

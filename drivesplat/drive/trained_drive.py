@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from drivesplat.drive.cameras import Matrix, PoseableCamera, require_pose
 from drivesplat.drive.drive_view import DriveView
 from drivesplat.drive.world_state import WorldState
 from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
-from drivesplat.editing.ego import EgoEdit
+from drivesplat.editing.ego import MAX_LEAD, EgoEdit
 from drivesplat.editing.sensor_path import recorded_ego
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.errors import RequestError
@@ -37,8 +37,8 @@ COLUMNS = [
     "id", "class", "category", "length", "width", "height", "first", "last", "speed", "editable", "why_not",
 ]  # fmt: skip
 """Those of `TrainedDrive.actors`."""
-Outside = Literal["refuse", "clamp"]
-"""What happens to a time outside of the recording."""
+OUTSIDE = ("refuse", "clamp")
+"""What can happen to a time outside of the recording."""
 
 
 def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "TrainedDrive":
@@ -48,8 +48,8 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
         folder: `results/{scene}/{method}`, with `checkpoint.npz`; scene and training record lie beside it.
         device: 'any' (the GPU where there is one), 'cuda' or 'cpu', or settings as under `device` in config.yaml.
 
-    Raises RequestError where the folder has no checkpoint, ResultError for files that are none of this version, and
-    DeviceError where the device is missing or its memory is exhausted.
+    Raises RequestError where the folder has no checkpoint, ResultError for files of another version, and DeviceError
+    where the device is missing or its memory is exhausted.
 
     >>> drive = open_drive("results/demo/street")
     >>> drive.render("CAM_FRONT", time=4.2).image.shape
@@ -63,12 +63,15 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
         )
     checkpoint = read_checkpoint(folder / "checkpoint.npz")
     scene, record = _recording(folder.parent, checkpoint)
+    kinds = get_args(DeviceSettings.model_fields["kind"].annotation)
+    if not isinstance(device, DeviceSettings) and device not in kinds:
+        raise RequestError(f"there is no device {device!r}; there are: {', '.join(kinds)}")
     settings = device if isinstance(device, DeviceSettings) else DeviceSettings.model_validate(device)
     model, chosen = open_model(checkpoint, settings)
     return TrainedDrive(folder, scene, record, model, chosen)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class TrainedDrive:
     """A drive that can be rendered at any time from any pose: see `open_drive`. Times are seconds since the first
     image, as in films and edits; world coordinates are metres, z up; `edit` is what `edited` has changed."""
@@ -80,16 +83,19 @@ class TrainedDrive:
     device: torch.device
     edit: Edit | None = None
 
-    @property
+    def __repr__(self) -> str:
+        return f"<TrainedDrive {self.folder}: {self.duration:.1f} s, cameras {', '.join(self.cameras) or 'none'}>"
+
+    @cached_property
     def cameras(self) -> list[str]:
         """The names of the recorded cameras."""
         return list(dict.fromkeys(frame.camera for frame in self.scene.frames))
 
-    @property
+    @cached_property
     def duration(self) -> float:
         """The time of the last image in seconds; of the last sweep without images."""
         recordings = self.scene.frames or self.scene.sweeps
-        return max(self.scene.seconds(recording.timestamp) for recording in recordings)
+        return self.scene.seconds(max(recording.timestamp for recording in recordings))
 
     @property
     def where(self) -> str:
@@ -113,9 +119,9 @@ class TrainedDrive:
 
     @property
     def actors(self) -> "pandas.DataFrame":
-        """A table of the annotated objects, by `id`: `class` and the dataset's `category`; `length`, `width` and
-        `height` in metres; `first` and `last`, the seconds of their annotations; `speed`, the largest horizontal one in
-        m/s; whether they are `editable`, which has objects moved and removed one by one, and `why_not`."""
+        """A table of the objects as recorded, by `id`: `class` and the dataset's `category`; `length`, `width` and
+        `height` in metres; `first` and `last`, the seconds of their boxes; `speed`, the largest horizontal one in m/s;
+        `editable`, whether the object has Gaussians of its own and can be moved and removed; and `why_not`."""
         from pandas import DataFrame  # here: it takes long to import
 
         editable = {actor.id for actor in trained_actors(self.model, self.scene, self.where)}
@@ -124,15 +130,18 @@ class TrainedDrive:
         return table.sort_values(["editable", "first"], ascending=[False, True])
 
     def edited(self, edit: Edit | list[dict[str, Any]]) -> "TrainedDrive":
-        """The drive after an edit: its steps as in an edits file (docs/editing.md), applied to this drive as recorded.
+        """The drive after an edit: its steps as in an edits file (docs/editing.md).
 
-        Raises ConfigError for steps that are none, or do not fit the drive.
+        Raises ConfigError for invalid steps and those that do not fit the drive, RequestError for a drive that is
+        edited already.
 
         >>> gone = open_drive("results/demo/street").edited([{"remove": {"track": "bf53"}}])
         """
+        if self.edit is not None:
+            raise RequestError("the drive is edited already: give all steps at once to the drive as recorded")
         checked = edit if isinstance(edit, Edit) else edit_of(edit, f"{self.where}, edit")
         changed = replace(self, edit=checked)
-        _ = changed.edited_actors  # an edit that does not fit is refused here
+        _ = changed.edited_actors, changed._ego_edit  # an edit that does not fit is refused here
         return changed
 
     def camera(self, name: str, exposure: bool = False) -> PoseableCamera:
@@ -144,20 +153,25 @@ class TrainedDrive:
         return PoseableCamera(width, height, K, frame.camera_to_ego, name if exposure else None)
 
     def ego_to_world(self, time: float) -> np.ndarray:
-        """The pose (4, 4) of the ego vehicle; its origin is on the ground below the rear axle."""
-        if self.edit is not None and (change := self._ego_edit(self._reference)) is not None:
-            return change.poses(recorded_frames(self.scene, self._reference), np.array([time]))[1][0]
-        return recorded_ego(self.scene, self.cameras[0] if self.cameras else None)(np.array([time]))[0]
+        """The pose (4, 4) of the ego vehicle; its origin is on the ground below the rear axle. Raises RequestError for
+        a time outside of the recording, and where an edited vehicle has left the recorded path."""
+        if self._ego_edit is not None:
+            return self._edited_poses(self._reference, time)[1]
+        at = np.array([self._checked(time)])
+        return recorded_ego(self.scene, self.cameras[0] if self.cameras else None)(at)[0]
 
     def camera_to_world(self, name: str, time: float) -> np.ndarray:
-        """The pose (4, 4) of a recorded camera: on the smooth path through its images, which films take, too."""
+        """The pose (4, 4) of a recorded camera: on the smooth path through its images, which films take, too. Raises
+        RequestError as `ego_to_world`, and for a time at which this camera did not record."""
         self._first_image(name)
-        frames = recorded_frames(self.scene, name)
-        if (change := self._ego_edit(name)) is not None:
-            return change.poses(frames, np.array([time]))[0][0]
-        recorded = np.array([self.scene.seconds(frame.timestamp) for frame in frames]) * 1e6
-        poses = np.stack([frame.camera_to_world for frame in frames])
-        return smooth_poses(recorded, poses, np.array([time]) * 1e6)[0]
+        if self._ego_edit is not None:
+            return self._edited_poses(name, time)[0]
+        recorded, poses = self._path(name)
+        if not recorded[0] - MAX_LEAD <= self._checked(time) <= recorded[-1] + MAX_LEAD:
+            raise RequestError(
+                f"camera {name} recorded from {recorded[0]:.2f} to {recorded[-1]:.2f} s, not at {time:g} s"
+            )
+        return smooth_poses(recorded * 1e6, poses, np.array([time]) * 1e6)[0]
 
     def view(
         self,
@@ -181,17 +195,12 @@ class TrainedDrive:
             pose = ego @ known.camera_to_ego
         return known.view(pose, time, self.device)
 
-    def state(self, time: float, outside: Outside = "refuse") -> WorldState:
+    def state(self, time: float, outside: str = "refuse") -> WorldState:
         """The drive at a time. One outside of the recording is refused by a RequestError, or clamped to it."""
-        if not np.isfinite(time):
-            raise RequestError(f"a time is a number of seconds, not {time}")
-        if outside == "refuse" and not 0.0 <= time <= self.duration:
-            raise RequestError(
-                f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s; outside='clamp' takes "
-                "the nearest of these times"
-            )
-        now = float(min(max(time, 0.0), self.duration))
-        return WorldState(self.model, self.edited_actors, self._static, self.view, now, self.edit is None)
+        if outside not in OUTSIDE:
+            raise RequestError(f"outside is {outside!r}; it is one of {', '.join(OUTSIDE)}")
+        now = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else self._checked(time)
+        return WorldState(self.model, self.edited_actors, self._static, self.view, float(now), self.edit is None)
 
     def render(
         self,
@@ -201,7 +210,7 @@ class TrainedDrive:
         ego_to_world: Matrix | None = None,
         camera_to_world: Matrix | None = None,
         outputs: Sequence[str] = ("rgb",),
-        outside: Outside = "refuse",
+        outside: str = "refuse",
     ) -> DriveView:
         """What a camera sees at a time: `state(time, outside).render(...)`."""
         state = self.state(time, outside)
@@ -220,8 +229,41 @@ class TrainedDrive:
                 return index, frame
         raise RequestError(f"{self.where} has no camera {name!r}; there are: {', '.join(self.cameras) or 'none'}")
 
-    def _ego_edit(self, camera: str) -> EgoEdit | None:
-        return None if self.edit is None else EgoEdit.of(self.scene, camera, self.edit, self.where)
+    def _checked(self, time: float) -> float:
+        """A time within the recording."""
+        if not 0.0 <= time <= self.duration:
+            raise RequestError(
+                f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s; outside='clamp' "
+                "renders its start or its end"
+            )
+        return time
+
+    @cached_property
+    def _ego_edit(self) -> EgoEdit | None:
+        """What the edit does to the ego vehicle."""
+        return None if self.edit is None else EgoEdit.of(self.scene, self._reference, self.edit, self.where)
+
+    def _edited_poses(self, camera: str, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """The poses of a camera and of the ego vehicle after the edit."""
+        frames, at, change = recorded_frames(self.scene, camera), np.array([self._checked(time)]), self._ego_edit
+        assert change is not None
+        if not change.within(frames, at)[0]:
+            raise RequestError(f"{self.where}: at {time:g} s the edited vehicle has left the recorded path")
+        camera_to_world, ego_to_world = change.poses(frames, at)
+        return camera_to_world[0], ego_to_world[0]
+
+    def _path(self, camera: str) -> tuple[np.ndarray, np.ndarray]:
+        """The times (n,) in seconds and poses (n, 4, 4) of a camera's images."""
+        if camera not in self._paths:
+            frames = recorded_frames(self.scene, camera)
+            first = self.scene.seconds(frames[0].timestamp)
+            times = first + np.array([frame.timestamp - frames[0].timestamp for frame in frames]) * 1e-6
+            self._paths[camera] = times, np.stack([frame.camera_to_world for frame in frames])
+        return self._paths[camera]
+
+    @cached_property
+    def _paths(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        return {}
 
 
 def _recording(folder: Path, checkpoint: TrainedCheckpoint) -> tuple[Scene, TrainingRecord]:
@@ -240,6 +282,6 @@ def _row(scene: Scene, track: Track, editable: set[str]) -> list[Any]:
     speed = max((box.speed for box in boxes if box is not None), default=0.0)
     first, last = (scene.seconds(track.timestamps[i]) for i in (0, -1))
     own = track.id in editable
-    why_not = "" if own else "the method has no Gaussians of its own for it" if ever_moves(track) else "it stands"
+    why_not = "" if own else "no Gaussians of its own in this method" if ever_moves(track) else "parked"
     size = [round(float(edge), 3) for edge in track.size]
     return [track.id, track.object_class.value, track.category, *size, first, last, round(speed, 2), own, why_not]

@@ -11,7 +11,8 @@ from drivesplat.drive.cameras import Matrix, PoseableCamera, require_pose
 from drivesplat.drive.drive_view import DriveView, ObjectBox
 from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_object
-from drivesplat.errors import RequestError
+from drivesplat.errors import RequestError, UnknownObjectError
+from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.groups import strongest_group
@@ -30,10 +31,10 @@ OUTPUTS = ("rgb", "depth", "alpha", "instance", "boxes")
 
 
 class WorldActor:
-    """An object of a world: `id`, `category`, and `size`, its length, width and height in metres."""
+    """An object of a world: `id` and `category` of the dataset."""
 
     def __init__(self, actor: EditedActor, placement: ActorPlacement, time: float):
-        self.id, self.category, self.size = actor.id, actor.category, actor.size
+        self.id, self.category = actor.id, actor.category
         self._actor, self._placement, self._time = actor, placement, time
         self.changed = False
 
@@ -43,9 +44,14 @@ class WorldActor:
         return self._placement
 
     @property
+    def size(self) -> np.ndarray:
+        """Length, width and height in metres, a copy."""
+        return self._actor.size.copy()
+
+    @property
     def pose(self) -> np.ndarray:
-        """Object to world (4, 4), at the centre of its box, x forward, y left, z up. May be set: its limbs and colours
-        stay those of the time. Raises RequestError for a matrix that is no pose."""
+        """Object to world (4, 4), at the centre of its box, x forward, y left, z up. It is a copy: assign a pose to
+        move the object, whose limbs and colours stay those of the time. Raises RequestError for an invalid pose."""
         placed = self._placement.object_to_world
         return self._actor.poses(np.array([self._time]))[0] if placed is None else placed.copy()
 
@@ -61,8 +67,8 @@ class WorldActor:
 
 
 class ActorsById(Mapping[str, WorldActor]):
-    """Objects by their ids, or by the first characters of an id that only one begins with. Raises RequestError, which
-    names those that there are."""
+    """Objects by their ids, or by the first characters of an id that only one begins with. Raises UnknownObjectError,
+    which is a KeyError, for any other name."""
 
     def __init__(self, actors: Mapping[str, WorldActor]):
         self._actors = dict(actors)
@@ -71,11 +77,8 @@ class ActorsById(Mapping[str, WorldActor]):
         found = [name] if name in self._actors else [known for known in self._actors if known.startswith(name)]
         if len(found) != 1 or not name:
             count = "no object has" if not found else f"{len(found)} objects have"
-            raise RequestError(f"{count} an id starting with {name!r}; there are: {', '.join(self) or 'none'}")
+            raise UnknownObjectError(f"{count} an id starting with {name!r}; there are: {', '.join(self) or 'none'}")
         return self._actors[found[0]]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._actors
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._actors)
@@ -108,6 +111,7 @@ class WorldState:
         """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of."""
         self.time, now = time, np.array([time])
         self._model, self._static, self._view_of, self._as_recorded = model, static, view_of, as_recorded
+        self._taken = {item.id for item in (*actors, *static.others)}
         present = [actor for actor in actors if actor.present(now)[0]]
         (placed,) = actor_placements(present, now)
         own = zip(present, placed, strict=True)
@@ -121,8 +125,8 @@ class WorldState:
 
     def add(self, source: str, name: str, object_to_world: Matrix) -> WorldActor:
         """Adds a copy `name` of the object `source` at a pose (4, 4)."""
-        if name in self.actors:
-            raise RequestError(f"an object is named {name!r} already; choose another name for the copy")
+        if not name or name in self._taken or any(name == known for known in self.actors):
+            raise RequestError(f"a copy cannot be named {name!r}: choose a name that no other object has")
         copy = self.actors[source].copied(name)
         copy.pose = object_to_world
         self.actors = ActorsById({**self.actors, name: copy})
@@ -146,12 +150,13 @@ class WorldState:
             outputs: Names from OUTPUTS.
 
         Raises RequestError for an unknown camera or output, and for poses that are none or are given twice; ResultError
-        for a rendering that contains NaN, DeviceError where memory is exhausted.
+        for images that contain NaN (when `DriveView.image` is read), DeviceError where memory is exhausted.
         """
         if unknown := [name for name in outputs if name not in OUTPUTS]:
             raise RequestError(f"there is no output {unknown[0]!r}; there are: {', '.join(OUTPUTS)}")
         view = self._view_of(camera, self.time, ego_to_world, camera_to_world)
-        return self._rendered(view, outputs)
+        with explain_out_of_memory(lambda: len(self._model)):
+            return self._rendered(view, outputs)
 
     def _rendered(self, view: View, outputs: Collection[str]) -> DriveView:
         model, actors = self._model, tuple(self.actors.values())
@@ -181,18 +186,20 @@ class WorldState:
         def composited(shares: Tensor) -> Tensor:
             return self._model.composited(gaussians, shares.to(gaussians.means), view).image.squeeze(0)
 
-        return strongest_group(gaussians.placement, composited).to(torch.int16)
+        sky = 1.0 - self._model.composited(gaussians, gaussians.means.new_ones(len(gaussians), 1), view).alpha
+        return strongest_group(gaussians.placement, composited, sky.squeeze((0, 3))).to(torch.int16)
 
     def _boxes(self, view: View) -> Iterator[ObjectBox]:
         model, actors = self._model, tuple(self.actors.values())
-        want = Want(placements=tuple(actor.placement for actor in actors))
+        want = Want(colors=False, placements=tuple(actor.placement for actor in actors))
         sets = model.sample(model.states(view.time, want), want)
         gaussians = concatenate(sets)
         boxes = [Box(a.id, ObjectClass.VEHICLE, a.category, a.size, a.pose, 0.0, 0) for a in actors]
         seen = [seen_object(model, gaussians, i, box, view) for i, box in enumerate(boxes)]
-        seen += self._static.others_in(view, sets)
-        boxes += [box_of(item, view.time) for item in self._static.others]
-        by_id = {box.track_id: box for box in boxes}
-        for item in (item for item in seen if item is not None):
-            box = by_id[item.id]
-            yield ObjectBox(item.id, box.category, box.size, box.object_to_world, item.corners, item.visible)
+        known = {item.id: item for item in self._static.others}
+        others = self._static.others_in(view, sets)
+        boxes += [box_of(known[item.id], view.time) for item in others]
+        for box, item in zip(boxes, [*seen, *others], strict=True):
+            if item is not None:
+                own = box.category, box.size.copy(), box.object_to_world
+                yield ObjectBox(item.id, *own, item.corners, item.visible)

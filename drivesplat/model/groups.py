@@ -13,10 +13,12 @@ CHANNELS = 4
 
 
 def strongest_group(
-    groups: Int[Tensor, " n"], composite: Callable[[Bool[Tensor, "n c"]], Float[Tensor, "a b c"]]
+    groups: Int[Tensor, " n"],
+    composite: Callable[[Bool[Tensor, "n c"]], Float[Tensor, "a b c"]],
+    behind: Float[Tensor, "a b"] | None = None,
 ) -> Int[Tensor, "a b"]:
-    """The one of `groups`, numbers from -1 of n Gaussians, that contributes most; -1 where nothing is met. `composite`
-    renders values of Gaussians."""
+    """The one of `groups`, numbers from -1 of n Gaussians, that contributes most; -1 where nothing is met, or where
+    what is `behind` all of them, such as the sky, contributes more. `composite` renders values of Gaussians."""
     numbers, own = groups.unique(return_inverse=True)
     most = found = None
     for first in range(0, max(1, len(numbers)), CHANNELS):
@@ -27,5 +29,5 @@ def strongest_group(
             better = weight > most
             found = torch.where(better, numbers[(first + number).clamp(max=len(numbers) - 1)], found)
             most = torch.where(better, weight, most)
-    assert found is not None
-    return found
+    assert most is not None and found is not None
+    return found if behind is None else torch.where(most > behind, found, -1)

@@ -140,16 +140,18 @@ def test_an_objects_pixels_and_depths_are_where_it_stands(drive, world):
     there = np.eye(4)
     there[:3, 3] = [8.0, 0.0, 30.0]
     world.actors[CAR].pose = there
-    camera = drivesplat.Camera.of_field(64, 48, 90.0)
+    camera = drivesplat.Camera.from_fov(64, 48, 90.0)
     view = world.render(camera, camera_to_world=pose, outputs=["instance", "depth", "boxes"])
     shown = view.instance == 0
     assert shown[24, 32] and not shown[0].any() and 4 < int(shown.sum()) < 32 * 48
     length = float(world.actors[CAR].size[0])
     assert ((view.depth[shown] > 8.0 - length) & (view.depth[shown] < 8.0 + length)).float().mean() > 0.9
     (box,) = view.boxes
-    left, top, right, bottom = box.corners
-    assert box.id == CAR and left < 32 < right and top < 24 < bottom and box.visible > 0.9
+    left, top, right, bottom = box.box_2d
+    assert box.id == CAR and left < 32 < right and top < 24 < bottom and box.visible_share > 0.9
     np.testing.assert_array_equal(box.object_to_world, there)
+    alpha = world.render(camera, camera_to_world=pose, outputs=["alpha"]).alpha
+    assert (alpha[shown] > 0.45).all(), "the sky shows more than the object does elsewhere"
 
 
 # ---- states
@@ -164,6 +166,7 @@ def test_a_moved_object_leaves_all_others_alone(drive, world):
     assert view.objects == (CAR, "twin") and (view.instance == 1).any()
     kept = (recorded.instance == 0) & (view.instance != 1)
     assert kept.any() and (view.instance[kept] == 0).float().mean() > 0.95
+    assert world.actors.get("twin") is world.actors["twi"] and world.actors.get("nobody") is None
     world.remove("twin")
     again = world.render(CAMERA)
     torch.testing.assert_close(again.rgb, recorded.rgb, atol=1e-5, rtol=0)
@@ -186,7 +189,7 @@ def test_a_time_outside_is_clamped_where_asked_to(drive):
 
 
 def test_cameras_of_ones_own_keep_their_field_of_view(drive):
-    camera = drivesplat.Camera.of_field(100, 50, 90.0, camera_to_ego=drive.camera(CAMERA).camera_to_ego)
+    camera = drivesplat.Camera.from_fov(100, 50, 90.0, camera_to_ego=drive.camera(CAMERA).camera_to_ego)
     half = camera.resized(50)
     assert (half.width, half.height, half.K[0, 0], half.K[1, 2]) == pytest.approx((50, 25, 25.0, 12.5))
     own = drive.render(half, TIME, ego_to_world=drive.ego_to_world(TIME)).rgb
@@ -208,18 +211,28 @@ SKEWED, NO_POSE = np.diag([1.0, 1.0, 1.5, 1.0]), np.full((4, 4), np.nan)
         (lambda drive, _: drive.render(CAMERA, TIME, camera_to_world=NO_POSE), RequestError, ["the camera"]),
         (lambda drive, _: drive.render(CAMERA, TIME, ego_to_world=SKEWED), RequestError, ["ego vehicle", "rigid"]),
         (lambda drive, _: drive.view(CAMERA, TIME, np.eye(4), np.eye(4)), RequestError, ["one pose"]),
-        (lambda drive, _: drive.render(drivesplat.Camera.of_field(8, 8, 90.0), TIME), RequestError, ["camera_to_ego"]),
+        (lambda drive, _: drive.render(drivesplat.Camera.from_fov(8, 8, 90.0), TIME), RequestError, ["camera_to_ego"]),
         (lambda drive, world: world.actors["zz"], RequestError, ["zz", CAR]),
         (lambda drive, world: world.actors[""], RequestError, [CAR]),
         (lambda drive, world: world.remove("zz"), RequestError, ["zz"]),
-        (lambda drive, world: world.add(CAR, CAR, np.eye(4)), RequestError, ["already"]),
+        (lambda drive, world: world.add(CAR, CAR, np.eye(4)), RequestError, [CAR]),
         (lambda drive, world: setattr(world.actors[CAR], "pose", torch.zeros(3, 3)), RequestError, [CAR]),
         (lambda drive, _: drive.edited([{"remove": {"trak": CAR}}]), ConfigError, ["step 1", "trak"]),
+        (lambda drive, _: drive.edited(STOP).edited(STOP), RequestError, ["already"]),
+        (lambda drive, _: drive.edited([{"ego": {"speed": 0.5, "start": 99.0}}]), ConfigError, ["start"]),
+        (lambda drive, _: drive.edited([{"ego": {"speed": 3.0}}]).ego_to_world(4.0), RequestError, ["path"]),
+        (lambda drive, _: drive.camera_to_world(CAMERA, 99.0), RequestError, ["99"]),
+        (lambda drive, _: drive.state(1.0, outside="error"), RequestError, ["clamp"]),
+        (lambda drive, _: drivesplat.open(drive.folder, "gpu"), RequestError, ["gpu", "cuda"]),
+        (lambda drive, _: drive.render(CAMERA, TIME, outputs=["depth"]).image, RequestError, ["rgb"]),
+        (lambda drive, world: world.add(CAR, "0001 instance 1", np.eye(4)), RequestError, ["0001 instance 1"]),
+        (lambda drive, world: world.add(CAR, "", np.eye(4)), RequestError, ["name"]),
+        (lambda drive, _: drive.view(CAMERA, TIME, None, [[1.0], [2.0, 3.0]]), RequestError, ["the camera"]),
         (lambda drive, _: drive.edited([]), ConfigError, ["steps"]),
         (lambda drive, _: drive.edited([{"remove": {"track": "zz"}}]), ConfigError, ["zz", "step 1"]),
-        (lambda drive, _: drivesplat.Camera(0, 8, np.eye(3)), RequestError, ["0 x 8"]),
+        (lambda drive, _: drivesplat.Camera(0, 8, np.eye(3)), RequestError, ["0x8"]),
         (lambda drive, _: drivesplat.Camera(8, 8, np.zeros((3, 3))), RequestError, ["camera"]),
-        (lambda drive, _: drivesplat.Camera.of_field(8, 8, 180.0), RequestError, ["180"]),
+        (lambda drive, _: drivesplat.Camera.from_fov(8, 8, 180.0), RequestError, ["180"]),
     ],
 )  # fmt: skip
 def test_what_a_drive_cannot_give_is_one_sentence(call, error, words, drive, world):
