@@ -56,7 +56,7 @@ def test_what_only_a_synthetic_world_knows_is_measured_too(finished):
     result = finished.read(TARGET)["methods"]["vanilla"]
     assert set(result["lateral"]) == {"2.0", "-2.0", "4.0"}
     for view in result["lateral"].values():
-        assert set(view) == {"all", "static", "moving_vehicle", "depth"}
+        assert set(view) == {"all", "static", "moving_vehicle", "road", "markings", "depth"}
         assert view["all"]["pixels"] == 6 * 128 * 72
         assert view["static"]["psnr"] > 8.0
         assert 0.0 < view["depth"]["median_relative_error"] < np.inf
