@@ -26,8 +26,8 @@ BROUGHT_ALONG = ("presets/", "profiles/")
 PAGE, OF_MOVING_OBJECTS = "viewer.html", "parts.mp4"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command of the command line. Returns the exit status."""
+def main(arguments: Sequence[str] | None = None, program: str = "drivesplat") -> int:
+    """Runs a command of the command line, whose help calls it `program`. Returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
         try:
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise DriveSplatError("the current folder has been removed; change to another one") from None
         if given[:1] == [RUN]:  # all the rest is Snakemake's
             return run_workflow(given[1:])
-        parsed = _parser().parse_args(given)
+        parsed = _parser(program).parse_args(given)
         with standard_output():
             return run_command(parsed)
         return 0  # nobody reads the rest
@@ -45,8 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("drivesplat", description="Recorded drives as 3D Gaussian splats, measured.")
+def _parser(program: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(program, description="Recorded drives as 3D Gaussian splats, measured.")
     parser.add_argument("--version", action="version", version=f"drivesplat {_version()}")
     commands = parser.add_subparsers(required=True, dest="command", metavar="COMMAND")
 
@@ -183,3 +183,7 @@ def chosen_page(
     newest = max(matching, key=lambda at: matching[at].stat().st_mtime)[0]
     of_scene = [page for at, page in matching.items() if at[0] == newest]
     return max(of_scene, key=lambda page: (page.with_name(OF_MOVING_OBJECTS).is_file(), page.stat().st_mtime))
+
+
+if __name__ == "__main__":
+    sys.exit(main(program="python -m drivesplat.cli.main"))

@@ -26,7 +26,7 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.tracks import FOUND, TRACK_FOLDERS, Tracks
-from drivesplat.trajectories.camera_path import recorded_frames, smooth_poses
+from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, smooth_poses
 from drivesplat.trajectories.edited_actors import EditedActor
 from drivesplat.workflow.edits_file import edit_of
 
@@ -166,11 +166,14 @@ class TrainedDrive:
         self._first_image(name)
         if self._ego_edit is not None:
             return self._edited_poses(name, time)[0]
-        recorded, poses = self._path(name)
+        frames = recorded_frames(self.scene, name)
+        stamps = recorded_timestamps(self.scene, name)
+        recorded = self.scene.seconds(stamps[0]) + (stamps - stamps[0]) * 1e-6
         if not recorded[0] - MAX_LEAD <= self._checked(time) <= recorded[-1] + MAX_LEAD:
             raise RequestError(
                 f"camera {name} recorded from {recorded[0]:.2f} to {recorded[-1]:.2f} s, not at {time:g} s"
             )
+        poses = np.stack([frame.camera_to_world for frame in frames])
         return smooth_poses(recorded * 1e6, poses, np.array([time]) * 1e6)[0]
 
     def view(
@@ -251,19 +254,6 @@ class TrainedDrive:
             raise RequestError(f"{self.where}: at {time:g} s the edited vehicle has left the recorded path")
         camera_to_world, ego_to_world = change.poses(frames, at)
         return camera_to_world[0], ego_to_world[0]
-
-    def _path(self, camera: str) -> tuple[np.ndarray, np.ndarray]:
-        """The times (n,) in seconds and poses (n, 4, 4) of a camera's images."""
-        if camera not in self._paths:
-            frames = recorded_frames(self.scene, camera)
-            first = self.scene.seconds(frames[0].timestamp)
-            times = first + np.array([frame.timestamp - frames[0].timestamp for frame in frames]) * 1e-6
-            self._paths[camera] = times, np.stack([frame.camera_to_world for frame in frames])
-        return self._paths[camera]
-
-    @cached_property
-    def _paths(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        return {}
 
 
 def _recording(folder: Path, checkpoint: TrainedCheckpoint) -> tuple[Scene, TrainingRecord]:

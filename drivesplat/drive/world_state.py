@@ -20,7 +20,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import Want
 from drivesplat.model.view import View
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.scene.tracks import Box
+from drivesplat.scene.tracks import Box, matching_ids
 from drivesplat.trajectories.edited_actors import EditedActor
 
 ViewOf = Callable[[str | PoseableCamera, float, Matrix | None, Matrix | None], View]
@@ -74,7 +74,7 @@ class ActorsById(Mapping[str, WorldActor]):
         self._actors = dict(actors)
 
     def __getitem__(self, name: str) -> WorldActor:
-        found = [name] if name in self._actors else [known for known in self._actors if known.startswith(name)]
+        found = matching_ids(name, self._actors)
         if len(found) != 1 or not name:
             count = "no object has" if not found else f"{len(found)} objects have"
             raise UnknownObjectError(f"{count} an id starting with {name!r}; there are: {', '.join(self) or 'none'}")
@@ -125,7 +125,7 @@ class WorldState:
 
     def add(self, source: str, name: str, object_to_world: Matrix) -> WorldActor:
         """Adds a copy `name` of the object `source` at a pose (4, 4)."""
-        if not name or name in self._taken or any(name == known for known in self.actors):
+        if not name or name in {*self._taken, *self.actors}:
             raise RequestError(f"a copy cannot be named {name!r}: choose a name that no other object has")
         copy = self.actors[source].copied(name)
         copy.pose = object_to_world
@@ -149,8 +149,8 @@ class WorldState:
             camera_to_world: Pose (4, 4) of the camera itself, in place of a vehicle's.
             outputs: Names from OUTPUTS.
 
-        Raises RequestError for an unknown camera or output, and for poses that are none or are given twice; ResultError
-        for images that contain NaN (when `DriveView.image` is read), DeviceError where memory is exhausted.
+        Raises RequestError for an unknown camera or output, an invalid pose, and for two poses; ResultError for
+        images that contain NaN (when `DriveView.image` is read), DeviceError where memory is exhausted.
         """
         if unknown := [name for name in outputs if name not in OUTPUTS]:
             raise RequestError(f"there is no output {unknown[0]!r}; there are: {', '.join(OUTPUTS)}")
@@ -197,7 +197,7 @@ class WorldState:
         boxes = [Box(a.id, ObjectClass.VEHICLE, a.category, a.size, a.pose, 0.0, 0) for a in actors]
         seen = [seen_object(model, gaussians, i, box, view) for i, box in enumerate(boxes)]
         known = {item.id: item for item in self._static.others}
-        others = self._static.others_in(view, sets)
+        others = self._static.others_in(view, sets, gaussians)
         boxes += [box_of(known[item.id], view.time) for item in others]
         for box, item in zip(boxes, [*seen, *others], strict=True):
             if item is not None:

@@ -85,18 +85,19 @@ class ShownObjects:
         (placements,) = actor_placements(present, now)
         want = Want(placements=tuple(placements))
         sets = self.model.sample(self.model.states(view.time, want), want)
-        found = self.others_in(view, sets)
+        gaussians = concatenate(sets)
+        found = self.others_in(view, sets, gaussians)
         if with_actors:
-            gaussians, boxes = concatenate(sets), [box_of(actor, view.time) for actor in present]
+            boxes = [box_of(actor, view.time) for actor in present]
             own = (seen_object(self.model, gaussians, i, box, view) for i, box in enumerate(boxes))
             found = [*(item for item in own if item is not None), *found]
         return found
 
     @torch.no_grad()
-    def others_in(self, view: View, sets: Sequence[Gaussians]) -> list[SeenObject]:
-        """Those of the others that a view shows, by the `sets` of Gaussians of the model's parts."""
+    def others_in(self, view: View, sets: Sequence[Gaussians], gaussians: Gaussians) -> list[SeenObject]:
+        """Those of the others that a view shows, by the `sets` of Gaussians of the model's parts, as one
+        `gaussians`."""
         now, found = np.array([view.time]), []
-        gaussians = concatenate(sets)
         means, names = gaussians.means, [part.name for part in self.model.parts]
         part_of_row = torch.cat([torch.full((len(own),), i, device=means.device) for i, own in enumerate(sets)])
         for item, parts in zip(self.others, self.parts, strict=True):

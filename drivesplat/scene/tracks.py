@@ -1,6 +1,6 @@
 """The poses of annotated objects between their annotations."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,6 +110,11 @@ def runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
     """The first and last position of every run of consecutive key frames."""
     breaks = np.flatnonzero(np.diff(sample_indices) != 1).tolist()
     return list(zip([0, *(i + 1 for i in breaks)], [*breaks, len(sample_indices) - 1], strict=True))
+
+
+def matching_ids(name: str, ids: Collection[str]) -> list[str]:
+    """The id `name` itself where it is one of `ids`, otherwise all that start with it."""
+    return [name] if name in ids else [known for known in ids if known.startswith(name)]
 
 
 def short_ids(ids: Sequence[str]) -> dict[str, str]:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import ConfigError
 from drivesplat.scene.track_references import why_fixed
-from drivesplat.scene.tracks import short_ids
+from drivesplat.scene.tracks import matching_ids, short_ids
 from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 from drivesplat.trajectories.actor_path import ActorPath, recorded_path
 from drivesplat.trajectories.motion import Motion
@@ -108,7 +108,7 @@ class _EditState:
     def find(self, name: str, also_removed: bool = False) -> EditedActor:
         """The actor with that id, or the only one whose id starts with it; perhaps `also_removed` ones."""
         known = [*self.actors, *self.removed]
-        found = [name] if name in known else [other for other in known if other.startswith(name)]
+        found = matching_ids(name, known)
         short = short_ids(known)
         remaining = ", ".join(short[other] for other in self.actors) or "none"
         if not found:
