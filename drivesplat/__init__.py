@@ -19,6 +19,8 @@ _PUBLIC = {
     "render_poses": ("drivesplat.drive.render_files", "render_poses"),
     "TrainedDrive": ("drivesplat.drive.trained_drive", "TrainedDrive"),
     "Camera": ("drivesplat.drive.cameras", "PoseableCamera"),
+    "LiveServer": ("drivesplat.drive.live_server", "LiveServer"),
+    "Lidar": ("drivesplat.drive.lidars", "PoseableLidar"),
 }
 
 

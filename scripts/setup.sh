@@ -121,6 +121,12 @@ make_venv() {
   stamp_for "$build" > "$stamp"
 }
 
+# The command drivesplat, and `import drivesplat` in any folder. Whoever has no network goes without.
+install_command() {
+  .venv/bin/python -m pip install --quiet --no-deps -e . ||
+    say "the command drivesplat could not be installed (see above); python -m drivesplat.cli.main does the same here"
+}
+
 # What is compiled at its first use otherwise, and waited for then: bytecode, and what trains and makes worlds on
 # processors.
 compile_ahead() {
@@ -166,6 +172,7 @@ else
   check_disk "$(disk_needed_mb "$build")" || exit 1
   make_venv "$build"
 fi
+[ -x .venv/bin/drivesplat ] || install_command
 no_card() { [ -z "${GSPLAT_ARCHS:-}" ] && ! command -v nvidia-smi >/dev/null 2>&1; }
 if [ -z "$quiet" ] || ! no_card; then
   .venv/bin/python -m drivesplat.machine.gsplat_build $quiet ||

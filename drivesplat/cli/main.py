@@ -70,6 +70,17 @@ def _parser(program: str) -> argparse.ArgumentParser:
     render.add_argument("--out", type=Path, required=True, help="folder to write images into")
     render.add_argument("--device", default="any", choices=["any", "cuda", "cpu"], help="any: a GPU where there is one")
 
+    live = commands.add_parser(
+        "view", help="look around in a trained drive and edit it, in the browser (docs/live_viewer.md)"
+    )
+    live.add_argument("folders", type=Path, nargs="+", help="of methods of one scene, such as results/demo/street")
+    live.add_argument(
+        "--edits", type=Path, default=Path("my_edits.yaml"), help="file to write edits into (my_edits.yaml)"
+    )
+    live.add_argument("--host", default="127.0.0.1", help="address to listen at; by default this machine alone")
+    live.add_argument("--port", type=int, default=8080, help="port to listen at (8080)")
+    live.add_argument("--device", default="any", choices=["any", "cuda", "cpu"], help="any: a GPU where there is one")
+
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
 
@@ -110,6 +121,15 @@ def run_command(parsed: argparse.Namespace) -> int:
         drive, outputs = drivesplat.open(parsed.folder, parsed.device), parsed.outputs.split(",")
         count = drivesplat.render_poses(drive, parsed.poses, parsed.camera, outputs, parsed.out, parsed.ego)
         print(f"{parsed.out}: {count} images each of {', '.join(outputs)}, and render.json")
+        return 0
+    if parsed.command == "view":
+        drives = [drivesplat.open(folder, parsed.device) for folder in parsed.folders]
+        server = drivesplat.LiveServer(drives, parsed.host, parsed.port, parsed.edits)
+        print(f"{server.url} shows {drives[0].where}; Ctrl-C ends it", flush=True)
+        try:
+            server.wait()
+        except KeyboardInterrupt:
+            server.close()
         return 0
     if parsed.command == "open":
         print(open_viewer(parsed.results or results_folder(), parsed.scene, parsed.method))

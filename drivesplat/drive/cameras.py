@@ -2,30 +2,42 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from drivesplat.errors import DatasetError, RequestError
-from drivesplat.model.view import View
+from drivesplat.model.view import View, rolling_shutter_of
 from drivesplat.readers.checks import checked_intrinsics, checked_size, checked_transform
+from drivesplat.scene.ego_mask import Outline, enclosed
+from drivesplat.scene.lens import coefficients_fault, lens_fault
+from drivesplat.scene.sensors import Camera, DistortionModel
+from drivesplat.scene.shutter import Shutter
 
-Matrix = np.ndarray | torch.Tensor | Sequence[Sequence[float]]
+Matrix = np.ndarray | torch.Tensor | Sequence[Sequence[float | int]]
 """What a pose may be given as."""
+Vector = np.ndarray | torch.Tensor | Sequence[float | int]
+"""What a velocity may be given as."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseableCamera:
-    """A pinhole camera with a global shutter.
+    """A camera that can be placed anywhere.
 
     `width` and `height` in pixels; `K` in continuous pixels, in which the centre of the first pixel is at (0.5, 0.5).
     `camera_to_ego` is its mount on the ego vehicle (ego: x forward, y left, z up; camera: x right, y down, z forward),
     None for a camera that is always placed by its own pose. With `exposure_of`, images have the exposure that was
-    learned for this recorded camera; otherwise the model's own colours, as films have. Raises RequestError for
-    an invalid size, invalid intrinsics or an invalid mount.
+    learned for this recorded camera; otherwise the model's own colours, as films have.
+
+    `readout_s` are the seconds from the left edge to the right one and from the top edge to the bottom one at which
+    lines are read, negative if read the other way, and from the image's time to the middle of the readout; zeros: a
+    global shutter. `distortion` are the coefficients of `distortion_model` (`drivesplat.scene.lens`); a distorted
+    camera has a global shutter. `covered` are outlines, in fractions of width and height, of the vehicle's own body.
+
+    Raises RequestError for an invalid size, lens or mount.
 
     >>> PoseableCamera.from_fov(640, 360, 90.0).K.tolist()
     [[320.0, 0.0, 320.0], [0.0, 320.0, 180.0], [0.0, 0.0, 1.0]]
@@ -36,6 +48,10 @@ class PoseableCamera:
     K: Float64[np.ndarray, "3 3"]
     camera_to_ego: Float64[np.ndarray, "4 4"] | None = None
     exposure_of: str | None = None
+    readout_s: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    distortion: Float64[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
+    distortion_model: DistortionModel = "none"
+    covered: tuple[Outline, ...] = ()
 
     def __post_init__(self) -> None:
         try:
@@ -43,8 +59,20 @@ class PoseableCamera:
         except DatasetError as error:
             raise RequestError(str(error)) from None
         object.__setattr__(self, "K", _checked(checked_intrinsics, self.K, "the camera"))
+        object.__setattr__(self, "readout_s", require_vector(self.readout_s, 3, "the camera's readout_s"))
+        object.__setattr__(self, "distortion", require_vector(self.distortion, None, "the camera's distortion"))
         if self.camera_to_ego is not None:
             object.__setattr__(self, "camera_to_ego", require_pose(self.camera_to_ego, "the camera's mount"))
+        if self.distortion_model not in get_args(DistortionModel):
+            known = ", ".join(get_args(DistortionModel))
+            raise RequestError(f"there is no distortion model {self.distortion_model!r}; there are: {known}")
+        fault = coefficients_fault(self.distortion_model, len(self.distortion))
+        if self.distorted:
+            fault = fault or lens_fault(self.lens)
+            if self.readout_s.any():
+                fault = fault or "a distorted camera is rendered with a global shutter: leave out readout_s"
+        if fault is not None:
+            raise RequestError(f"the camera: {fault}")
 
     @classmethod
     def from_fov(
@@ -58,22 +86,75 @@ class PoseableCamera:
         K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
         return cls(width, height, K, camera_to_ego)
 
+    @property
+    def distorted(self) -> bool:
+        """Whether it is no pinhole camera."""
+        return self.distortion_model != "none"
+
+    @property
+    def lens(self) -> Camera:
+        """The lens as scenes describe it: with integer coordinates at the centres of pixels."""
+        shifted = self.K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+        return Camera("", self.width, self.height, shifted, self.distortion, distortion_model=self.distortion_model)
+
     def resized(self, width: int) -> "PoseableCamera":
         """The same field of view in images of another width."""
         height = max(1, round(self.height * width / self.width))
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
+        if self.distortion_model in ("angle_to_radius", "radius_to_angle"):
+            raise RequestError(f"distortion {self.distortion_model!r} is in pixels: its camera cannot be resized")
         return replace(self, width=width, height=height, K=self.K * scale)
 
-    def view(self, camera_to_world: np.ndarray, time: float, device: torch.device) -> View:
-        """The camera at a pose (4, 4) and a time in seconds since the first image."""
-        pose, K = (torch.from_numpy(matrix).float().to(device) for matrix in (camera_to_world, self.K))
-        return View(K, pose, self.width, self.height, time, camera=self.exposure_of)
+    def uncovered(self) -> Bool[np.ndarray, "h w"]:
+        """The pixels (h, w) that show more than the vehicle's own body."""
+        return ~enclosed(self.covered, (self.width, self.height))
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCamera:
+    """A camera at a pose and a time in seconds since the first image. `velocity` (6,): linear (m/s), then angular
+    velocity (rad/s) along the camera's own axes, which matter to a rolling shutter."""
+
+    camera: PoseableCamera
+    camera_to_world: Float64[np.ndarray, "4 4"]
+    velocity: Float64[np.ndarray, "6"]
+    time: float
+
+    def view(self, device: torch.device) -> View:
+        """What the model renders; without the distortion of the lens."""
+        camera = self.camera
+        pose, K = (torch.from_numpy(matrix).float().to(device) for matrix in (self.camera_to_world, camera.K))
+        shutter = Shutter(camera.readout_s, self.velocity) if camera.readout_s.any() else None
+        rolling = rolling_shutter_of(shutter, device)
+        return View(K, pose, camera.width, camera.height, self.time, camera.exposure_of, rolling)
 
 
 def require_pose(pose: Matrix, of: str) -> Float64[np.ndarray, "4 4"]:
     """A pose as an array. Raises RequestError, which names what it is the pose `of`, unless it is a matrix (4, 4) of a
     rotation and a translation."""
     return _checked(checked_transform, pose, of)
+
+
+def require_vector(values: Vector, length: int | None, what: str) -> Float64[np.ndarray, " n"]:
+    """Finite numbers, as many as `length` if that is not None, as an array. Raises RequestError that says `what` they
+    are."""
+    try:
+        found = np.array(values.detach().cpu() if isinstance(values, torch.Tensor) else values, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.full((1, 1), np.nan)
+    if found.ndim != 1 or length not in (None, len(found)) or not np.isfinite(found).all():
+        raise RequestError(f"{what} must be {'some' if length is None else length} finite numbers, not {values}")
+    return found
+
+
+def mounted_velocity(
+    velocity: Float64[np.ndarray, "6"], sensor_to_ego: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "6"]:
+    """The velocity of a sensor on a vehicle along its own axes, by that of the vehicle along its axes: linear (m/s),
+    then angular (rad/s)."""
+    turning = velocity[3:]
+    moving = velocity[:3] + np.cross(turning, sensor_to_ego[:3, 3])
+    return (np.stack([moving, turning]) @ sensor_to_ego[:3, :3]).reshape(6)
 
 
 def _checked(check: Callable[[Any, str], np.ndarray], matrix: Matrix, of: str) -> np.ndarray:

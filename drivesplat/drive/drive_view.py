@@ -1,9 +1,10 @@
 """What a camera sees of a drive."""
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int16
+from jaxtyping import Bool, Float, Int16
 from torch import Tensor
 
 from drivesplat.errors import RequestError
@@ -31,10 +32,12 @@ class ObjectBox:
 class DriveView:
     """A rendering, as tensors on the model's device. What was not asked for is None.
 
-    `rgb` in [0, 1]; `depth` along the camera's axis in metres, 0 where no Gaussian is met; `alpha`, how opaque the
-    scene is there without the sky; `instance`, the index into `objects` of the object that contributes most to a pixel,
-    -1 where something else does; `boxes` of the objects that the image shows. `objects` are the ids of the objects that
-    are present and of which the model has Gaussians.
+    `rgb` in [0, 1]; `depth` along the camera's axis in metres (from a distorted camera the distance), 0 where no
+    Gaussian is met; `alpha`, how opaque the scene is there without the sky; `instance`, the index into `objects` of the
+    object that contributes most to a pixel, -1 where something else does; `semantic`, the index into `classes` of what
+    contributes most; `valid`, whether the lens sees a direction there and the vehicle's own body does not cover it;
+    `boxes` of the objects that the image shows. `objects` are the ids of the objects that are present and of which the
+    model has Gaussians. `classes` are the sky, the parts of the model without objects, and the classes of its objects.
     """
 
     objects: tuple[str, ...]
@@ -42,7 +45,10 @@ class DriveView:
     depth: Float[Tensor, "h w"] | None = None
     alpha: Float[Tensor, "h w"] | None = None
     instance: Int16[Tensor, "h w"] | None = None
+    semantic: Int16[Tensor, "h w"] | None = None
+    valid: Bool[Tensor, "h w"] | None = None
     boxes: tuple[ObjectBox, ...] | None = None
+    classes: tuple[str, ...] = ()
 
     @property
     def image(self) -> np.ndarray:
@@ -54,5 +60,10 @@ class DriveView:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The tensors by name as arrays in main memory."""
-        named = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: values.cpu().numpy() for name, values in named.items() if isinstance(values, Tensor)}
+        return arrays_of(self)
+
+
+def arrays_of(record: Any) -> dict[str, np.ndarray]:
+    """The tensors of a dataclass by name as arrays in main memory."""
+    named = {field.name: getattr(record, field.name) for field in fields(record)}
+    return {name: values.cpu().numpy() for name, values in named.items() if isinstance(values, Tensor)}

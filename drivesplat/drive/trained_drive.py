@@ -4,29 +4,43 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, get_args, overload
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
-from drivesplat.drive.cameras import Matrix, PoseableCamera, require_pose
+from drivesplat.drive.cameras import (
+    Matrix,
+    PlacedCamera,
+    PoseableCamera,
+    Vector,
+    mounted_velocity,
+    require_pose,
+    require_vector,
+)
+from drivesplat.drive.drive_scan import DriveScan
 from drivesplat.drive.drive_view import DriveView
-from drivesplat.drive.world_state import WorldState
+from drivesplat.drive.lidars import PoseableLidar
+from drivesplat.drive.recording import Recording
+from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
 from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
-from drivesplat.editing.ego import MAX_LEAD, EgoEdit
-from drivesplat.editing.sensor_path import recorded_ego
+from drivesplat.editing.ego import EgoEdit
+from drivesplat.editing.sensor_path import EgoPoses
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.errors import RequestError
-from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
+from drivesplat.lidar.moved_sensor import moved, steady_motion
+from drivesplat.lidar.scans import SensorPoses
+from drivesplat.model.checkpoint import open_model, read_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.scene.scene import REFINED, Frame, Scene, Track, read_scene
+from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import box_at, ever_moves
-from drivesplat.scene.training_record import TrainingRecord, read_training_record
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
-from drivesplat.settings.tracks import FOUND, TRACK_FOLDERS, Tracks
-from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, smooth_poses
+from drivesplat.trajectories.camera_path import recorded_frames
 from drivesplat.trajectories.edited_actors import EditedActor
 from drivesplat.workflow.edits_file import edit_of
 
@@ -36,9 +50,11 @@ if TYPE_CHECKING:
 COLUMNS = [
     "id", "class", "category", "length", "width", "height", "first", "last", "speed", "editable", "why_not",
 ]  # fmt: skip
-"""Those of `TrainedDrive.actors`."""
+"""The columns of `TrainedDrive.actors`."""
 OUTSIDE = ("refuse", "clamp")
 """What can happen to a time outside of the recording."""
+HALF_SPAN = 0.05
+"""Half the time in seconds between the two poses that give the velocity of the ego vehicle."""
 
 
 def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "TrainedDrive":
@@ -62,45 +78,65 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
             "results/demo/street"
         )
     checkpoint = read_checkpoint(folder / "checkpoint.npz")
-    scene, record = _recording(folder.parent, checkpoint)
+    recording = Recording.of_method(folder, checkpoint)
     kinds = get_args(DeviceSettings.model_fields["kind"].annotation)
     if not isinstance(device, DeviceSettings) and device not in kinds:
         raise RequestError(f"there is no device {device!r}; there are: {', '.join(kinds)}")
     settings = device if isinstance(device, DeviceSettings) else DeviceSettings.model_validate(device)
     model, chosen = open_model(checkpoint, settings)
-    return TrainedDrive(folder, scene, record, model, chosen)
+    return TrainedDrive(folder, recording, model, chosen, checkpoint.job.train.scans.beam_spread_rad)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TrainedDrive:
+class TrainedDrive(Sensors):
     """A drive that can be rendered at any time from any pose: see `open_drive`. Times are seconds since the first
     image, as in films and edits; world coordinates are metres, z up; `edit` is what `edited` has changed."""
 
     folder: Path
-    scene: Scene
-    record: TrainingRecord
+    recording: Recording
     model: SplatModel
     device: torch.device
+    beam_spread: tuple[float, float]
     edit: Edit | None = None
 
     def __repr__(self) -> str:
-        return f"<TrainedDrive {self.folder}: {self.duration:.1f} s, cameras {', '.join(self.cameras) or 'none'}>"
+        sensors = ", ".join((*self.cameras, *self.lidars)) or "none"
+        return f"<TrainedDrive {self.folder}: {self.duration:.1f} s, sensors {sensors}>"
 
-    @cached_property
+    @property
+    def scene(self) -> Scene:
+        """The record of the scene, with the tracks of the model."""
+        return self.recording.scene
+
+    @property
+    def record(self) -> TrainingRecord:
+        """The record of the training images."""
+        return self.recording.record
+
+    @property
     def cameras(self) -> list[str]:
         """The names of the recorded cameras."""
-        return list(dict.fromkeys(frame.camera for frame in self.scene.frames))
+        return list(self.recording.cameras)
 
-    @cached_property
+    @property
+    def lidars(self) -> list[str]:
+        """The names of the recorded LiDARs."""
+        return list(self.recording.lidars)
+
+    @property
+    def renders_lidar(self) -> bool:
+        """Whether the method was trained with LiDAR, and the drive has one."""
+        return bool(self.lidars) and all("lidar_logits" in part.params for part in self.model.parts)
+
+    @property
     def duration(self) -> float:
         """The time of the last image in seconds; of the last sweep without images."""
-        recordings = self.scene.frames or self.scene.sweeps
-        return self.scene.seconds(max(recording.timestamp for recording in recordings))
+        return self.recording.duration
 
     @property
     def where(self) -> str:
         """The scene and the method, for messages."""
-        return f"scene {self.scene.name}, method {self.folder.name}"
+        return self.recording.where
 
     @cached_property
     def edited_actors(self) -> list[EditedActor]:
@@ -144,80 +180,176 @@ class TrainedDrive:
         _ = changed.edited_actors, changed._ego_edit  # an edit that does not fit is refused here
         return changed
 
-    def camera(self, name: str, exposure: bool = False) -> PoseableCamera:
+    def camera(self, name: str, exposure: bool = False, rolling_shutter: bool = False) -> PoseableCamera:
         """A recorded camera: its intrinsics at the size of its training images and its mount; with its learned
-        `exposure`, if wanted. Raises RequestError for an unknown camera."""
-        index, frame = self._first_image(name)
-        width, height = self.record.image_size(index)
-        K = self.record.Ks[index].astype(np.float64)
-        return PoseableCamera(width, height, K, frame.camera_to_ego, name if exposure else None)
+        `exposure` and the readout of its `rolling_shutter`, if wanted and known. Raises RequestError for an unknown
+        camera."""
+        return self.recording.camera(name, exposure, rolling_shutter)
+
+    def lidar(self, name: str, time: float = 0.0) -> PoseableLidar:
+        """A recorded LiDAR: the rays of its scan that is nearest in time, and its mount. Raises RequestError for an
+        unknown LiDAR, and where no scans were prepared."""
+        return self.recording.lidar(name, time)
 
     def ego_to_world(self, time: float) -> np.ndarray:
         """The pose (4, 4) of the ego vehicle; its origin is on the ground below the rear axle. Raises RequestError for
         a time outside of the recording, and where an edited vehicle has left the recorded path."""
         if self._ego_edit is not None:
             return self._edited_poses(self._reference, time)[1]
-        at = np.array([self._checked(time)])
-        return recorded_ego(self.scene, self.cameras[0] if self.cameras else None)(at)[0]
+        return self.recording.ego(np.array([self.recording.checked(time)]))[0]
+
+    def ego_velocity(self, time: float) -> np.ndarray:
+        """The velocity (6,) of the ego vehicle along its own axes: linear (m/s), then angular (rad/s). Raises
+        RequestError for a time outside of the recording."""
+        ends = np.clip(self.recording.checked(time) + np.array([-HALF_SPAN, HALF_SPAN]), 0.0, self.duration)
+        now, first, last = self._ego_path(np.array([time, *ends]))
+        if not ends[1] > ends[0]:
+            return np.zeros(6)
+        turn = Rotation.from_matrix(first[:3, :3].T @ last[:3, :3]).as_rotvec()  # about axes of the first pose
+        turn = now[:3, :3].T @ first[:3, :3] @ turn
+        return np.concatenate([now[:3, :3].T @ (last - first)[:3, 3], turn]) / (ends[1] - ends[0])
 
     def camera_to_world(self, name: str, time: float) -> np.ndarray:
         """The pose (4, 4) of a recorded camera: on the smooth path through its images, which films take, too. Raises
         RequestError as `ego_to_world`, and for a time at which this camera did not record."""
-        self._first_image(name)
+        self.recording.first_image(name)
         if self._ego_edit is not None:
             return self._edited_poses(name, time)[0]
-        frames = recorded_frames(self.scene, name)
-        stamps = recorded_timestamps(self.scene, name)
-        recorded = self.scene.seconds(stamps[0]) + (stamps - stamps[0]) * 1e-6
-        if not recorded[0] - MAX_LEAD <= self._checked(time) <= recorded[-1] + MAX_LEAD:
-            raise RequestError(
-                f"camera {name} recorded from {recorded[0]:.2f} to {recorded[-1]:.2f} s, not at {time:g} s"
-            )
-        poses = np.stack([frame.camera_to_world for frame in frames])
-        return smooth_poses(recorded * 1e6, poses, np.array([time]) * 1e6)[0]
+        return self.recording.camera_to_world(name, time)
 
-    def view(
+    def placed_camera(
         self,
-        camera: str | PoseableCamera,
+        camera: AnyCamera,
         time: float,
         ego_to_world: Matrix | None = None,
         camera_to_world: Matrix | None = None,
-    ) -> View:
-        """A camera at a time and a pose, as the model renders it; see `WorldState.render`."""
+        velocity: Vector | None = None,
+    ) -> PlacedCamera:
+        """A camera at a time, a pose and a velocity; see `WorldState.render`."""
         known = self.camera(camera) if isinstance(camera, str) else camera
+        moving = _velocity(velocity)
         if camera_to_world is not None:
             if ego_to_world is not None:
                 raise RequestError("a camera has one pose: give ego_to_world or camera_to_world, not both")
-            pose = require_pose(camera_to_world, "the camera")
-        elif isinstance(camera, str) and ego_to_world is None:
-            pose = self.camera_to_world(camera, time)
-        elif known.camera_to_ego is None:
+            return PlacedCamera(known, require_pose(camera_to_world, "the camera"), moving, time)
+        mount = known.camera_to_ego
+        if mount is None:
             raise RequestError("a camera of one's own without camera_to_ego needs camera_to_world")
+        if ego_to_world is not None:
+            pose = require_pose(ego_to_world, "the ego vehicle") @ mount
         else:
-            ego = self.ego_to_world(time) if ego_to_world is None else require_pose(ego_to_world, "the ego vehicle")
-            pose = ego @ known.camera_to_ego
-        return known.view(pose, time, self.device)
+            by_name = isinstance(camera, str)
+            pose = self.camera_to_world(camera, time) if by_name else self.ego_to_world(time) @ mount
+            if velocity is None and known.readout_s.any():
+                moving = self.ego_velocity(time)
+        return PlacedCamera(known, pose, mounted_velocity(moving, mount), time)
+
+    def view(
+        self,
+        camera: AnyCamera,
+        time: float,
+        ego_to_world: Matrix | None = None,
+        camera_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+    ) -> View:
+        """A camera at a time and a pose as `SplatModel.render` takes it; see `WorldState.render`."""
+        return self.placed_camera(camera, time, ego_to_world, camera_to_world, velocity).view(self.device)
+
+    def placed_lidar(
+        self,
+        lidar: str | PoseableLidar,
+        time: float,
+        ego_to_world: Matrix | None = None,
+        sensor_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+    ) -> tuple[RecordedScan, tuple[float, float]]:
+        """The rays of a LiDAR at a time, a pose and a velocity, and the spread of its beams; see `WorldState.scan`."""
+        recorded = self.recording.nearest_scan(lidar, time) if isinstance(lidar, str) else None
+        known = self.lidar(lidar, time) if isinstance(lidar, str) else lidar
+        path = self._lidar_path(known, recorded, time, ego_to_world, sensor_to_world, velocity)
+        sensor = known.placed(path, time) if recorded is None else replace(moved(recorded, path), seconds=time)
+        return sensor, known.beam_spread or self.beam_spread
+
+    def _lidar_path(
+        self,
+        lidar: PoseableLidar,
+        recorded: RecordedScan | None,
+        time: float,
+        ego_to_world: Matrix | None,
+        sensor_to_world: Matrix | None,
+        velocity: Vector | None,
+    ) -> SensorPoses:
+        """The poses of a LiDAR in the world at offsets in seconds from a time; `recorded` is the scan whose rays it
+        fires."""
+        linear, angular = _velocity(velocity).reshape(2, 3)
+        if sensor_to_world is not None:
+            if ego_to_world is not None:
+                raise RequestError("a LiDAR has one pose: give ego_to_world or sensor_to_world, not both")
+            return steady_motion(require_pose(sensor_to_world, "the LiDAR"), linear, angular)
+        mount = lidar.sensor_to_ego
+        if mount is None:
+            raise RequestError("a LiDAR of one's own without sensor_to_ego needs sensor_to_world")
+        ego = self.ego_to_world(time) if ego_to_world is None else require_pose(ego_to_world, "the ego vehicle")
+        if ego_to_world is not None or velocity is not None:
+            of_ego = steady_motion(ego, linear, angular)
+            return lambda offsets: of_ego(offsets) @ mount
+        if recorded is not None:
+            return self.recording.carried(recorded, self._ego_path, time)
+        return lambda offsets: self._ego_path(time + offsets) @ mount
 
     def state(self, time: float, outside: str = "refuse") -> WorldState:
         """The drive at a time. One outside of the recording is refused by a RequestError, or clamped to it."""
         if outside not in OUTSIDE:
             raise RequestError(f"outside is {outside!r}; it is one of {', '.join(OUTSIDE)}")
-        now = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else self._checked(time)
-        return WorldState(self.model, self.edited_actors, self._static, self.view, float(now), self.edit is None)
+        inside = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else time
+        classes = {track.id: track.object_class for track in self.scene.tracks}
+        objects = self.edited_actors, self._static, classes
+        now = self.recording.checked(inside)
+        return WorldState(self.model, *objects, self, float(now), self.edit is None)
 
+    @overload
     def render(
         self,
-        camera: str | PoseableCamera,
+        camera: AnyCamera,
         time: float,
         *,
         ego_to_world: Matrix | None = None,
         camera_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
         outputs: Sequence[str] = ("rgb",),
         outside: str = "refuse",
-    ) -> DriveView:
-        """What a camera sees at a time: `state(time, outside).render(...)`."""
+    ) -> DriveView: ...
+
+    @overload
+    def render(
+        self,
+        camera: Sequence[AnyCamera],
+        time: float,
+        *,
+        ego_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+        outputs: Sequence[str] = ("rgb",),
+        outside: str = "refuse",
+    ) -> list[DriveView]: ...
+
+    def render(self, camera: Any, time: float, *, outside: str = "refuse", **at: Any) -> DriveView | list[DriveView]:
+        """What a camera sees at a time, or each of several cameras: `state(time, outside).render(camera, ...)`, whose
+        arguments it has."""
+        return self.state(time, outside).render(camera, **at)
+
+    def scan(
+        self,
+        lidar: str | PoseableLidar,
+        time: float,
+        *,
+        ego_to_world: Matrix | None = None,
+        sensor_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+        outside: str = "refuse",
+    ) -> DriveScan:
+        """What a LiDAR measures about a time: `state(time, outside).scan(...)`."""
         state = self.state(time, outside)
-        return state.render(camera, ego_to_world=ego_to_world, camera_to_world=camera_to_world, outputs=outputs)
+        return state.scan(lidar, ego_to_world=ego_to_world, sensor_to_world=sensor_to_world, velocity=velocity)
 
     @property
     def _reference(self) -> str:
@@ -226,29 +358,24 @@ class TrainedDrive:
             raise RequestError(f"{self.where} has no camera, and edits need one")
         return self.cameras[0]
 
-    def _first_image(self, name: str) -> tuple[int, Frame]:
-        for index, frame in enumerate(self.scene.frames):
-            if frame.camera == name:
-                return index, frame
-        raise RequestError(f"{self.where} has no camera {name!r}; there are: {', '.join(self.cameras) or 'none'}")
-
-    def _checked(self, time: float) -> float:
-        """A time within the recording."""
-        if not 0.0 <= time <= self.duration:
-            raise RequestError(
-                f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s; outside='clamp' "
-                "renders its start or its end"
-            )
-        return time
-
     @cached_property
     def _ego_edit(self) -> EgoEdit | None:
         """What the edit does to the ego vehicle."""
         return None if self.edit is None else EgoEdit.of(self.scene, self._reference, self.edit, self.where)
 
+    @cached_property
+    def _ego_path(self) -> EgoPoses:
+        """The poses of the ego vehicle after the edit."""
+        change = self._ego_edit
+        if change is None:
+            return self.recording.ego
+        frames = recorded_frames(self.scene, self._reference)
+        return lambda times: change.poses(frames, times)[1]
+
     def _edited_poses(self, camera: str, time: float) -> tuple[np.ndarray, np.ndarray]:
         """The poses of a camera and of the ego vehicle after the edit."""
-        frames, at, change = recorded_frames(self.scene, camera), np.array([self._checked(time)]), self._ego_edit
+        frames, change = recorded_frames(self.scene, camera), self._ego_edit
+        at = np.array([self.recording.checked(time)])
         assert change is not None
         if not change.within(frames, at)[0]:
             raise RequestError(f"{self.where}: at {time:g} s the edited vehicle has left the recorded path")
@@ -256,15 +383,9 @@ class TrainedDrive:
         return camera_to_world[0], ego_to_world[0]
 
 
-def _recording(folder: Path, checkpoint: TrainedCheckpoint) -> tuple[Scene, TrainingRecord]:
-    """The scene with the tracks of a model, and the training record, from the result folder of a scene."""
-    tracks = [track.id for part in checkpoint.parts for track in part.tracks]
-    refined = "refine_poses" in checkpoint.provenance["stages"]
-    own: Tracks = "discovered" if any(track.startswith(FOUND) for track in tracks) else "annotated"
-    scene = folder / (REFINED if refined and own == "annotated" else Path(TRACK_FOLDERS[own], "scene.json"))
-    parsers = [folder / TRACK_FOLDERS[of] / "parser.npz" for of in (own, "none")]  # the images of both are the same
-    parser = next((path for path in parsers if path.is_file()), parsers[0])
-    return read_scene(scene), read_training_record(parser)
+def _velocity(given: Vector | None) -> np.ndarray:
+    """A velocity (6,) of the user; zeros for None."""
+    return np.zeros(6) if given is None else require_vector(given, 6, "the velocity")
 
 
 def _row(scene: Scene, track: Track, editable: set[str]) -> list[Any]:

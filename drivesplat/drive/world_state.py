@@ -1,90 +1,57 @@
-"""A drive at one time, whose objects can be moved one by one."""
+"""A drive at one time, whose objects can be moved one by one, as cameras and LiDARs see it."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import overload
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from drivesplat.drive.cameras import Matrix, PoseableCamera, require_pose
-from drivesplat.drive.drive_view import DriveView, ObjectBox
+from drivesplat.drive.cameras import Matrix, PlacedCamera, PoseableCamera, Vector
+from drivesplat.drive.drive_scan import DriveScan
+from drivesplat.drive.drive_view import DriveView
+from drivesplat.drive.lidars import PoseableLidar
+from drivesplat.drive.sampled_world import SampledWorld
+from drivesplat.drive.world_actor import ActorsById, WorldActor
 from drivesplat.editing.actors import actor_placements
-from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_object
-from drivesplat.errors import RequestError, UnknownObjectError
+from drivesplat.editing.shown_objects import ShownObjects
+from drivesplat.errors import RequestError
 from drivesplat.machine.device import explain_out_of_memory
-from drivesplat.model.actor_placements import ActorPlacement
-from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.groups import strongest_group
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import Want
-from drivesplat.model.view import View
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.scene.tracks import Box, matching_ids
+from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.trajectories.edited_actors import EditedActor
 
-ViewOf = Callable[[str | PoseableCamera, float, Matrix | None, Matrix | None], View]
-"""The view of a camera at a time, with the pose of the vehicle or of the camera, if given."""
-
-OUTPUTS = ("rgb", "depth", "alpha", "instance", "boxes")
+OUTPUTS = ("rgb", "depth", "alpha", "instance", "semantic", "valid", "boxes")
 """What `WorldState.render` can give."""
+AnyCamera = str | PoseableCamera
+"""The name of a recorded camera, or a camera of one's own."""
 
 
-class WorldActor:
-    """An object of a world: `id` and `category` of the dataset."""
+class Sensors(ABC):
+    """The sensors of a drive, placed at a time: see `TrainedDrive`."""
 
-    def __init__(self, actor: EditedActor, placement: ActorPlacement, time: float):
-        self.id, self.category = actor.id, actor.category
-        self._actor, self._placement, self._time = actor, placement, time
-        self.changed = False
+    @abstractmethod
+    def placed_camera(
+        self,
+        camera: AnyCamera,
+        time: float,
+        ego_to_world: Matrix | None = None,
+        camera_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+    ) -> PlacedCamera:
+        """A camera at a time."""
 
-    @property
-    def placement(self) -> ActorPlacement:
-        """Where and how its Gaussians are rendered."""
-        return self._placement
-
-    @property
-    def size(self) -> np.ndarray:
-        """Length, width and height in metres, a copy."""
-        return self._actor.size.copy()
-
-    @property
-    def pose(self) -> np.ndarray:
-        """Object to world (4, 4), at the centre of its box, x forward, y left, z up. It is a copy: assign a pose to
-        move the object, whose limbs and colours stay those of the time. Raises RequestError for an invalid pose."""
-        placed = self._placement.object_to_world
-        return self._actor.poses(np.array([self._time]))[0] if placed is None else placed.copy()
-
-    @pose.setter
-    def pose(self, object_to_world: Matrix) -> None:
-        pose = require_pose(object_to_world, f"object {self.id}")
-        self._placement = replace(self._placement, object_to_world=pose, around=None)
-        self.changed = True
-
-    def copied(self, name: str) -> "WorldActor":
-        """Another object with the same Gaussians."""
-        return WorldActor(replace(self._actor, id=name), self._placement, self._time)
-
-
-class ActorsById(Mapping[str, WorldActor]):
-    """Objects by their ids, or by the first characters of an id that only one begins with. Raises UnknownObjectError,
-    which is a KeyError, for any other name."""
-
-    def __init__(self, actors: Mapping[str, WorldActor]):
-        self._actors = dict(actors)
-
-    def __getitem__(self, name: str) -> WorldActor:
-        found = matching_ids(name, self._actors)
-        if len(found) != 1 or not name:
-            count = "no object has" if not found else f"{len(found)} objects have"
-            raise UnknownObjectError(f"{count} an id starting with {name!r}; there are: {', '.join(self) or 'none'}")
-        return self._actors[found[0]]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._actors)
-
-    def __len__(self) -> int:
-        return len(self._actors)
+    @abstractmethod
+    def placed_lidar(
+        self,
+        lidar: str | PoseableLidar,
+        time: float,
+        ego_to_world: Matrix | None = None,
+        sensor_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+    ) -> tuple[RecordedScan, tuple[float, float]]:
+        """The rays of a LiDAR at a time, and the spread of its beams in radians."""
 
 
 class WorldState:
@@ -104,13 +71,16 @@ class WorldState:
         model: SplatModel,
         actors: Sequence[EditedActor],
         static: ShownObjects,
-        view_of: ViewOf,
+        class_of: Mapping[str, ObjectClass],
+        sensors: Sensors,
         time: float,
         as_recorded: bool,
     ):
-        """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of."""
+        """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of; `class_of`
+        are the classes of tracks by id."""
         self.time, now = time, np.array([time])
-        self._model, self._static, self._view_of, self._as_recorded = model, static, view_of, as_recorded
+        self._model, self._static, self._class_of = model, static, class_of
+        self._sensors, self._as_recorded = sensors, as_recorded
         self._taken = {item.id for item in (*actors, *static.others)}
         present = [actor for actor in actors if actor.present(now)[0]]
         (placed,) = actor_placements(present, now)
@@ -132,74 +102,89 @@ class WorldState:
         self.actors = ActorsById({**self.actors, name: copy})
         return copy
 
-    @torch.no_grad()
+    @overload
     def render(
         self,
-        camera: str | PoseableCamera,
+        camera: AnyCamera,
         *,
         ego_to_world: Matrix | None = None,
         camera_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
         outputs: Sequence[str] = ("rgb",),
-    ) -> DriveView:
-        """What a camera sees.
+    ) -> DriveView: ...
+
+    @overload
+    def render(
+        self,
+        camera: Sequence[AnyCamera],
+        *,
+        ego_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+        outputs: Sequence[str] = ("rgb",),
+    ) -> list[DriveView]: ...
+
+    @torch.no_grad()
+    def render(
+        self,
+        camera: AnyCamera | Sequence[AnyCamera],
+        *,
+        ego_to_world: Matrix | None = None,
+        camera_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+        outputs: Sequence[str] = ("rgb",),
+    ) -> DriveView | list[DriveView]:
+        """What a camera sees, or each of several cameras of one vehicle.
 
         Args:
-            camera: The name of a recorded camera, or a camera of one's own.
-            ego_to_world: Pose (4, 4) of the vehicle that carries the camera; None: that of the drive at this time.
-            camera_to_world: Pose (4, 4) of the camera itself, in place of a vehicle's.
+            camera: The name of a recorded camera, a camera of one's own, or a list of these. The Gaussians are placed
+                once for all of a list.
+            ego_to_world: Pose (4, 4) of the vehicle that carries the camera; None: its pose in the drive at this time.
+            camera_to_world: Pose (4, 4) of the camera itself, in place of a vehicle's; for one camera.
+            velocity: Linear (m/s), then angular velocity (rad/s) along the axes of what the pose is given for, which
+                rolling shutters see. None: at rest where a pose is given, otherwise as the vehicle drives.
             outputs: Names from OUTPUTS.
 
-        Raises RequestError for an unknown camera or output, an invalid pose, and for two poses; ResultError for
-        images that contain NaN (when `DriveView.image` is read), DeviceError where memory is exhausted.
+        Raises RequestError for an unknown camera or output, an invalid pose or velocity, and for two poses; ResultError
+        for images that contain NaN (when `DriveView.image` is read), DeviceError where memory is exhausted.
         """
         if unknown := [name for name in outputs if name not in OUTPUTS]:
             raise RequestError(f"there is no output {unknown[0]!r}; there are: {', '.join(OUTPUTS)}")
-        view = self._view_of(camera, self.time, ego_to_world, camera_to_world)
+        several = not isinstance(camera, str | PoseableCamera)
+        cameras = list(camera) if several else [camera]
+        if several and camera_to_world is not None:
+            raise RequestError("several cameras are placed by one ego_to_world: camera_to_world is for one camera")
+        at = ego_to_world, camera_to_world, velocity
+        placed = [self._sensors.placed_camera(one, self.time, *at) for one in cameras]
+        world = self._sampled()
         with explain_out_of_memory(lambda: len(self._model)):
-            return self._rendered(view, outputs)
+            views = [world.image(one, outputs) for one in placed]
+        return views if several else views[0]
 
-    def _rendered(self, view: View, outputs: Collection[str]) -> DriveView:
-        model, actors = self._model, tuple(self.actors.values())
+    @torch.no_grad()
+    def scan(
+        self,
+        lidar: str | PoseableLidar,
+        *,
+        ego_to_world: Matrix | None = None,
+        sensor_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+    ) -> DriveScan:
+        """What a LiDAR measures in a revolution about this time.
+
+        Args:
+            lidar: The name of a recorded LiDAR, whose rays of the scan nearest in time are fired, or a LiDAR of one's
+                own.
+            ego_to_world: Pose (4, 4) of the vehicle that carries it; None: its pose in the drive at this time.
+            sensor_to_world: Pose (4, 4) of the LiDAR itself, in place of a vehicle's.
+            velocity: As in `render`; the sensor moves during the revolution.
+
+        Raises RequestError as `render`, ResultError for a model that was trained without LiDAR.
+        """
+        sensor, spread = self._sensors.placed_lidar(lidar, self.time, ego_to_world, sensor_to_world, velocity)
+        with explain_out_of_memory(lambda: len(self._model)):
+            return self._sampled().scan(sensor, spread)
+
+    def _sampled(self) -> SampledWorld:
+        actors = tuple(self.actors.values())
         as_recorded = self._as_recorded and not any(actor.changed for actor in actors)
-        placed = None
-        if "instance" in outputs or not (as_recorded or set(outputs) <= {"boxes"}):
-            placed = model.at(view.time, Want(placements=tuple(actor.placement for actor in actors)))
-        gaussians = None if as_recorded else placed
-        picture = surfaces = None
-        if "rgb" in outputs or "alpha" in outputs:
-            picture = model.render(view, gaussians=gaussians)
-        if "depth" in outputs:
-            surfaces = model.render(view, gaussians=gaussians, with_surface_depth=True).surface_depth
-        return DriveView(
-            tuple(self.actors),
-            picture.image if picture is not None and "rgb" in outputs else None,
-            surfaces,
-            picture.alpha if picture is not None and "alpha" in outputs else None,
-            self._instances(view, placed) if placed is not None and "instance" in outputs else None,
-            tuple(self._boxes(view)) if "boxes" in outputs else None,
-        )
-
-    def _instances(self, view: View, gaussians: Gaussians) -> Tensor:
-        if gaussians.placement is None:
-            return torch.full((view.height, view.width), -1, dtype=torch.int16, device=view.K.device)
-
-        def composited(shares: Tensor) -> Tensor:
-            return self._model.composited(gaussians, shares.to(gaussians.means), view).image.squeeze(0)
-
-        sky = 1.0 - self._model.composited(gaussians, gaussians.means.new_ones(len(gaussians), 1), view).alpha
-        return strongest_group(gaussians.placement, composited, sky.squeeze((0, 3))).to(torch.int16)
-
-    def _boxes(self, view: View) -> Iterator[ObjectBox]:
-        model, actors = self._model, tuple(self.actors.values())
-        want = Want(colors=False, placements=tuple(actor.placement for actor in actors))
-        sets = model.sample(model.states(view.time, want), want)
-        gaussians = concatenate(sets)
-        boxes = [Box(a.id, ObjectClass.VEHICLE, a.category, a.size, a.pose, 0.0, 0) for a in actors]
-        seen = [seen_object(model, gaussians, i, box, view) for i, box in enumerate(boxes)]
-        known = {item.id: item for item in self._static.others}
-        others = self._static.others_in(view, sets, gaussians)
-        boxes += [box_of(known[item.id], view.time) for item in others]
-        for box, item in zip(boxes, [*seen, *others], strict=True):
-            if item is not None:
-                own = box.category, box.size.copy(), box.object_to_world
-                yield ObjectBox(item.id, *own, item.corners, item.visible)
+        return SampledWorld(self._model, self.time, actors, self._static, self._class_of, as_recorded)

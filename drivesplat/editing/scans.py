@@ -14,7 +14,7 @@ from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.sensor_path import beside, carried, recorded_ego
 from drivesplat.editing.shown_objects import parts_that_may_show
 from drivesplat.errors import ConfigError
-from drivesplat.lidar.moved_sensor import sensor_poses_of
+from drivesplat.lidar.moved_sensor import places_of_returns
 from drivesplat.lidar.objects_met import TrackedBoxes
 from drivesplat.model.scans import group_met, view_of_scan
 from drivesplat.model.splat_model import SplatModel
@@ -44,10 +44,7 @@ class SimulatedScan:
 
     def places(self) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
         """The returns in world coordinates, beam by beam, and the sensor's positions at their times, metres."""
-        offsets = self.sensor.scan.rays.offsets_s[self.returned].astype(np.float64)
-        poses = sensor_poses_of(self.sensor)(offsets)
-        seen = (self.sensor.scan.rays.directions() * self.rendered.ranges[..., None])[self.returned].astype(np.float64)
-        return np.einsum("nij,nj->ni", poses[:, :3, :3], seen) + poses[:, :3, 3], poses[:, :3, 3]
+        return places_of_returns(self.sensor, self.rendered.ranges, self.returned)
 
 
 @dataclass(frozen=True)

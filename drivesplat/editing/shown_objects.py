@@ -1,6 +1,6 @@
 """The annotated objects that renderings of a drive show: by Gaussians of their own, or with the background."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,21 +97,29 @@ class ShownObjects:
     def others_in(self, view: View, sets: Sequence[Gaussians], gaussians: Gaussians) -> list[SeenObject]:
         """Those of the others that a view shows, by the `sets` of Gaussians of the model's parts, as one
         `gaussians`."""
-        now, found = np.array([view.time]), []
+        found = (
+            _seen_object(self.model, gaussians, rows, box_of(item, view.time), view)
+            for item, rows in self.rows_of_others(view.time, sets, gaussians)
+        )
+        return [item for item in found if item is not None]
+
+    def rows_of_others(
+        self, time: float, sets: Sequence[Gaussians], gaussians: Gaussians
+    ) -> Iterator[tuple[EditedActor, Bool[Tensor, " n"]]]:
+        """Those of the others that are present at a time and may be shown, each with the Gaussians that show it: of the
+        parts that may show it those whose centres lie in its box. `sets` as in `others_in`."""
+        now = np.array([time])
         means, names = gaussians.means, [part.name for part in self.model.parts]
         part_of_row = torch.cat([torch.full((len(own),), i, device=means.device) for i, own in enumerate(sets)])
         for item, parts in zip(self.others, self.parts, strict=True):
             if not parts or not item.present(now)[0]:
                 continue
-            # of the Gaussians of these parts those whose centres lie in the box
             to_object, half = torch.from_numpy(inverse(item.poses(now)[0])).to(means), item.size / 2
             local = means @ to_object[:3, :3].T + to_object[:3, 3]
             floor = [MARGIN, MARGIN, -FLOOR_SHARE * item.size[2]]
             low, high = (torch.from_numpy(corner).to(means) for corner in (-half - floor, half + MARGIN))
             of_parts = torch.tensor([name in parts for name in names], device=means.device)[part_of_row]
-            rows = ((local > low) & (local < high)).all(dim=1) & of_parts
-            found.append(_seen_object(self.model, gaussians, rows, box_of(item, view.time), view))
-        return [item for item in found if item is not None]
+            yield item, ((local > low) & (local < high)).all(dim=1) & of_parts
 
 
 def parts_that_may_show(track: Track, model: SplatModel) -> frozenset[str]:
@@ -160,7 +168,4 @@ def _cropped(view: View, low: np.ndarray, high: np.ndarray) -> View:
     """The part of a view between two corners, which may lie outside of its image."""
     left, top = np.floor(low).astype(int).tolist()
     right, bottom = np.ceil(high).astype(int).tolist()
-    shifted = view.K.clone()
-    shifted[0, 2] -= left
-    shifted[1, 2] -= top
-    return replace(view, K=shifted, width=max(1, right - left), height=max(1, bottom - top))
+    return view.cropped(left, top, max(1, right - left), max(1, bottom - top))

@@ -74,6 +74,20 @@ class View:
         """This view without rolling shutter."""
         return self if self.shutter is None else replace(self, shutter=None)
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> "View":
+        """The part of the image whose first pixel is (`left`, `top`), which may lie outside of it."""
+        K, shutter = self.K.clone(), self.shutter
+        K[0, 2] -= left
+        K[1, 2] -= top
+        if shutter is not None:
+            along_x, along_y, middle = shutter.readout_s
+            offset = along_x * ((left + width / 2) / self.width - 0.5) + along_y * (
+                (top + height / 2) / self.height - 0.5
+            )
+            readout = torch.stack([along_x * width / self.width, along_y * height / self.height, middle + offset])
+            shutter = replace(shutter, readout_s=readout)
+        return replace(self, K=K, width=width, height=height, shutter=shutter)
+
     def rays(self) -> Float[Tensor, "h w 3"]:
         """The unit viewing direction of every pixel's centre in world coordinates, at the time of its line."""
         x = torch.arange(self.width, device=self.K.device) + 0.5
@@ -97,12 +111,13 @@ def view_of(record: TrainingRecord, index: int, device: torch.device) -> View:
         height=height,
         time=record.seconds(index),
         camera=record.camera_name(index),
-        shutter=_shutter(record.shutter(index), device),
+        shutter=rolling_shutter_of(record.shutter(index), device),
         seconds=torch.tensor(record.seconds(index), dtype=torch.float32, device=device),
     )
 
 
-def _shutter(recorded: Shutter | None, device: torch.device) -> RollingShutter | None:
+def rolling_shutter_of(recorded: Shutter | None, device: torch.device) -> RollingShutter | None:
+    """The shutter of an image on a device; None for a global shutter."""
     if recorded is None:
         return None
     readout, motion = (torch.from_numpy(values).float().to(device) for values in (recorded.readout_s, recorded.motion))

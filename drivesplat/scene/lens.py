@@ -22,6 +22,8 @@ from drivesplat.scene.sensors import Camera
 POLYNOMIALS = ("angle_to_radius", "radius_to_angle")
 SAMPLES = 20_000
 """Angles, or radii, at which the growth of the radius is tested and a polynomial inverted."""
+COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
+"""The numbers of coefficients that a distortion model may have; a polynomial may have any number above 0."""
 MAX_FOCAL_RATIO = 1.1
 """Maximum ratio between the focal length of K and that of a polynomial at the centre of the image."""
 
@@ -94,6 +96,16 @@ def radial_profile(camera: Camera) -> tuple[Float[np.ndarray, " m"], Float[np.nd
         grows = (np.diff(radii) > 0) & (np.diff(angles) > 0) & np.isfinite(radii[1:]) & (angles[1:] <= np.pi)
     end = 1 + int(np.argmin(grows)) if not grows.all() else SAMPLES
     return angles[:end], radii[:end]
+
+
+def coefficients_fault(model: str, count: int) -> str | None:
+    """What is wrong with `count` coefficients of a distortion model; None if nothing is."""
+    expected = COEFFICIENTS.get(model)
+    if expected is None and not count:
+        return f"distortion {model} has no coefficients; it takes one for each power, from the first on"
+    if expected is not None and count not in expected:
+        return f"distortion {model} has {count} coefficients; it takes {' or '.join(map(str, expected))}"
+    return None
 
 
 def lens_fault(camera: Camera) -> str | None:

@@ -22,6 +22,8 @@ case "$*" in
   --version) echo "Python 3.11.9" ;;
   "-m venv .venv") mkdir -p .venv/bin && cp "$FAKE_BIN/python3.11" .venv/bin/python ;;
   "-m pip check") ;;
+  *"--no-deps -e .") echo "command" >> "$FAKE_LOG"
+     [ -z "${FAKE_NO_COMMAND:-}" ] && cp "$FAKE_BIN/python3.11" .venv/bin/drivesplat ;;
   "-m pip "*) echo "pip ${*:3}" >> "$FAKE_LOG"; [ -z "${FAKE_PIP_FAILS:-}" ] ;;
   *torch_builds*) exec "$REAL_PYTHON" "$@" ;;
   *gsplat_build*) echo "gsplat_build ${*:3}" >> "$FAKE_LOG"; exit "${FAKE_BUILD_STATUS:-0}" ;;
@@ -101,7 +103,7 @@ def test_a_good_venv_is_left_alone_and_remade_for_other_requirements(machine):
     digest = hashlib.sha256(b"".join((REPOSITORY / name).read_bytes() for name in REQUIREMENTS)).hexdigest()
     assert machine.stamp.read_text().strip() == digest
     done = machine.done()
-    made = ["pip", "pip", "pip", "gsplat_build", "compileall", "warm_up", "warm_up"]
+    made = ["pip", "pip", "pip", "command", "gsplat_build", "compileall", "warm_up", "warm_up"]
     assert [line.split()[0] for line in done] == made
     assert done[2] == "pip install --quiet --no-deps nuscenes-devkit==1.2.0", "whatever numpy it asks for"
     second = machine.run()
@@ -114,8 +116,15 @@ def test_a_good_venv_is_left_alone_and_remade_for_other_requirements(machine):
     assert any("-r requirements.txt -r requirements-dev.txt -c constraints.txt" in line for line in machine.done())
 
 
+def test_who_cannot_install_the_command_goes_without_it_and_it_is_tried_again(machine):
+    failed = machine.run(FAKE_NO_COMMAND="1")
+    assert failed.returncode == 0 and "python -m drivesplat.cli.main" in failed.stderr and machine.stamp.exists()
+    machine.done()
+    assert machine.run().returncode == 0 and machine.done() == ["command"]
+
+
 def test_a_machine_that_cannot_train_is_reported_on_every_call(machine):
-    for begun in (["pip", "pip", "pip", "gsplat_build", "compileall", "warm_up"], ["compileall", "warm_up"]):
+    for begun in (["pip", "pip", "pip", "command", "gsplat_build", "compileall", "warm_up"], ["compileall", "warm_up"]):
         result = machine.run(FAKE_WARM_UP_FAILS="1")
         assert result.returncode == 0 and machine.begun() == begun, "who has a GPU may do without"
         assert "a first training or world on the processors fails" in result.stderr and "make doctor" in result.stderr

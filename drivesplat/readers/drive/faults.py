@@ -18,13 +18,12 @@ from drivesplat.readers.drive.format import Drive, Pose, TimedPose
 from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
 from drivesplat.readers.record_names import shown
-from drivesplat.scene.lens import lens_fault
+from drivesplat.scene.lens import coefficients_fault, lens_fault
 
 MAX_ELEVATION = 1.6
 """Maximum elevation of a beam in radians; degrees are mostly beyond it."""
 UNITS = {"seconds": 1e6, "milliseconds": 1e3, "nanoseconds": 1e-3}
 """Units that are taken for microseconds by mistake, and the microseconds in one."""
-COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 MAX_FROM_ORIGIN, MAX_SPAN = 10_000.0, 100_000.0
 """Metres from the origin, where it is given, to the first pose, and from there to any other: single precision, in which
 models are trained, has steps of 1 mm at the first distance and of 8 mm at the second."""
@@ -83,12 +82,10 @@ def _sensor_faults(drive: Drive) -> Iterator[str]:
             yield str(error)
             continue
         model, count = camera.distortion.model, len(camera.distortion.coefficients)
-        expected = COEFFICIENTS.get(model)
-        if expected is None and not count:
-            yield f"{where}: distortion {model} has no coefficients; it takes one for each power, from the first on"
-        elif expected is not None and count not in expected:
-            yield f"{where}: distortion {model} has {count} coefficients; it takes {' or '.join(map(str, expected))}"
-        elif model != "none" and (fault := lens_fault(camera.sensor(name))):
+        fault = coefficients_fault(model, count)
+        if fault is None and model != "none":
+            fault = lens_fault(camera.sensor(name))
+        if fault is not None:
             yield f"{where}: {fault}"
     yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()), MAX_MOUNT)
     for name, lidar in drive.lidars.items():

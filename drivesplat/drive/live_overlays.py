@@ -1,0 +1,92 @@
+"""What a live viewer draws over its pictures: recorded cameras, the boxes of objects, and LiDAR returns."""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drivesplat.drive.live_view import LiveView
+from drivesplat.drive.pictures import number_colors
+
+FRUSTUM_EVERY = 5
+"""Every this many-th key frame is drawn as a camera."""
+_CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+EDGES = np.array([(a, b) for a, b in itertools.combinations(_CORNERS, 2) if np.abs(a - b).sum() == 1.0])
+"""The edges (12, 2, 3) of a box with edges of length 1."""
+MAX_POINTS = 100_000
+"""LiDAR returns that are sent at once."""
+STATIC_COLOR = 220
+"""The grey level of returns of what is no object."""
+
+
+class Overlays:
+    """The nodes of viser's scene `nodes` for a view. `select` is called with the id of an object that is clicked."""
+
+    def __init__(self, nodes: Any, view: LiveView, select: Callable[[str], None]):
+        self._nodes, self._view, self._select = nodes, view, select
+        self._boxes: dict[str, list[Any]] = {}
+        self._frustums = nodes.add_frame("/cameras", show_axes=False, visible=False)
+        for number, frame in enumerate(view.session.drive.scene.frames):
+            if frame.is_key_frame and frame.sample_index % FRUSTUM_EVERY == 0:
+                pose, fov = frame.camera_to_world, 2.0 * np.arctan(0.5 * frame.height / frame.intrinsics[1, 1])
+                nodes.add_camera_frustum(
+                    f"/cameras/{number}", float(fov), frame.width / frame.height, scale=0.5,
+                    wxyz=wxyz_of(pose), position=pose[:3, 3],
+                )  # fmt: skip
+
+    def show_cameras(self, visible: bool) -> None:
+        """Shows or hides the recorded cameras."""
+        self._frustums.visible = visible
+
+    def draw_boxes(self, visible: bool) -> None:
+        """Draws the boxes of the objects that can be edited, at the time of the view."""
+        state = self._view.drive.state(self._view.time, outside="clamp")
+        shown = dict(state.actors.items()) if visible else {}
+        for name in self._boxes.keys() - shown.keys():
+            for handle in self._boxes.pop(name):
+                handle.remove()
+        for name, actor in shown.items():
+            pose = actor.pose
+            if name not in self._boxes:
+                self._boxes[name] = self._new_box(name, actor.size)
+            for handle in self._boxes[name]:
+                handle.position, handle.wxyz = pose[:3, 3], wxyz_of(pose)
+
+    def _new_box(self, name: str, size: np.ndarray) -> list[Any]:
+        objects, table = self._view.session.objects, self._view.session.drive.actors
+        color = tuple(number_colors(len(objects))[objects.index(name)].tolist())
+        key, edges = f"/objects/{name.replace('/', '_')}", tuple(size.tolist())
+        box = self._nodes.add_box(f"{key}/box", color, edges, opacity=0.15)
+        lines = self._nodes.add_line_segments(f"{key}/lines", size * EDGES, colors=color)
+        label = self._nodes.add_label(f"{key}/label", describe(table, name))
+        box.on_click(lambda _: self._select(name))
+        return [box, lines, label]
+
+    def draw_points(self, visible: bool) -> None:
+        """Draws the returns of the first LiDAR at the time of the view, in the colours of their objects."""
+        if not visible:
+            self._nodes.remove_by_name("/lidar")
+            return
+        drive = self._view.drive
+        scan = drive.scan(drive.lidars[0], self._view.time, outside="clamp")
+        arrays, points = scan.arrays(), scan.points()
+        numbers = arrays["instance"][arrays["returned"]]
+        chosen = slice(None, None, max(1, len(points) // MAX_POINTS))
+        static = np.full((1, 3), STATIC_COLOR, dtype=np.uint8)
+        colors = np.concatenate([number_colors(len(scan.objects)), static])  # -1 finds the last
+        self._nodes.add_point_cloud(
+            "/lidar", points[chosen].astype(np.float32), colors[numbers[chosen]], point_size=0.06
+        )
+
+
+def describe(table: Any, name: str) -> str:
+    """An object in words, from the table `TrainedDrive.actors`."""
+    known = table.loc[name]
+    return f"{known['class']} {name[:8]}, up to {known['speed']:.0f} m/s"
+
+
+def wxyz_of(pose: np.ndarray) -> np.ndarray:
+    """The quaternion (4,) of a pose (4, 4), w first."""
+    return Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)

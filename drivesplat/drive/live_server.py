@@ -1,0 +1,178 @@
+"""The live viewer in the browser: viser's window and controls, with images that this process renders.
+
+viser is an optional package (docs/live_viewer.md). Images are small while something moves, and have the size of the window
+when it rests.
+"""
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drivesplat.drive.edit_session import EditSession
+from drivesplat.drive.live_controls import LiveControls
+from drivesplat.drive.live_overlays import wxyz_of
+from drivesplat.drive.live_view import FreeCamera, LiveView
+from drivesplat.drive.trained_drive import TrainedDrive
+from drivesplat.errors import DriveSplatError, RequestError
+from drivesplat.scene.rigid import rigid
+
+log = logging.getLogger(__name__)
+
+REST_S = 0.3
+"""Seconds without a change after which an image has the size of the window."""
+SMALL, LARGEST = 320, 1920
+"""Width in pixels of the images of a CPU while something moves, and of the largest images."""
+MOVING_SHARE = 0.5
+"""Share of the window's width that images of a GPU have while something moves."""
+QUALITY = {False: 80, True: 95}
+"""JPEG quality of images while something moves, and at rest."""
+POLL_S, PAUSE_S = 0.005, 1.0
+"""Seconds between two looks for changes, and after an error."""
+FIRST_FOV = 1.0
+"""Vertical field of view in radians of a window that follows no camera."""
+
+
+@dataclass
+class WindowState:
+    """The image of a browser window: what it `shows`, since when, and whether it has the size of the window."""
+
+    shows: tuple = ()
+    since: float = 0.0
+    whole: bool = True
+
+
+class LiveServer:
+    """A live viewer of one or several methods of a drive. `url` is its address, by default on this machine alone.
+
+    Edits are written into `edits_file`. `close` ends it. Raises RequestError where viser is missing or the port is in
+    use, and for methods of different scenes.
+
+    >>> server = LiveServer([drivesplat.open("results/demo/street")])
+    >>> server.wait()
+    """
+
+    def __init__(
+        self,
+        drives: Sequence[TrainedDrive],
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        edits_file: str | Path = "my_edits.yaml",
+    ):
+        view = LiveView([EditSession(drive) for drive in drives])
+        viser = _viser()
+        _require_free(host, port)
+        self._server = viser.ViserServer(host=host, port=port, verbose=False, label="drivesplat")
+        self._server.scene.set_up_direction("+z")
+        self.url = f"http://{host}:{port}"
+        self.view, self.controls = view, LiveControls(self._server, view, Path(edits_file))
+        self._closed, self._windows = threading.Event(), dict[int, WindowState]()
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(lambda client: self._windows.pop(client.client_id, None))
+        self._worker = threading.Thread(target=self._work, name="drivesplat-viewer", daemon=True)
+        self._worker.start()
+
+    def wait(self) -> None:
+        """Returns when the viewer has been closed."""
+        while not self._closed.wait(PAUSE_S):
+            pass
+
+    def close(self) -> None:
+        """Ends the server."""
+        self._closed.set()
+        self._worker.join()
+        self._server.stop()
+
+    def _connected(self, client: Any) -> None:
+        with self.controls.lock:
+            followed, drive = self.view.followed(), self.view.drive
+            if followed is None and drive.cameras:
+                pose = self.view.session.drive.camera_to_world(drive.cameras[0], 0.0)
+                followed = FreeCamera(pose, FIRST_FOV)
+        if followed is not None:
+            _set_camera(client.camera, followed)
+        self._windows[client.client_id] = WindowState()
+
+    def _work(self) -> None:
+        last, drawn = time.monotonic(), -1
+        while not self._closed.wait(POLL_S):
+            now = time.monotonic()
+            try:
+                with self.controls.lock:
+                    self.controls.advance(now - last)
+                    if drawn != self.controls.version:
+                        drawn = self.controls.version
+                        self.controls.draw_overlays()
+                last = now
+                for client in self._server.get_clients().values():
+                    self._show(client)
+            except DriveSplatError as error:
+                log.warning("%s", error)
+                self.controls.say(str(error))
+                self._closed.wait(PAUSE_S)
+
+    def _show(self, client: Any) -> None:
+        """Renders the image of a window, if anything has changed or come to rest."""
+        window, camera, now = self._windows.get(client.client_id), client.camera, time.monotonic()
+        if window is None or not camera.image_height:
+            return
+        with self.controls.lock:
+            followed, version = self.view.followed(), self.controls.version
+        if followed is not None:
+            free = followed
+        else:
+            turn = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
+            free = FreeCamera(rigid(turn, np.array(camera.position)), float(camera.fov))
+        size = camera.image_width, camera.image_height
+        shows = version, free.camera_to_world.tobytes(), free.vertical_fov, size
+        moved = shows != window.shows
+        if not moved and (window.whole or now - window.since < REST_S):
+            return
+        with self.controls.lock:
+            picture = self.view.picture(free, *self._size_of(size, whole=not moved))
+        client.scene.set_background_image(picture, format="jpeg", jpeg_quality=QUALITY[not moved])
+        if followed is not None:
+            _set_camera(camera, followed)
+        window.shows, window.whole = shows, not moved
+        window.since = now if moved else window.since
+
+    def _size_of(self, window: tuple[int, int], whole: bool) -> tuple[int, int]:
+        """The width and height of an image in pixels for a window of this size."""
+        width = min(window[0], LARGEST)
+        if not whole:
+            on_cpu = self.view.session.drive.device.type == "cpu"
+            width = min(width, SMALL if on_cpu else max(SMALL, round(MOVING_SHARE * width)))
+        return width, max(1, round(width * window[1] / window[0]))
+
+
+def _set_camera(camera: Any, to: FreeCamera) -> None:
+    """Moves the camera of a window."""
+    pose = to.camera_to_world
+    camera.position, camera.wxyz, camera.fov = pose[:3, 3], wxyz_of(pose), to.vertical_fov
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError:
+        raise RequestError(
+            "the live viewer needs the package viser: pip install 'viser>=1.1,<2' into the environment of drivesplat"
+        ) from None
+    return viser
+
+
+def _require_free(host: str, port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            reason = error.strerror or error
+            raise RequestError(f"the viewer cannot use {host}:{port} ({reason}); choose another --port") from None

@@ -1,0 +1,152 @@
+"""The recording of a trained drive: its scene, and the sensors that recorded it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from drivesplat.drive.cameras import PoseableCamera
+from drivesplat.drive.lidars import PoseableLidar
+from drivesplat.editing.ego import MAX_LEAD
+from drivesplat.editing.sensor_path import EgoPoses, recorded_ego
+from drivesplat.errors import RequestError
+from drivesplat.lidar.moved_sensor import sensor_poses_of
+from drivesplat.lidar.scans import SensorPoses
+from drivesplat.model.checkpoint import TrainedCheckpoint
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scan_record import RecordedScan, ScanRecords, read_scans
+from drivesplat.scene.scene import REFINED, Frame, Scene, read_scene
+from drivesplat.scene.shutter import readout_of
+from drivesplat.scene.training_record import TrainingRecord, read_training_record
+from drivesplat.settings.tracks import FOUND, TRACK_FOLDERS, Tracks
+from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, smooth_poses
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A scene with the tracks of a method, its training images, the outlines of the vehicle's own body in them, and the
+    file of its LiDAR scans, which may be missing. `where` names scene and method in messages. Times are seconds since
+    the first image."""
+
+    where: str
+    scene: Scene
+    record: TrainingRecord
+    ego_mask: EgoMask
+    scans_file: Path
+
+    @classmethod
+    def of_method(cls, folder: Path, checkpoint: TrainedCheckpoint) -> "Recording":
+        """The recording of the method with the result folder `folder`. Raises ResultError for missing files and those
+        of another version."""
+        results = folder.parent
+        tracks = [track.id for part in checkpoint.parts for track in part.tracks]
+        refined = "refine_poses" in checkpoint.provenance["stages"]
+        own: Tracks = "discovered" if any(track.startswith(FOUND) for track in tracks) else "annotated"
+        scene = read_scene(
+            results / (REFINED if refined and own == "annotated" else Path(TRACK_FOLDERS[own], "scene.json"))
+        )
+        # Images and rays are the same with any tracks.
+        of_tracks = [results / TRACK_FOLDERS[of] for of in (own, "none")]
+        parsers, scans = ([path / name for path in of_tracks] for name in ("parser.npz", "scans.npz"))
+        parser, scan = (next((path for path in paths if path.is_file()), paths[0]) for paths in (parsers, scans))
+        mask = results / "own_car.json"
+        ego_mask = read_ego_mask(mask)[0] if mask.is_file() else NO_EGO_MASK
+        where = f"scene {scene.name}, method {folder.name}"
+        return cls(where, scene, read_training_record(parser), ego_mask, scan)
+
+    @cached_property
+    def cameras(self) -> list[str]:
+        """The names of the recorded cameras."""
+        return list(dict.fromkeys(frame.camera for frame in self.scene.frames))
+
+    @cached_property
+    def lidars(self) -> list[str]:
+        """The names of the recorded LiDARs."""
+        return list(dict.fromkeys(sweep.lidar for sweep in self.scene.sweeps))
+
+    @cached_property
+    def duration(self) -> float:
+        """The time of the last image in seconds; of the last sweep without images."""
+        recordings = self.scene.frames or self.scene.sweeps
+        return self.scene.seconds(max(recording.timestamp for recording in recordings))
+
+    def checked(self, time: float) -> float:
+        """A time within the recording. Raises RequestError for any other."""
+        if not 0.0 <= time <= self.duration:
+            raise RequestError(
+                f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s; outside='clamp' "
+                "renders its start or its end"
+            )
+        return time
+
+    def camera(self, name: str, exposure: bool, rolling_shutter: bool) -> PoseableCamera:
+        """A recorded camera: see `TrainedDrive.camera`."""
+        index, frame = self.first_image(name)
+        width, height = self.record.image_size(index)
+        readout, known = np.zeros(3), {camera.name: camera for camera in self.scene.cameras}
+        if rolling_shutter and name in known and readout_of(known[name]).any():
+            readout = np.append(readout_of(known[name]), frame.readout_middle_s)
+        return PoseableCamera(
+            width, height, self.record.Ks[index].astype(np.float64), frame.camera_to_ego, name if exposure else None,
+            readout, covered=tuple(self.ego_mask.outlines.get(name, ())),
+        )  # fmt: skip
+
+    def first_image(self, name: str) -> tuple[int, Frame]:
+        """The first image of a camera and its index. Raises RequestError for an unknown camera."""
+        for index, frame in enumerate(self.scene.frames):
+            if frame.camera == name:
+                return index, frame
+        raise RequestError(f"{self.where} has no camera {name!r}; there are: {', '.join(self.cameras) or 'none'}")
+
+    def camera_to_world(self, name: str, time: float) -> Float64[np.ndarray, "4 4"]:
+        """The pose of a camera on the smooth path through its images. Raises RequestError for a time at which it did
+        not record."""
+        frames, stamps = recorded_frames(self.scene, name), recorded_timestamps(self.scene, name)
+        recorded = self.scene.seconds(stamps[0]) + (stamps - stamps[0]) * 1e-6
+        if not recorded[0] - MAX_LEAD <= self.checked(time) <= recorded[-1] + MAX_LEAD:
+            raise RequestError(
+                f"camera {name} recorded from {recorded[0]:.2f} to {recorded[-1]:.2f} s, not at {time:g} s"
+            )
+        poses = np.stack([frame.camera_to_world for frame in frames])
+        return smooth_poses(recorded * 1e6, poses, np.array([time]) * 1e6)[0]
+
+    @cached_property
+    def ego(self) -> EgoPoses:
+        """The poses of the vehicle."""
+        return recorded_ego(self.scene, self.cameras[0] if self.cameras else None)
+
+    @cached_property
+    def _scans(self) -> ScanRecords:
+        if not self.scans_file.is_file():
+            raise RequestError(
+                f"{self.where}: {self.scans_file} is missing, which has the rays of recorded LiDARs; give a LiDAR of "
+                "your own (drivesplat.Lidar), or make it with snakemake"
+            )
+        return read_scans(self.scans_file)
+
+    def nearest_scan(self, lidar: str, time: float) -> RecordedScan:
+        """The scan of a LiDAR that is nearest in time. Raises RequestError for an unknown LiDAR."""
+        if lidar not in self.lidars:
+            raise RequestError(f"{self.where} has no LiDAR {lidar!r}; there are: {', '.join(self.lidars) or 'none'}")
+        own = [scan for scan in self._scans.scans if scan.lidar == lidar]
+        if not own:
+            raise RequestError(f"{self.where}: {self.scans_file} has no scan of {lidar}: its rays are not known")
+        return min(own, key=lambda scan: abs(scan.seconds - time))
+
+    def lidar(self, name: str, time: float) -> PoseableLidar:
+        """A recorded LiDAR with the rays of its scan that is nearest in time, and its mount."""
+        scan = self.nearest_scan(name, time)
+        ego = self.ego(np.array([scan.seconds]))[0]
+        return PoseableLidar(scan.scan.rays, inverse(ego) @ scan.sensor_to_world, scan.blocked)
+
+    def carried(self, scan: RecordedScan, ego: EgoPoses, time: float) -> SensorPoses:
+        """The poses of the sensor of a recorded scan at a time, on a vehicle that drives as `ego` says."""
+        sensor = sensor_poses_of(scan)
+
+        def at(offsets: np.ndarray) -> np.ndarray:
+            return ego(time + offsets) @ inverse(self.ego(scan.seconds + offsets)) @ sensor(offsets)
+
+        return at
