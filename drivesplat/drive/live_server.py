@@ -1,7 +1,7 @@
 """The live viewer in the browser: viser's window and controls, with images that this process renders.
 
-viser is an optional package (docs/live_viewer.md). Images are small while something moves, and have the size of the window
-when it rests.
+viser is an optional package (docs/live_viewer.md). Images are small while something moves, and have the size of the
+window when it rests.
 """
 
 import logging

@@ -12,7 +12,7 @@ from drivesplat.drive.pose_files import read_poses
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
 from drivesplat.io.storage import write_json
-from drivesplat.readers.truth import DEPTH_LIMIT, DEPTH_UNITS_PER_METRE
+from drivesplat.rendering.labels import depth_units, numbered
 from drivesplat.scene.images import write_png
 
 WRITTEN = ("rgb", "depth", "instance")
@@ -65,7 +65,4 @@ def _pixels(view: DriveView, name: str, numbers: dict[str, int]) -> np.ndarray:
     if name == "rgb":
         return view.image
     values = view.arrays()[name]
-    if name == "depth":
-        return np.clip(values * DEPTH_UNITS_PER_METRE + 0.5, 0, DEPTH_LIMIT).astype(np.uint16)
-    table = np.array([*(numbers[item] for item in view.objects), 0], dtype=np.uint16)  # the last is what -1 finds
-    return table[values]
+    return depth_units(values) if name == "depth" else numbered(values, [numbers[item] for item in view.objects])

@@ -16,11 +16,11 @@ from drivesplat.drive.world_actor import WorldActor
 from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_object
 from drivesplat.errors import RequestError
 from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.groups import strongest_group
 from drivesplat.model.scans import group_met, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN, Want, want_of
 from drivesplat.model.view import View
+from drivesplat.rendering.labels import objects_in_view, strongest_in_view
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.tracks import Box
@@ -129,25 +129,10 @@ class SampledWorld:
             assert depth is not None
             found["depth"] = depth
         if "instance" in outputs:
-            found["instance"] = self._instances(view)
+            found["instance"] = objects_in_view(self.model, self._placed(view)[1], view)
         if "semantic" in outputs:
             found["semantic"] = self._classes(view)
         return {name: values for name, values in found.items() if name in outputs}
-
-    def _strongest(self, groups: Tensor, gaussians: Gaussians, view: View) -> Int16[Tensor, "h w"]:
-        """The group of Gaussians that contributes most to each pixel; -1 where the sky does."""
-
-        def composited(shares: Tensor) -> Tensor:
-            return self.model.composited(gaussians, shares.to(gaussians.means), view).image.squeeze(0)
-
-        sky = 1.0 - self.model.composited(gaussians, gaussians.means.new_ones(len(gaussians), 1), view).alpha
-        return strongest_group(groups, composited, sky.squeeze((0, 3))).to(torch.int16)
-
-    def _instances(self, view: View) -> Int16[Tensor, "h w"]:
-        _, gaussians = self._placed(view)
-        if gaussians.placement is None:
-            return torch.full((view.height, view.width), -1, dtype=torch.int16, device=self.device)
-        return self._strongest(gaussians.placement, gaussians, view)
 
     def _classes(self, view: View) -> Int16[Tensor, "h w"]:
         sets, gaussians = self._placed(view)
@@ -164,7 +149,7 @@ class SampledWorld:
             rows = torch.where(gaussians.placement >= 0, own, rows)
         for item, shown in self.static.rows_of_others(self.time, sets, gaussians):
             rows[shown] = number[self.class_of[item.source].value]
-        return self._strongest(rows, gaussians, view).clamp(min=0)
+        return strongest_in_view(self.model, gaussians, rows, view).clamp(min=0)
 
     def _boxes(self, view: View) -> Iterator[ObjectBox]:
         sets, gaussians = self._placed(view)

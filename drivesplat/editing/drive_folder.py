@@ -1,27 +1,34 @@
 """The stage `drive_folder`: writes a rendered drive as a dataset: images, poses, calibration and boxes."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+import numpy as np
+import torch
 from PIL import Image
 
 from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
-from drivesplat.editing.render_plan import image_render_plan
+from drivesplat.editing.render_plan import ImageRenderPlan, image_render_plan
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.storage import Provenance, atomic_write, write_json
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import Want
 from drivesplat.readers.drive.write import write_record
 from drivesplat.readers.nuscenes.write import write_nuscenes
 from drivesplat.rendering.frames import film_frames
+from drivesplat.rendering.labels import depth_units, numbered, objects_in_view
+from drivesplat.scene.images import write_png
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import last_training_timestamp
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.export import DriveJob
+from drivesplat.settings.export import DriveJob, DriveLabel
 
 TABLES, VERSION = "nuscenes", "v1.0-rendered"
 """The folder of the nuScenes dataset in a drive folder, and the name of its version."""
@@ -59,6 +66,7 @@ def write_rendered_drive(
             for frame, pixels in zip(drive.scene.frames, prefetch_items(pictures), strict=True):
                 with atomic_write(Path(frame.image_path)) as file:
                     Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)
+            instances = _write_label_images(folder, model, drive, job.labels, device)
             trained_until = last_training_timestamp(scene, job.eval_camera, job.holdout)
             drive, labels = labelled(scene, drive, trained_until, device, what)
         marked = replace(
@@ -69,7 +77,8 @@ def write_rendered_drive(
         )
         steps = None if job.edit is None else job.edit.model_dump(mode="json", exclude_none=True)["steps"]
         rendered: dict[str, Any] = {
-            **source, "steps": steps, "trained_until": labels.trained_until, "shown_by": labels.shown_by
+            **source, "steps": steps, "trained_until": labels.trained_until, "shown_by": labels.shown_by,
+            **({"instances": instances} if "instances" in job.labels else {}),
         }  # fmt: skip
         log = {"logfile": "rendered-by-drivesplat", "vehicle": "rendered", "date_captured": "", "location": what}
         write_nuscenes(marked, labels, folder / TABLES, VERSION, log)
@@ -80,8 +89,36 @@ def write_rendered_drive(
         raise
 
 
+@torch.no_grad()
+def _write_label_images(
+    folder: Path, model: SplatModel, drive: ImageRenderPlan, labels: Sequence[DriveLabel], device: torch.device
+) -> dict[str, int]:
+    """Writes the depth and the objects of every image as 16-bit images, as `labels` say; returns the numbers of objects
+    in these by id."""
+    actors = drive.objects.actors
+    numbers = {actor.id: number for number, actor in enumerate(actors, start=1)}
+    if not labels:
+        return numbers
+    placed = actor_placements(actors, drive.seconds)
+    for frame, view, own in zip(drive.scene.frames, drive.views(device), placed, strict=True):
+        gaussians = model.at(view.time, Want(placements=tuple(own)))
+        image = Path(frame.image_path)
+        named = {label: folder / label / image.parent.name / f"{image.stem}.png" for label in labels}
+        for path in named.values():
+            path.parent.mkdir(parents=True, exist_ok=True)
+        if "depth" in named:
+            depth = model.render(view, gaussians=gaussians, with_surface_depth=True).surface_depth
+            assert depth is not None
+            write_png(named["depth"], depth_units(depth.cpu().numpy()))
+        if "instances" in named:
+            present = [actor for actor in actors if actor.present(np.array([view.time]))[0]]
+            shown = objects_in_view(model, gaussians, view).cpu().numpy()
+            write_png(named["instances"], numbered(shown, [numbers[actor.id] for actor in present]))
+    return numbers
+
+
 def _remove(folder: Path) -> None:
     """Removes the images and tables of an earlier or a failed run."""
-    for part in (folder / "images", folder / TABLES):
+    for part in (folder / "images", folder / TABLES, *(folder / label for label in get_args(DriveLabel))):
         if part.exists():
             shutil.rmtree(part)

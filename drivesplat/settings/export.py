@@ -11,6 +11,7 @@ from drivesplat.settings.render import TrajectorySettings
 
 ExportFormat = Literal["ply", "usd", "viewer", "colmap", "spz", "sog"]
 ScanFormat = Literal["npz", "ply", "pcd.bin"]
+DriveLabel = Literal["depth", "instances"]
 
 MAX_DISTANCE = 1000.0
 """Metres from the origin of the world beyond which no export holds a Gaussian: what lies there is the sky's."""
@@ -37,6 +38,8 @@ class ExportSettings(Settings):
     """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
     drive_width: int | None = Field(None, ge=16, le=7680)
     """:printed: Width in pixels of the images in rendered drive folders. null: that of the training images."""
+    drive_labels: tuple[DriveLabel, ...] = ()
+    """Label images in rendered drive folders, beside each image: 'depth' and 'instances' (docs/editing.md)."""
     viewer_images: int = Field(640, ge=0, le=3840)
     """Width in pixels of the recorded images in viewer.html, one JPEG per key frame, about 30 KB each at 640. 0 = none.
     """
@@ -83,13 +86,15 @@ class SplatJob(Settings):
 
 class DriveJob(Settings):
     """All settings that determine one rendered drive folder: the `edit` of its drive, or the `trajectory` beside the
-    recorded one. `width` is that of its images in pixels; None: that of the training images."""
+    recorded one. `width` is that of its images in pixels; None: that of the training images. `labels` are the kinds of
+    label images to write."""
 
     eval_camera: str
     cameras: tuple[str, ...]
     images: ImageSettings
     holdout: HoldoutSettings
     width: int | None = None
+    labels: tuple[DriveLabel, ...] = ()
     edit: Edit | None = None
     trajectory: TrajectorySettings | None = None
 

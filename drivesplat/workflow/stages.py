@@ -275,6 +275,12 @@ def _edit_or_trajectory(at: JobScope) -> dict[str, Any]:
     return {"edit": _quad(of_film)["edit"]} if kind == EDITS else {"trajectory": _film(of_film)["trajectory"]}
 
 
+def _drive_folder(at: JobScope) -> dict[str, Any]:
+    """Of a `DriveJob`; raises as `_quad` or `_film`."""
+    export = at.config.export
+    return {**_edit_or_trajectory(at), "width": export.drive_width, "labels": export.drive_labels}
+
+
 def _scan_folder(at: JobScope) -> dict[str, Any]:
     """Of a `ScanFolderJob`; raises as `_quad` or `_film`, and ConfigError for an edit of a scene without cameras."""
     camera = at.config.eval_camera if at.config.cameras else None
@@ -323,7 +329,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "truth_film": (CompareJob, _encoding),
     "edit": (EditJob, lambda at: {**_quad(at), "frames": at.config.render.edited_frames}),
     "quad": (EditJob, _quad),
-    "drive_folder": (DriveJob, lambda at: {**_edit_or_trajectory(at), "width": at.config.export.drive_width}),
+    "drive_folder": (DriveJob, _drive_folder),
     "scan_folder": (ScanFolderJob, _scan_folder),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),

@@ -109,6 +109,7 @@ def test_the_folder_has_no_faults_and_says_that_it_was_rendered(busy, scene):
     assert drive.rendered.model_dump(exclude={"steps", "trained_until", "shown_by", "provenance"}) == {
         **SOURCE,
         "trajectory": None,
+        "instances": None,
     }
     assert [list(step) for step in drive.rendered.steps] == [["shift"], ["duplicate"], ["remove"], ["rescale"]]
     assert drive.rendered.provenance == {"stage": "drive_folder"}
@@ -138,6 +139,31 @@ def test_images_are_at_the_recorded_times_and_places_and_equal_the_model_s_rende
     assert np.abs(pixels - expected).mean() < 3.0
     without = shown_by(model, frame, scene, [])
     assert np.abs(pixels - without).mean() > 2 * np.abs(pixels - expected).mean()
+
+
+@pytest.mark.parametrize("steps", [(), STEPS])
+def test_label_images_show_where_objects_are_and_how_far(steps, scene, model, tmp_path):
+    """The pixels of an object are those that change most where it is removed; depths there are those of its box."""
+    job = a_job(*steps, trajectory=None if steps else TrajectorySettings())
+    folder = written(scene, model, tmp_path, job.model_copy(update={"labels": ("depth", "instances")}))
+    read_back, numbers = as_read(folder), read_drive(folder).rendered.instances
+    assert set(numbers) >= {AHEAD, GONE} and ("twin" in numbers) == bool(steps)
+    frame = read_back.frames[1]
+    name = Path(frame.image_path).with_suffix(".png").name
+    depth, instances = (np.asarray(Image.open(folder / kind / "CAM_FRONT" / name)) for kind in ("depth", "instances"))
+    assert depth.dtype == instances.dtype == np.uint16 and depth.shape == (frame.height, frame.width)
+    seconds = scene.seconds(frame.timestamp)
+    others = [] if steps else [ActorPlacement(TURNING)]
+    shift = ASIDE if steps else np.eye(4)
+    own = ActorPlacement(AHEAD, straight(seconds) @ shift, 1.0)
+    more = [ActorPlacement(AHEAD, straight(seconds - 6.0 / SPEED) @ shift, 1.0)] if steps else others
+    changed = np.abs(
+        shown_by(model, frame, scene, [own, *more]) - shown_by(model, frame, scene, more)
+    ).max(axis=2)  # fmt: skip
+    mine = instances == numbers[AHEAD]
+    assert mine.any() and (changed[mine] > 0).all() and changed[mine].mean() > 4 * changed[~mine].mean()
+    ahead = np.linalg.norm((straight(seconds) @ shift)[:2, 3] - frame.camera_to_world[:2, 3])
+    assert np.median(depth[mine]) / 256.0 == pytest.approx(ahead, abs=2.5)
 
 
 def test_tracks_hold_every_object_after_the_edit_at_key_frames_and_between(busy, scene):
