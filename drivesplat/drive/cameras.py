@@ -3,12 +3,14 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from drivesplat.drive.lenses import LensFace, faces_of
 from drivesplat.errors import DatasetError, RequestError
 from drivesplat.model.view import View, rolling_shutter_of
 from drivesplat.readers.checks import checked_intrinsics, checked_size, checked_transform
@@ -96,6 +98,11 @@ class PoseableCamera:
         """The lens as scenes describe it: with integer coordinates at the centres of pixels."""
         shifted = self.K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
         return Camera("", self.width, self.height, shifted, self.distortion, distortion_model=self.distortion_model)
+
+    @cached_property
+    def faces(self) -> list[LensFace]:
+        """The pinhole images that a distorted image is resampled from."""
+        return faces_of(self.lens)
 
     def resized(self, width: int) -> "PoseableCamera":
         """The same field of view in images of another width."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from drivesplat.drive.cameras import PlacedCamera
 from drivesplat.drive.drive_scan import DriveScan
 from drivesplat.drive.drive_view import DriveView, ObjectBox
-from drivesplat.drive.lenses import faces_of, resampled
+from drivesplat.drive.lenses import resampled
 from drivesplat.drive.world_actor import WorldActor
 from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_object
 from drivesplat.errors import RequestError
@@ -63,13 +63,13 @@ class SampledWorld:
         if camera.distorted:
             if "boxes" in outputs:
                 raise RequestError("boxes are those of a pinhole camera: leave them out for a distorted one")
-            faces = faces_of(camera, view)
-            shown = [self._tensors(face.view, outputs) for face in faces]
+            faces = camera.faces
+            shown = [self._tensors(face.view(view), outputs) for face in faces]
             found = {
                 name: resampled(faces, [own[name] for own in shown], name not in INTERPOLATED, name == "depth")
                 for name in shown[0]
             }
-            seen = torch.stack([face.shows for face in faces]).any(dim=0)
+            seen = torch.stack([face.shows for face in faces]).any(dim=0).to(self.device)
         else:
             rows = max(1, MAX_PIXELS // view.width)
             bands = [(top, min(rows, view.height - top)) for top in range(0, view.height, rows)]

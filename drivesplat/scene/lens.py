@@ -14,12 +14,16 @@ Radii of the two polynomials are measured along x; K scales y by fy / fx.
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from numpy.polynomial import polynomial
 
 from drivesplat.scene.sensors import Camera
 
 POLYNOMIALS = ("angle_to_radius", "radius_to_angle")
+STEPS, STEP = 8, 1e-4
+"""Iterations of Newton's method for the direction of a pixel, and the step in radians of its differences."""
+MAX_ERROR = 0.05
+"""Pixels by which the image of a direction may miss its pixel; a farther one has no direction."""
 SAMPLES = 20_000
 """Angles, or radii, at which the growth of the radius is tested and a polynomial inverted."""
 COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
@@ -69,6 +73,36 @@ def pixels_of(camera: Camera, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
         radius = np.interp(angles, tested, radii)
         pixels = radius[:, None] * along * [1.0, k[1, 1] / k[0, 0]] + k[:2, 2]
     return np.where(seen[:, None], pixels, np.nan)
+
+
+def directions(camera: Camera) -> Float64[np.ndarray, "h w 3"]:
+    """The unit direction of every pixel of a distorted camera (x right, y down, z forward); NaN where it has none."""
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
+    k = central_intrinsics(camera)
+    across = (pixels - camera.intrinsics[:2, 2]) / [1.0, k[1, 1] / k[0, 0]]
+    radius = np.linalg.norm(across, axis=1)
+    known, radii = radial_profile(camera)
+    angles = np.interp(radius, radii, known)
+    turn = angles[:, None] * across / np.maximum(radius, 1e-12)[:, None]  # the angle, towards the pixel
+    for _ in range(STEPS):
+        found = pixels_of(camera, _turned(turn))
+        by_x, by_y = (pixels_of(camera, _turned(turn + step)) for step in (np.array([STEP, 0.0]), [0.0, STEP]))
+        slopes = np.stack([by_x - found, by_y - found], axis=-1) / STEP
+        determinant = np.linalg.det(slopes)
+        missing = ~(np.abs(determinant) > 1e-9)
+        slopes[missing] = np.eye(2)
+        turn = turn + np.where(missing[:, None], 0.0, np.linalg.solve(slopes, (pixels - found)[..., None])[..., 0])
+    rays = _turned(turn)
+    missed = ~(np.linalg.norm(pixels_of(camera, rays) - pixels, axis=1) < MAX_ERROR)
+    rays[missed] = np.nan
+    return rays.reshape(camera.height, camera.width, 3)
+
+
+def _turned(turn: np.ndarray) -> np.ndarray:
+    """The optical axis turned by angles (n, 2) in radians towards the right and down."""
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    return np.hstack([turn * np.sinc(angle / np.pi), np.cos(angle)])
 
 
 def radial_profile(camera: Camera) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:

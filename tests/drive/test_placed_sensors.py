@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 import drivesplat
 from drivesplat.drive import sampled_world
 from drivesplat.drive.cameras import mounted_velocity
-from drivesplat.drive.lenses import directions
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.drive.world_state import WorldState
 from drivesplat.editing.scans import scan_render_plan
 from drivesplat.errors import DriveSplatError, RequestError, ResultError
 from drivesplat.lidar.moved_sensor import steady_motion
-from drivesplat.scene.lens import pixels_of
+from drivesplat.scene.lens import directions, pixels_of
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.export import ScanFolderJob
