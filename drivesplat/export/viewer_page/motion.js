@@ -1,6 +1,8 @@
-// Where the instances and the camera of a drive are at a second, and how instances deform. Poses are 12 values: three rows of [rotation | place].
+// Where the instances and the camera of a drive are at a second, and how instances deform. Poses are 12 values: three
+// rows of [rotation | place].
 
-// The row of `width` values between two samples, interpolated entry by entry: samples are dense enough for a millimetre.
+// The row of `width` values between two samples, interpolated entry by entry: samples are dense enough for a
+// millimetre.
 function rowBetween(seconds, values, width, [first, last], second) {
   let [low, high] = [first, last - 1];
   while (high - low > 1) {

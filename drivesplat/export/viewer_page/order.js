@@ -25,7 +25,9 @@ function depthOrder({ centers, modes, largest }, near) {
         depths[i] = ax * centers[j] + ay * centers[j + 1] + az * centers[j + 2] + offset;
       }
       const after = row + end - begin;
-      if (weights) addShifts(depths.subarray(row, after), [ax, ay, az], modes, 6 * weights.length * first, weights, largest);
+      if (weights) {
+        addShifts(depths.subarray(row, after), [ax, ay, az], modes, 6 * weights.length * first, weights, largest);
+      }
       for (let i = row; i < after; i++) if (depths[i] > near) ahead[shown++] = i;
     });
     radixPass(ahead, partly, shown, low, starts);

@@ -15,7 +15,9 @@ function answerSorts(near) {
 
 // A worker that sorts, made of this page's own functions: it needs no file and no network. Null where it is refused.
 function sortingWorker(shapes, near) {
-  const source = [`"use strict"; const dot = ${dot};`, radixPass, addShifts, depthOrder, answerSorts, `answerSorts(${near});`];
+  const source = [
+    `"use strict"; const dot = ${dot};`, radixPass, addShifts, depthOrder, answerSorts, `answerSorts(${near});`,
+  ];
   try {
     const address = URL.createObjectURL(new Blob([source.join("\n")], { type: "text/javascript" }));
     const worker = new Worker(address);
@@ -28,7 +30,8 @@ function sortingWorker(shapes, near) {
 
 // What an order depends on, as numbers: equal ones need no new order.
 function sortKey(axis, position, ranges) {
-  return [...axis, ...position, ...ranges.flatMap(({ row, pose, weights }) => [row, ...(pose || [NaN]), ...(weights || [])])];
+  const numbers = ({ row, pose, weights }) => [row, ...(pose || [NaN]), ...(weights || [])];
+  return [...axis, ...position, ...ranges.flatMap(numbers)];
 }
 
 const sameKey = (a, b) => a.length === b.length && a.every((x, i) => Object.is(x, b[i]));
