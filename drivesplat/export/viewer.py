@@ -21,6 +21,7 @@ from drivesplat.export import viewer_page as template
 from drivesplat.export.modes import fitted_modes
 from drivesplat.export.thinning import thinned_groups
 from drivesplat.export.trained_parts import trained_groups
+from drivesplat.export.viewer_boxes import box_motions
 from drivesplat.export.viewer_scene import ViewerContent, recorded_path, scene_record
 from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import Provenance, atomic_write
@@ -50,20 +51,20 @@ def export_viewer(
     edits: Sequence[SampledEdit],
     provenance: Provenance,
 ) -> None:
-    """Writes the page with the `job.gaussians` Gaussians of a checkpoint that have the largest coverage, viewed from
-    the middle key frame of `job.eval_camera`.
+    """Writes the page with the `job.gaussians` Gaussians of a checkpoint that have the largest coverage, viewed along
+    the path of `job.eval_camera`.
 
-    Objects move as recorded or as one of `edits` says, in the colours of the shown time. Raises DatasetError
-    if the scene has no key frame of that camera or one of their images cannot be read.
+    Objects move as recorded or as one of `edits` says, in the colours of the shown time. Raises DatasetError if the
+    scene has no image of that camera or one of its key frames cannot be read.
     """
-    model, recorded = trained_model(checkpoint), recorded_path(scene, job.eval_camera)
+    model, recorded = trained_model(checkpoint), recorded_path(scene, record, job.eval_camera)
     groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera), job.time_s)
     kept = thinned_groups(groups, job.gaussians)
     content = ViewerContent(
         kept, model.sky, model.antialiased, recorded,
         edits=edits,
         images=key_frame_images(scene, record, job.eval_camera, job.image_width),
-        method=method, methods=job.methods, modes=fitted_modes(model, kept),
+        method=method, methods=job.methods, modes=fitted_modes(model, kept), boxes=box_motions(scene, kept),
     )  # fmt: skip
     page = viewer_page(content, f"{scene.name} · {method}", provenance)
     with atomic_write(path) as file:
@@ -73,8 +74,8 @@ def export_viewer(
 
 
 def viewer_page(content: ViewerContent, title: str, provenance: Provenance) -> str:
-    """The text of the page, deterministic. Its first view is that of the path's `start`; without a sky the background
-    is black."""
+    """The text of the page, deterministic. Its first view is that of the path's first pose; without a sky the
+    background is black."""
     scene, payload = scene_record(content, SKY_SIZE)
     encoded = base64.b64encode(payload).decode()
     return filled_page(template, title=title, provenance=provenance, scene=scene, payload=encoded)

@@ -15,31 +15,37 @@ import torch
 from drivesplat.export.modes import Gait, Modes
 from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
 from drivesplat.export.trained_parts import SampledGroup
+from drivesplat.export.viewer_boxes import BoxMotion
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Sky
 from drivesplat.rendering.color_bytes import to_uint8
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.splits import HELD_OUT_GROUPS
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.trajectories.camera_path import recorded_frames, sampled_path
 from drivesplat.trajectories.sampled_edit import InstanceMotion, SampledEdit
 
 
 @dataclass(frozen=True)
 class RecordedPath:
-    """The recorded camera: its poses `camera_to_world` (n, 4, 4) at `seconds` (n,) since the first image, the seconds
-    of its key frames, and the frame `start` of the first view with its second."""
+    """The recorded camera: its `first` frame, of whose size and intrinsics all are; its poses `camera_to_world`
+    (n, 4, 4) at `seconds` (n,) since the first image; the seconds of its key frames; those of its `held_out` images by
+    group; and the second of the last training image, its own if it has one (None: there is none)."""
 
-    start: Frame
-    start_second: float
+    first: Frame
     seconds: np.ndarray
     camera_to_world: np.ndarray
     key_frames: tuple[float, ...]
+    held_out: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    last_training: float | None = None
 
 
 @dataclass(frozen=True)
 class ViewerContent:
     """What a page shows: groups, a sky (None: black), the recorded camera, edited drives, the recorded `images`
-    (records of `viewer_images`), the methods that have pages beside it, and the `modes` of groups that deform."""
+    (records of `viewer_images`), the methods that have pages beside it, the `modes` of groups that deform, and the
+    `boxes` of tracks that are no groups."""
 
     groups: Mapping[str, SampledGroup]
     sky: Sky | None
@@ -50,19 +56,27 @@ class ViewerContent:
     method: str = ""
     methods: Sequence[str] = ()
     modes: Mapping[str, Modes] = field(default_factory=dict)
+    boxes: Sequence[BoxMotion] = ()
 
 
-def recorded_path(scene: Scene, camera: str) -> RecordedPath:
-    """The path of a camera, starting at its middle key frame. Raises DatasetError if the scene has no key frame of
+def recorded_path(scene: Scene, record: TrainingRecord, camera: str) -> RecordedPath:
+    """The path of a camera, with the split of its images by `record`. Raises DatasetError if the scene has no image of
     it."""
-    start, frames = scene.frames[scene.middle_key_frame(camera)], recorded_frames(scene, camera)
+    frames = recorded_frames(scene, camera)
     times, poses = sampled_path(scene, camera, SAMPLES_PER_SECOND)
+    own = [i for i in range(len(record.timestamps)) if record.camera_name(i) == camera]
+    seconds = {
+        group: [scene.seconds(record.timestamps[i]) for i in own if i in record.splits.get(group, ())]
+        for group in ("train", *HELD_OUT_GROUPS)
+    }
+    trained = seconds.pop("train") or [scene.seconds(record.timestamps[i]) for i in record.train_images]
     return RecordedPath(
-        start,
-        scene.seconds(start.timestamp),
+        frames[0],
         np.array([scene.seconds(time) for time in times]),
         poses,
         tuple(scene.seconds(frame.timestamp) for frame in frames if frame.is_key_frame),
+        {group: sorted(found) for group, found in seconds.items()},
+        max(trained, default=None),
     )
 
 
@@ -174,6 +188,15 @@ class MotionRecords:
         return {"present": [list(span) for span in motion.spans], "samples": samples}
 
 
+def box_records(boxes: Sequence[BoxMotion]) -> tuple[list[dict[str, Any]], SampleRows]:
+    """A record for each box: what its track says, and its motion as in records of groups, with its own rows."""
+    rows, records = SampleRows(), []
+    for box in boxes:
+        motion = {"present": [list(span) for span in box.spans], "samples": rows.add(box.seconds, box.object_to_world)}
+        records.append({"id": box.track.id, "category": box.track.category, "size": box.track.size.tolist(), **motion})
+    return records, rows
+
+
 def modes_array(groups: Sequence[str], modes: Mapping[str, Modes], count: int) -> tuple[np.ndarray, float]:
     """The modes of all groups that deform, in order, as bytes (n, count, 2, 3): the shift (metres) and the turn of each
     Gaussian in every mode, 0 beyond those of its group; and the largest absolute value."""
@@ -186,7 +209,7 @@ def modes_array(groups: Sequence[str], modes: Mapping[str, Modes], count: int) -
 
 def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any], bytes]:
     """What the page's scripts read, and the compressed arrays that it lists."""
-    groups, path, start = content.groups, content.path, content.path.start
+    groups, path, first = content.groups, content.path, content.path.first
     gaussians = concatenate([group.gaussians for group in groups.values()])
     arrays, sh_range = splat_arrays(gaussians)
     count = max((len(modes.shifts) for modes in content.modes.values()), default=0)
@@ -194,9 +217,10 @@ def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any],
     motions, cameras = SampleRows(count), SampleRows()
     made = MotionRecords(motions, cameras, content.modes)
     records, camera = made.groups(groups), cameras.add(path.seconds, path.camera_to_world)
-    edits = made.edits(content.edits, [*groups])
+    edits, (boxes, box_rows) = made.edits(content.edits, [*groups]), box_records(content.boxes)
+    samples = motions.arrays("motion") | cameras.arrays("camera") | box_rows.arrays("box")
     others = {"modes": modes, "sky": sky_faces(content.sky, sky_size)}
-    layout, payload = packed({**arrays, **motions.arrays("motion"), **cameras.arrays("camera"), **others})
+    layout, payload = packed({**arrays, **samples, **others})
     record = {
         "count": len(gaussians),
         "coefficients": 1 + gaussians.shN.shape[1],
@@ -206,16 +230,17 @@ def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any],
         "modes_range": modes_range,
         "sky_size": sky_size,
         "has_sky": content.sky is not None,
-        "start": {
-            "width": start.width,
-            "height": start.height,
-            "K": continuous_intrinsics(start, (start.width, start.height)).tolist(),
-            "camera_to_world": start.camera_to_world.tolist(),
-            "second": path.start_second,
+        "frame": {
+            "width": first.width,
+            "height": first.height,
+            "K": continuous_intrinsics(first, (first.width, first.height)).tolist(),
         },
         "key_frames": list(path.key_frames),
+        "held_out": {group: list(seconds) for group, seconds in path.held_out.items()},
+        "last_training": path.last_training,
         "camera": camera,
         "groups": records,
+        "boxes": boxes,
         "edits": edits,
         "images": list(content.images),
         "method": content.method,

@@ -67,10 +67,17 @@ def oblique_frame() -> Frame:
     return Frame("CAM_FRONT", 0, "", 480, 270, K, pose, np.eye(4), True, 0, "")
 
 
+def ridden(second: float) -> np.ndarray:
+    """The recorded camera: from `oblique_frame` on it rides a metre ahead in a second."""
+    pose = oblique_frame().camera_to_world
+    return rigid(pose[:3, :3], pose[:3, 3] + second * pose[:3, 2])
+
+
 def path_from(frame: Frame) -> RecordedPath:
-    """Two seconds in which the camera rides two metres ahead from `frame`."""
-    ahead = rigid(frame.camera_to_world[:3, :3], frame.camera_to_world[:3, 3] + 2.0 * frame.camera_to_world[:3, 2])
-    return RecordedPath(frame, 0.0, np.array([0.0, 2.0]), np.stack([frame.camera_to_world, ahead]), (0.0, 0.5, 2.0))
+    """Two seconds of the recorded camera; the key frame at 0.5 s is held out, and that at 2 s after all training."""
+    held_out = {"interpolation": [0.5], "extrapolation": [2.0]}
+    poses = np.stack([ridden(0.0), ridden(2.0)])
+    return RecordedPath(frame, np.array([0.0, 2.0]), poses, (0.0, 0.5, 2.0), held_out, 1.75)
 
 
 def page_of(gaussians: Gaussians, sky: Sky | None, antialiased: bool = False, title: str = "test") -> str:
@@ -135,6 +142,11 @@ def set_second(second: float) -> str:
       time.value = {second};
       time.dispatchEvent(new Event("input"));
     }})()"""
+
+
+def click(name: str) -> str:
+    """Clicks on a control."""
+    return f'document.getElementById("{name}").click()'
 
 
 def tick(label: str) -> str:

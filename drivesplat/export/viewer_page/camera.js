@@ -26,16 +26,11 @@ function anglesOf(rotation) {
   return { heading, pitch, roll: Math.atan2(along(1), along(0)) };
 }
 
-function startView(start) {
-  const rows = start.camera_to_world;
-  return { ...anglesOf(rows.map((row) => row.slice(0, 3))), position: rows.slice(0, 3).map((row) => row[3]) };
-}
-
 // The whole recorded frame in a canvas of any shape: focal lengths and principal point in the canvas's pixels.
-function pinhole(start, width, height) {
-  const scale = Math.min(width / start.width, height / start.height);
-  const [[fx, , cx], [, fy, cy]] = start.K;
-  const center = [width / 2 + (cx - start.width / 2) * scale, height / 2 + (cy - start.height / 2) * scale];
+function pinhole(frame, width, height) {
+  const scale = Math.min(width / frame.width, height / frame.height);
+  const [[fx, , cx], [, fy, cy]] = frame.K;
+  const center = [width / 2 + (cx - frame.width / 2) * scale, height / 2 + (cy - frame.height / 2) * scale];
   return { focal: [fx * scale, fy * scale], center };
 }
 

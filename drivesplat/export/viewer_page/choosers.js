@@ -1,4 +1,5 @@
-// Lists to choose from: an edit of the scene, where the recorded image is shown, and the page of another method.
+// Lists to choose from: what the picture shows, an edit of the scene, where the recorded image is shown, and the page
+// of another method.
 
 // Fills a list with [text, value] and shows it; calls choose(value) for each choice.
 function chooser(id, options, chosen, choose) {
@@ -7,6 +8,10 @@ function chooser(id, options, chosen, choose) {
   list.value = chosen;
   list.hidden = false;
   list.addEventListener("change", () => choose(list.value));
+}
+
+function lookChooser(looks, state, change) {
+  chooser("look", looks.map((look) => [look, look]), state.look, (look) => change({ look }));
 }
 
 function editChooser(scene, state, change) {

@@ -6,30 +6,20 @@ function element(kind, text, properties = {}) {
   return Object.assign(document.createElement(kind), { textContent: text, ...properties });
 }
 
-// The bar below the picture. `state` has second, playing, speed and following; change(part) alters it and redraws.
-// Returns update(), which shows the state.
-function timeBar(state, span, keyFrames, change) {
-  const [slider, play] = [find("time"), find("play")];
-  Object.assign(slider, { min: span[0], max: span[1], step: 0.01 });
-  const jump = (frames) => frames.length && change({ second: frames[0], playing: false });
-  const toggle = () => change({ playing: !state.playing });
-  slider.addEventListener("input", () => change({ second: Number(slider.value), playing: false }));
-  play.addEventListener("click", toggle);
-  find("next").addEventListener("click", () => jump(keyFrames.filter((at) => at > state.second + 1e-3)));
-  find("previous").addEventListener("click", () => jump(keyFrames.filter((at) => at < state.second - 1e-3).reverse()));
-  find("speed").addEventListener("change", (e) => change({ speed: Number(e.target.value) }));
-  find("follow").addEventListener("change", (e) => change({ following: e.target.checked }));
-  addEventListener("keydown", (e) => {
-    if (e.code !== "Space" || e.target.matches("button, select")) return;
-    e.preventDefault();
-    toggle();
-  });
+// Boxes to tick for parts of the state that are on or off. Returns update(), which shows the state.
+function switches(state, change) {
+  const names = { follow: "following", "boxes-on": "boxes", "figures-on": "figures" };
+  for (const [id, name] of Object.entries(names)) {
+    find(id).addEventListener("change", (e) => change({ [name]: e.target.checked }));
+  }
+  find("depths").firstChild.style.background = `linear-gradient(to right, ${DEPTH_COLORS.join(", ")})`;
+  find("more").addEventListener("click", () => find("bar").classList.toggle("open"));
   return () => {
-    slider.value = state.second;
-    play.textContent = state.playing ? "Pause" : "Play";
-    find("follow").checked = state.following;
+    for (const [id, name] of Object.entries(names)) find(id).checked = state[name];
     find("followed").textContent = state.edit && state.edit.camera ? "edited camera" : "recorded camera";
-    find("clock").textContent = `${state.second.toFixed(2)} s`;
+    find("figures").hidden = !state.figures;
+    find("look").value = state.look;
+    find("depths").hidden = state.look !== "depth";
   };
 }
 
@@ -37,8 +27,7 @@ function instanceLabel({ id, samples, category }, ids) {
   return samples ? `${category || "object"} ${shortId(id, ids)}` : id;
 }
 
-// A box to tick for boxes, the path of the camera, the sky and each instance. Returns fill(instances), for another
-// drive.
+// A box to tick for the path of the camera, the sky and each instance. Returns fill(instances), for another drive.
 function shownList(state, hasSky, change) {
   const list = find("list");
   const add = (text, checked, set) => {
@@ -51,7 +40,6 @@ function shownList(state, hasSky, change) {
   return (instances) => {
     list.replaceChildren();
     const ids = instances.map(({ id }) => id);
-    if (instances.some(({ samples, size }) => samples && size)) add("boxes", state.boxes, (on) => (state.boxes = on));
     add("path of the camera", state.path, (on) => (state.path = on));
     if (hasSky) add("sky", state.sky, (on) => (state.sky = on));
     instances.forEach((instance) => add(instanceLabel(instance, ids), !state.hidden.has(instance.id), (on) => {
@@ -78,14 +66,23 @@ function followCopy() {
   });
 }
 
-// What mouse, keys and fingers do: shown until the view is moved by hand, and again on request.
+// What mouse, keys and fingers do: shown until the view is moved by hand, and again on request. Returns hide().
 function hints() {
   const hint = find("hint");
   const fingers = matchMedia("(pointer: coarse)").matches;
-  hint.textContent = fingers
+  const help = fingers
     ? "One finger: look · two fingers: move and zoom · tap: pick an object"
-    : "Drag: look · right drag: orbit · shift drag: pan · wheel or W A S D Q E: move · R: back to the start · " +
-      "space: play · click: pick an object";
-  find("help").addEventListener("click", () => (hint.hidden = !hint.hidden));
+    : "Drag: look · right drag: orbit · shift drag: pan · wheel or W A S D Q E: move · R: follow the camera again · " +
+      "space: play · V: colour, depth, instances · B: boxes · F: frames a second · P: save the picture · L: link · " +
+      "click: pick an object";
+  tell(help);
+  find("help").addEventListener("click", () => {
+    if (hint.hidden || hint.textContent !== help) tell(help);
+    else hint.hidden = true;
+  });
   return () => (hint.hidden = true);
+}
+
+function tell(sentence) {
+  Object.assign(find("hint"), { textContent: sentence, hidden: false });
 }

@@ -66,8 +66,8 @@ function instanceTexture(gl, unit) {
 
 const SAME_COLORS = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
-// The poses, colour matrices and weights of up to `modes` modes of the instances, a line for each: filled anew for every
-// picture.
+// The poses, colour matrices, labels and weights of up to `modes` modes of the instances, a line for each: filled anew
+// for every picture.
 function poseTexture(gl, unit, modes) {
   const texture = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0 + unit);
@@ -77,11 +77,11 @@ function poseTexture(gl, unit, modes) {
   return (ranges) => {
     const texels = 7 + Math.ceil(modes / 4);
     const values = new Float32Array(4 * texels * ranges.length);
-    ranges.forEach(({ begin, row, pose, colors, modes: first, weights }, line) => {
+    ranges.forEach(({ begin, row, pose, colors, label, modes: first, weights }, line) => {
       if (!pose) return;
-      const [red, green, blue] = [0, 3, 6].map((i) => (colors || SAME_COLORS).slice(i, i + 3));
+      const matrix = [0, 1, 2].flatMap((i) => [...(colors || SAME_COLORS).slice(3 * i, 3 * i + 3), label[i]]);
       const state = [begin - row, 1, row, weights ? first : -1];
-      values.set([...pose, ...state, ...red, 0, ...green, 0, ...blue, 0, ...(weights || [])], 4 * texels * line);
+      values.set([...pose, ...state, ...matrix, ...(weights || [])], 4 * texels * line);
     });
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -130,9 +130,10 @@ function setCamera(gl, { made, uniforms }, rotation, position, { focal, center }
   gl.uniform2fv(uniforms.size, size);
 }
 
-// Returns { setDrive, setOrder, draw }. setDrive(ranges) tells which rows there are, setOrder(rows) which are drawn, far
-// to near; draw(view, ranges, skyShown) draws the sky, then them over it. A range has with `pose` the pose of its
-// instance, null if it is not shown. Throws where the browser has no WebGL 2.
+// Returns { setDrive, setOrder, draw, looks }. setDrive(ranges) tells which rows there are, setOrder(rows) which are
+// drawn, far to near; draw(view, ranges, { look, sky }) draws the sky, then them over it, and returns their number.
+// `looks` are those of LOOKS that this browser can draw. A range has with `pose` the pose of its instance, null if it
+// is not shown, and with `label` the colour of it. Throws where the browser has no WebGL 2.
 function painter(canvas, scene, arrays) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
   if (!gl) throw new Error("this browser has no WebGL 2; update it, or allow it to use the graphics card");
@@ -150,6 +151,7 @@ function painter(canvas, scene, arrays) {
   gl.useProgram(sky.made);
   skyTexture(gl, unit + 2, arrays.sky, scene.sky_size);
   gl.uniform1i(sky.uniforms.sky, unit + 2);
+  const depth = depthTarget(gl, unit + 3);
   geometry(gl);
   gl.clearColor(0, 0, 0, 1);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
@@ -158,20 +160,25 @@ function painter(canvas, scene, arrays) {
     count = rows.length;
     gl.bufferData(gl.ARRAY_BUFFER, rows, gl.DYNAMIC_DRAW);
   };
-  const draw = (view, ranges, skyShown) => {
+  const looks = LOOKS.filter((look) => look !== "depth" || depth);
+  const draw = (view, ranges, { look, sky: skyShown }) => {
     const size = [canvas.width, canvas.height];
-    const [rotation, lens] = [rotationOf(view), pinhole(scene.start, ...size)];
+    const [rotation, lens] = [rotationOf(view), pinhole(scene.frame, ...size)];
     setPoses(ranges);
     gl.viewport(0, 0, ...size);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.disable(gl.BLEND);
-    if (skyShown) {
+    if (look === "depth") depth.begin(size);
+    if (look === "colour" && skyShown) {
       setCamera(gl, sky, rotation, view.position, lens, size);
       gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
     }
     gl.enable(gl.BLEND);
     setCamera(gl, splat, rotation, view.position, lens, size);
+    gl.uniform1i(splat.uniforms.look, LOOKS.indexOf(look));
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+    if (look === "depth") depth.finish();
+    return count;
   };
-  return { setDrive, setOrder, draw };
+  return { setDrive, setOrder, draw, looks };
 }

@@ -17,9 +17,9 @@ function nearestSecond(images, second) {
 }
 
 // The place of a whole recorded frame in a canvas of any shape, as CSS.
-function framePlace(start, width, height) {
-  const scale = Math.min(width / start.width, height / start.height);
-  const [w, h] = [scale * start.width, scale * start.height];
+function framePlace(frame, width, height) {
+  const scale = Math.min(width / frame.width, height / frame.height);
+  const [w, h] = [scale * frame.width, scale * frame.height];
   const place = { left: (width - w) / 2, top: (height - h) / 2, width: w, height: h };
   return Object.fromEntries(Object.entries(place).map(([name, pixels]) => [name, `${pixels}px`]));
 }
@@ -27,7 +27,7 @@ function framePlace(start, width, height) {
 const NO_PLACE = { left: "", top: "", width: "", height: "" };
 
 // Returns show(state, canvas), which says whether the canvas has another size now.
-function imageLayer(images, start) {
+function imageLayer(images, frame) {
   const [layer, image, caption] = [find("recorded"), find("image-shown"), find("image-caption")];
   return (state, canvas) => {
     const shown = imageAt(images, state);
@@ -38,7 +38,7 @@ function imageLayer(images, start) {
     if (!shown) return beside !== was;
     if (image.src !== shown.image) image.src = shown.image;
     caption.textContent = `recorded, ${shown.second.toFixed(2)} s${shown.trained ? "" : ", not trained on"}`;
-    Object.assign(layer.style, beside ? NO_PLACE : framePlace(start, canvas.clientWidth, canvas.clientHeight));
+    Object.assign(layer.style, beside ? NO_PLACE : framePlace(frame, canvas.clientWidth, canvas.clientHeight));
     image.style.opacity = beside ? 1 : state.opacity;
     return beside !== was;
   };

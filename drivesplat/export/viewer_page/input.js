@@ -10,15 +10,16 @@ const MOVES = {
   KeyE: [0, -1, 0], KeyQ: [0, 1, 0],
 };
 
-// Calls change(view => view) whenever mouse, fingers or keys change the view, restart() where it is to be the first
-// one, and pick(x, y) for a click without a drag.
-function followInput(canvas, start, change, restart, pick) {
-  const focal = () => pinhole(start, canvas.clientWidth, canvas.clientHeight).focal[0];
+// Calls change(view => view) whenever mouse, fingers or keys change the view, and pick(x, y) for a click without a
+// drag.
+function followInput(canvas, frame, change, pick) {
+  const focal = () => pinhole(frame, canvas.clientWidth, canvas.clientHeight).focal[0];
   followPointers(canvas, (before, after, drag) => {
     if (before.length > 1) return change((view) => moved(view, pinchStep(before, after, focal())));
     const [dx, dy] = [after[0].x - before[0].x, after[0].y - before[0].y].map((pixels) => pixels / focal());
     if (drag.button === 2) return change((view) => orbited(view, -dx, -dy));
-    if (drag.button === 1 || drag.shift) return change((view) => moved(view, [dx, dy, 0].map((x) => -ORBIT_METRES * x)));
+    const pan = [-ORBIT_METRES * dx, -ORBIT_METRES * dy, 0];
+    if (drag.button === 1 || drag.shift) return change((view) => moved(view, pan));
     return change((view) => turned(view, dx, dy));
   }, pick);
   canvas.addEventListener("contextmenu", (e) => e.preventDefault());
@@ -27,14 +28,14 @@ function followInput(canvas, start, change, restart, pick) {
     const pixels = e.deltaY * (e.deltaMode === 1 ? 30 : 1);
     change((view) => moved(view, [0, 0, -pixels * WHEEL_METRES]));
   }, { passive: false });
-  followKeys((step) => change((view) => moved(view, step)), restart);
+  followKeys((step) => change((view) => moved(view, step)));
 }
 
 // Calls drag(before, after, { button, shift }) with the places of the one or two pointers that are down, and pick(x, y)
-// for one that was released where it was pressed.
+// for one that was released near where it was pressed, without a drag before.
 function followPointers(canvas, drag, pick) {
   const down = new Map(); // places by pointer, in the order in which they were pressed
-  let [button, way] = [0, 0]; // of all since the first was pressed
+  let [button, way] = [0, 0]; // of all since the first was pressed: the way as far as a drag begins
   canvas.addEventListener("pointerdown", (e) => {
     [button, way] = down.size ? [button, Infinity] : [e.button, 0];
     down.set(e.pointerId, { x: e.clientX, y: e.clientY });
@@ -43,8 +44,9 @@ function followPointers(canvas, drag, pick) {
     if (!down.has(e.pointerId)) return;
     const before = [...down.values()].slice(0, 2);
     const from = down.get(e.pointerId);
+    way = Math.max(way, Math.abs(e.clientX - from.x) + Math.abs(e.clientY - from.y));
+    if (way < CLICK_PIXELS) return;
     down.set(e.pointerId, { x: e.clientX, y: e.clientY });
-    way += Math.abs(e.clientX - from.x) + Math.abs(e.clientY - from.y);
     drag(before, [...down.values()].slice(0, 2), { button, shift: e.shiftKey });
   });
   addEventListener("pointerup", (e) => {
@@ -54,7 +56,7 @@ function followPointers(canvas, drag, pick) {
 }
 
 // Walks while keys are held, at one speed whatever the frame rate.
-function followKeys(walk, restart) {
+function followKeys(walk) {
   const held = new Set();
   let last = 0;
   const step = (now) => {
@@ -67,7 +69,6 @@ function followKeys(walk, restart) {
   };
   addEventListener("keydown", (e) => {
     if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("input, select, button")) return;
-    if (e.code === "KeyR") restart();
     if (!(e.code in MOVES)) return;
     e.preventDefault();
     if (!held.size) requestAnimationFrame((now) => { last = now; step(now); });

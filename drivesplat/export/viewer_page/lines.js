@@ -1,6 +1,8 @@
-// Lines over the picture, on a canvas of their own: the boxes of the objects, the recorded path and its camera.
+// Lines over the picture, on a canvas of their own: boxes with their names, and the camera on its path.
 
 const FRUSTUM_METRES = 1.5;
+const NAME_PIXELS = 12;
+const [NAME_NEAR, NAME_FAR] = [0.5, 80]; // metres ahead of the camera
 const BOX_EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const FRUSTUM_EDGES = [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]];
 
@@ -20,12 +22,13 @@ function frustumCorners(pose, { K, width, height }) {
   return [[0, 0, 0], ...corners].map((corner) => placed(pose, corner));
 }
 
-// Returns draw(view, segments): pairs of points in the world with a colour, cut off at the near plane.
-function linePainter(canvas, start) {
+// Returns draw(view, segments, names): pairs of points in the world with a colour, cut off at the near plane; and names
+// above points, from near to far, unless nearer ones are in their place.
+function linePainter(canvas, frame) {
   const context = canvas.getContext("2d");
-  return (view, segments) => {
+  return (view, segments, names) => {
     context.clearRect(0, 0, canvas.width, canvas.height);
-    const [rotation, { focal, center }] = [rotationOf(view), pinhole(start, canvas.width, canvas.height)];
+    const [rotation, { focal, center }] = [rotationOf(view), pinhole(frame, canvas.width, canvas.height)];
     const inCamera = (point) => {
       const away = point.map((x, i) => x - view.position[i]);
       return [0, 1, 2].map((column) => away.reduce((sum, x, row) => sum + rotation[row][column] * x, 0));
@@ -41,7 +44,28 @@ function linePainter(canvas, start) {
       context.lineTo(...pixel(ends[1]));
       context.stroke();
     }
+    writeNames(context, names.map((one) => ({ ...one, place: inCamera(one.point) })), pixel);
   };
+}
+
+function writeNames(context, names, pixel) {
+  const sharpness = context.canvas.width / Math.max(1, context.canvas.clientWidth);
+  const height = NAME_PIXELS * sharpness;
+  context.font = `600 ${height}px system-ui, sans-serif`;
+  context.textAlign = "center";
+  context.lineWidth = 3 * sharpness;
+  context.strokeStyle = "#000c";
+  const taken = [];
+  const ahead = names.filter(({ place }) => place[2] > NAME_NEAR && place[2] < NAME_FAR);
+  for (const { name, place, color } of ahead.sort((a, b) => a.place[2] - b.place[2])) {
+    const [[x, y], half] = [pixel(place), context.measureText(name).width / 2];
+    const own = [x - half, x + half, y - height, y];
+    if (taken.some((t) => own[0] < t[1] && t[0] < own[1] && own[2] < t[3] && t[2] < own[3])) continue;
+    taken.push(own);
+    context.fillStyle = color;
+    context.strokeText(name, x, y - 4 * sharpness);
+    context.fillText(name, x, y - 4 * sharpness);
+  }
 }
 
 // The part of a line that lies ahead of the near plane; null if none does.
@@ -53,21 +77,17 @@ function cutOff(from, to) {
   return [from[2] < near ? cut : from, to[2] < near ? cut : to];
 }
 
-// The lines of a second: boxes of the shown instances, and the path of the camera, by its rows, with the camera on it.
-function linesAt(scene, arrays, instances, poses, rows, second, { boxes, path }) {
+// The lines of a second: `boxes` (boxes.js), and with `path` the path of the camera, by its rows, with the camera on
+// it.
+function linesAt({ frame }, arrays, boxes, rows, { second, path }) {
   const segments = [];
   const add = (points, edges, color) => edges.forEach(([a, b]) => segments.push([points[a], points[b], color]));
-  if (boxes) {
-    instances.forEach(({ size }, number) => {
-      if (size && poses[number]) add(boxCorners(poses[number], size), BOX_EDGES, "#ffd166");
-    });
-  }
-  if (path) {
-    const places = [];
-    for (let i = rows[0]; i < rows[1]; i++) places.push([3, 7, 11].map((j) => arrays.camera_poses[12 * i + j]));
-    places.slice(1).forEach((place, i) => segments.push([places[i], place, "#06d6a0"]));
-    const pose = poseBetween(arrays.camera_seconds, arrays.camera_poses, rows, second);
-    add(frustumCorners(pose, scene.start), FRUSTUM_EDGES, "#06d6a0");
-  }
+  boxes.forEach(({ pose, size, modelled }) => add(boxCorners(pose, size), BOX_EDGES, boxColor(modelled)));
+  if (!path) return segments;
+  const places = [];
+  for (let i = rows[0]; i < rows[1]; i++) places.push([3, 7, 11].map((j) => arrays.camera_poses[12 * i + j]));
+  places.slice(1).forEach((place, i) => segments.push([places[i], place, "#06d6a0"]));
+  const pose = poseBetween(arrays.camera_seconds, arrays.camera_poses, rows, second);
+  add(frustumCorners(pose, frame), FRUSTUM_EDGES, "#06d6a0");
   return segments;
 }

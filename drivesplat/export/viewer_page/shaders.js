@@ -12,10 +12,10 @@ layout(location = 1) in uint row;
 uniform sampler2D means, scales, quats, opacities, sh0, shN, modes;
 uniform usampler2D instance; // the number of each row's instance
 // a line for each instance: three rows of [rotation | place], [from row to Gaussian, shown, first row, first row of its
-// modes or -1], three rows of its colour matrix, the weights of its modes
+// modes or -1], three rows of [colour matrix | label], the weights of its modes
 uniform sampler2D poses;
 uniform float shRange, modesRange;
-uniform int coefficients, modeCount;
+uniform int coefficients, modeCount, look; // look: the number in LOOKS
 uniform bool antialiased;
 uniform mat3 cameraToWorld;
 uniform vec3 position;
@@ -26,6 +26,7 @@ out vec4 color;
 
 const float EPS2D = 0.3; // square pixels that gsplat's 2D filter adds
 const float LEAST_ALPHA = 1.0 / 255.0;
+const float DEPTH_LIMIT = 1000.0; // metres: half floats sum depths up to it
 
 vec4 texel(sampler2D values, uint i) {
   uint width = uint(textureSize(values, 0).x);
@@ -121,9 +122,13 @@ void main() {
     sigmas.y * sqrt(max(mid - spread, 0.0)) * vec2(-major.y, major.x);
   vec2 pixel = focal * p.xy / p.z + center + offset;
   gl_Position = vec4((2.0 * pixel / size - 1.0) * vec2(1.0, -1.0), 0.0, 1.0);
-  mat3 colors = mat3(texelFetch(poses, ivec2(4, line), 0).xyz, texelFetch(poses, ivec2(5, line), 0).xyz,
-    texelFetch(poses, ivec2(6, line), 0).xyz);
-  color = vec4(max(radiance(index, normalize((mean - position) * toWorld)) * colors, 0.0), alpha);
+  vec4 red = texelFetch(poses, ivec2(4, line), 0), green = texelFetch(poses, ivec2(5, line), 0),
+    blue = texelFetch(poses, ivec2(6, line), 0);
+  vec3 radiant = radiance(index, normalize((mean - position) * toWorld)) * mat3(red.xyz, green.xyz, blue.xyz);
+  color = vec4(max(radiant, 0.0), alpha);
+  vec3 label = vec3(red.w, green.w, blue.w);
+  if (look == 1) color.rgb = vec3(min(p.z, DEPTH_LIMIT), 0.0, 0.0);
+  if (look == 2) color.rgb = label.r < 0.0 ? vec3(0.45 * dot(color.rgb, vec3(0.3, 0.6, 0.1))) : label;
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es
