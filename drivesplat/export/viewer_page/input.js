@@ -68,7 +68,7 @@ function followKeys(walk) {
     requestAnimationFrame(step);
   };
   addEventListener("keydown", (e) => {
-    if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("input, select, button")) return;
+    if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("select, input[type=range]")) return;
     if (!(e.code in MOVES)) return;
     e.preventDefault();
     if (!held.size) requestAnimationFrame((now) => { last = now; step(now); });

@@ -52,7 +52,7 @@ async function openPage() {
     const { found, ids } = shown.pickAt(x, y);
     showPicked(found, ids, found && instanceSpeed(found, arrays, state.second));
   });
-  const save = () => { shown.drawNow(); savePicture(layers, state.second); };
+  const save = () => savePicture(layers, shown.drawNow(), state.second);
   const link = () => copyLink(state);
   find("save").addEventListener("click", save);
   find("link").addEventListener("click", link);

@@ -18,8 +18,8 @@ function posed({ instances, ranges }, arrays, count, { second, hidden }) {
 }
 
 // Returns { redraw, drawNow, pickAt }. redraw() draws with the browser's next frame, and goes on while the drive plays
-// or figures are shown; drawNow() at once. pickAt(x, y) gives the instance `found` there, or null, and the `ids` of
-// all. `controls` has fillList(instances), for another drive, and `updates`, called after every picture.
+// or figures are shown; drawNow() at once, and returns the notes on the picture. pickAt(x, y) gives the instance
+// `found` there, or null, and the `ids` of all. `controls` has fillList(instances), for another drive, and `updates`, called after every picture.
 function shower({ scene, arrays, layers: [canvas, over], paint, span }, state, controls) {
   const [drawLines, showImage] = [linePainter(over, scene.frame), imageLayer(scene.images, scene.frame)];
   const showFigures = frameFigures();
@@ -55,10 +55,12 @@ function shower({ scene, arrays, layers: [canvas, over], paint, span }, state, c
     const boxes = boxesAt(scene, arrays, drive.instances, poses, state.second);
     const visible = state.boxes ? boxes : [];
     drawLines(state.view, linesAt(scene, arrays, visible, drive.camera, state), boxNames(visible));
-    showNotes(notesOf(state, scene.last_training, boxAround(boxes, state.view.position)));
+    const notes = notesOf(state, scene.last_training, boxAround(boxes, state.view.position));
+    showNotes(notes);
     showFigures(state.figures, now, drawn, ranges.reduce((sum, { begin, end }) => sum + end - begin, 0));
     controls.updates.forEach((update) => update());
     document.documentElement.dataset.shown = sorter.settled() ? "yes" : "sorting";
+    return notes;
   };
   const advance = (now) => {
     if (state.playing && before !== null) {
