@@ -11,6 +11,7 @@ from helpers.viewer_pages import (
     a_model,
     a_sky,
     choose,
+    click,
     oblique_frame,
     path_from,
     psnr,
@@ -148,6 +149,7 @@ def test_people_walk_as_recorded_and_as_edited(opened):
         return rendered(a_model(concatenate([street, person]), sky), frame.camera_to_world)
 
     with opened(viewer_page(content, "test", {})) as tab:
+        tab.run(click("follow"))
         for second in (0.4, 1.3):
             tab.run(set_second(second))
             walked = float(motion.walked(np.array([second]))[0])

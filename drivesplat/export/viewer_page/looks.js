@@ -1,4 +1,4 @@
-// What a picture shows: colours, depths, or which instance is where.
+// What the picture is of: colours, depths, or which instance is where.
 
 const LOOKS = ["colour", "depth", "instances"]; // as the shaders number them
 
