@@ -433,6 +433,16 @@ def test_where_workers_are_refused_the_page_sorts_itself(opened, worker):
 
 
 @in_a_browser
+def test_what_lies_behind_the_camera_is_not_drawn_while_the_order_is_an_old_one(opened):
+    """A worker that never answers, and a camera that has passed all Gaussians, 20 metres ahead."""
+    page = page_of(splats(400, sh_degree=1), None)
+    with opened(page.replace('"use strict";', '"use strict"; window.Worker = class { postMessage() {} };', 1)) as tab:
+        assert tab.picture().max() > 0.5
+        tab.mouse("mouseWheel", 100, 60, deltaX=0, deltaY=-3000)
+        assert tab.picture().max() == 0.0
+
+
+@in_a_browser
 def test_one_finger_looks_and_two_pan_and_zoom(tmp_path):
     gaussians, frame = splats(400, sh_degree=1), oblique_frame()
     model, pose = a_model(gaussians, None), frame.camera_to_world

@@ -180,6 +180,7 @@ def test_the_time_bar_marks_each_held_out_image_and_the_time_beyond_the_last_tra
     beyond, plain, nothing = by_node(
         "timebar", cases=cases, expression="cases.map((scene) => timeMarks(scene, [1, 6]))"
     )
+    assert by_node("timebar", scene=scene, expression="timeMarks(scene, [1, 1])") == [], "a single image"
     held_out = [("interpolation", 0.0), ("interpolation", 0.5), ("extrapolation", 0.8)]
     assert [(mark["kind"], mark["left"]) for mark in plain] == held_out and plain == beyond[1:] and nothing == []
     assert beyond[0] == {"kind": "beyond", "left": 0.6, "width": 0.4}

@@ -66,7 +66,8 @@ function followCopy() {
   });
 }
 
-// What mouse, keys and fingers do: shown until the view is moved by hand, and again on request. Returns hide().
+// What mouse, keys and fingers do: shown until the drive plays or the view is moved by hand, and again on request.
+// Returns hide().
 function hints() {
   const hint = find("hint");
   const fingers = matchMedia("(pointer: coarse)").matches;

@@ -1,6 +1,5 @@
 // The splat and its sky on the graphics card: textures from the page's arrays, and the drawing of one view.
 
-const NEAR = 0.01; // metres: gsplat's near plane
 const TEXTURE_WIDTH = 4096;
 
 function program(gl, vertex, fragment) {

@@ -34,7 +34,11 @@ async function openPage() {
   const state = openingState(scene, arrays);
   if (!paint.looks.includes(state.look)) state.look = LOOKS[0];
   let shown = null; // what draws, once the controls are there
-  const change = (part) => { Object.assign(state, part); shown.redraw(); };
+  const change = (part) => {
+    if (part.playing) find("hint").hidden = true;
+    Object.assign(state, part);
+    shown.redraw();
+  };
   const span = [scene.camera[0], scene.camera[1] - 1].map((row) => arrays.camera_seconds[row]);
   const controls = {
     fillList: shownList(state, scene.has_sky, change),

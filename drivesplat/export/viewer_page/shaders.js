@@ -1,5 +1,7 @@
 // How a Gaussian and the sky are drawn, with gsplat's projection and cut-offs: the picture is the one that was trained.
 
+const NEAR = 0.01; // metres: gsplat's near plane
+
 const SPLAT_VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
@@ -103,6 +105,7 @@ void main() {
   }
   vec3 mean = toWorld * (texel(means, index).xyz + shift) + vec3(rows[0].w, rows[1].w, rows[2].w);
   vec3 p = (mean - position) * cameraToWorld;
+  if (p.z <= ${NEAR}) return; // behind the camera by now: the order is of a moment ago
   vec3 scale = texel(scales, index).xyz;
   mat3 axes = toWorld * rotation(vec4(1.0, turn)) * rotation(texel(quats, index));
   vec3 cov = projected(mat3(axes[0] * scale.x, axes[1] * scale.y, axes[2] * scale.z), p);

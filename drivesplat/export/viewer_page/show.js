@@ -18,8 +18,9 @@ function posed({ instances, ranges }, arrays, count, { second, hidden }) {
 }
 
 // Returns { redraw, drawNow, pickAt }. redraw() draws with the browser's next frame, and goes on while the drive plays
-// or figures are shown; drawNow() at once, and returns the notes on the picture. pickAt(x, y) gives the instance
-// `found` there, or null, and the `ids` of all. `controls` has fillList(instances), for another drive, and `updates`, called after every picture.
+// or figures are shown; drawNow() at once, in exact order, and returns the notes on the picture. pickAt(x, y) gives the
+// instance `found` there, or null, and the `ids` of all. `controls` has fillList(instances), for another drive, and
+// `updates`, called after every picture.
 function shower({ scene, arrays, layers: [canvas, over], paint, span }, state, controls) {
   const [drawLines, showImage] = [linePainter(over, scene.frame), imageLayer(scene.images, scene.frame)];
   const showFigures = frameFigures();
@@ -36,7 +37,7 @@ function shower({ scene, arrays, layers: [canvas, over], paint, span }, state, c
   };
   const shapes = { centers: arrays.means.slice(), modes: arrays.modes, largest: scene.modes_range };
   const sorter = sorterOf(shapes, NEAR, (rows) => { paint.setOrder(rows); redraw(); });
-  const show = (now) => {
+  const show = (now, exact = false) => {
     const another = !drive || drive.edit !== state.edit;
     if (another) {
       drive = driveOf(scene, state.edit);
@@ -47,10 +48,9 @@ function shower({ scene, arrays, layers: [canvas, over], paint, span }, state, c
     if (showImage(state, canvas)) fit();
     const [ranges, poses] = posed(drive, arrays, scene.modes, state);
     const seen = [rotationOf(state.view).map((row) => row[2]), state.view.position, ranges];
-    if (another) {
-      paint.setDrive(ranges);
-      paint.setOrder(sorter.now(...seen));
-    } else sorter.later(...seen);
+    if (another) paint.setDrive(ranges);
+    if (another || exact) paint.setOrder(sorter.now(...seen));
+    else sorter.later(...seen);
     const drawn = paint.draw(state.view, ranges, state);
     const boxes = boxesAt(scene, arrays, drive.instances, poses, state.second);
     const visible = state.boxes ? boxes : [];
@@ -85,5 +85,5 @@ function shower({ scene, arrays, layers: [canvas, over], paint, span }, state, c
   canvas.addEventListener("webglcontextlost", () => tell("The browser lost access to the GPU: reload the page."));
   addEventListener("resize", () => { fit(); redraw(); });
   fit();
-  return { redraw, drawNow: () => show(performance.now()), pickAt };
+  return { redraw, drawNow: () => show(performance.now(), true), pickAt };
 }

@@ -27,7 +27,8 @@ function timeBar(state, scene, span, change) {
 // What the bar marks, as shares of its length: held-out images of each group, and with a `width` the time beyond the
 // last training image.
 function timeMarks({ held_out: heldOut, last_training: lastTraining }, [first, last]) {
-  const share = (second) => (last > first ? Math.min(Math.max((second - first) / (last - first), 0), 1) : 0);
+  if (last <= first) return []; // a single image
+  const share = (second) => Math.min(Math.max((second - first) / (last - first), 0), 1);
   const marks = Object.entries(heldOut).flatMap(([kind, seconds]) =>
     seconds.map((second) => ({ kind, left: share(second), width: 0 })));
   const known = lastTraining === null ? 1 : share(lastTraining);
