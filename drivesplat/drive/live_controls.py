@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.drive.edit_session import EditSession
-from drivesplat.drive.live_overlays import Overlays, describe, wxyz_of
-from drivesplat.drive.live_view import ERROR, LiveView
+from drivesplat.drive.live_view import ERROR, EditSession, LiveView, describe, wxyz_of
 from drivesplat.drive.pictures import PICTURES
 from drivesplat.errors import DriveSplatError, RequestError
 
@@ -28,7 +26,6 @@ class LiveControls:
         self.selected: str | None = None
         self._server, self._handle = server, None
         self._names = [f"{session.drive.folder.name} ({i + 1})" for i, session in enumerate(view.sessions)]
-        self._overlays = Overlays(server.scene, view, lambda name: self.changing(lambda: self.select(name)))
         self._add_of_view()
         self._add_of_edit()
         self._choose_camera()
@@ -99,11 +96,9 @@ class LiveControls:
         for client in self._server.get_clients().values():
             client.add_notification("drivesplat", text, auto_close_seconds=8.0)
 
-    def draw_overlays(self) -> None:
-        """Draws what lies over the picture."""
-        self._overlays.show_cameras(bool(self.cameras.value))
-        self._overlays.draw_boxes(bool(self.boxes.value))
-        self._overlays.draw_points(bool(self.points.value))
+    def click(self, track: str) -> None:
+        """Selects the object that was clicked."""
+        self.changing(lambda: self.select(track))
 
     def advance(self, seconds: float) -> None:
         """Plays the drive; at its end it begins again."""

@@ -5,9 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from drivesplat.drive.live_view import LiveView
+from drivesplat.drive.live_view import LiveView, describe, wxyz_of
 from drivesplat.drive.pictures import number_colors
 
 FRUSTUM_EVERY = 5
@@ -79,14 +78,3 @@ class Overlays:
         self._nodes.add_point_cloud(
             "/lidar", points[chosen].astype(np.float32), colors[numbers[chosen]], point_size=0.06
         )
-
-
-def describe(table: Any, name: str) -> str:
-    """An object in words, from the table `TrainedDrive.actors`."""
-    known = table.loc[name]
-    return f"{known['class']} {name[:8]}, up to {known['speed']:.0f} m/s"
-
-
-def wxyz_of(pose: np.ndarray) -> np.ndarray:
-    """The quaternion (4,) of a pose (4, 4), w first."""
-    return Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.drive.edit_session import EditSession
 from drivesplat.drive.live_controls import LiveControls
-from drivesplat.drive.live_overlays import wxyz_of
-from drivesplat.drive.live_view import FreeCamera, LiveView
+from drivesplat.drive.live_overlays import Overlays
+from drivesplat.drive.live_view import EditSession, FreeCamera, LiveView, wxyz_of
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import DriveSplatError, RequestError
 from drivesplat.scene.rigid import rigid
@@ -73,6 +72,7 @@ class LiveServer:
         self._server.scene.set_up_direction("+z")
         self.url = f"http://{host}:{port}"
         self.view, self.controls = view, LiveControls(self._server, view, Path(edits_file))
+        self._overlays = Overlays(self._server.scene, view, self.controls.click)
         self._closed, self._windows = threading.Event(), dict[int, WindowState]()
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(lambda client: self._windows.pop(client.client_id, None))
@@ -109,7 +109,7 @@ class LiveServer:
                     self.controls.advance(now - last)
                     if drawn != self.controls.version:
                         drawn = self.controls.version
-                        self.controls.draw_overlays()
+                        self._draw_overlays()
                 last = now
                 for client in self._server.get_clients().values():
                     self._show(client)
@@ -117,6 +117,12 @@ class LiveServer:
                 log.warning("%s", error)
                 self.controls.say(str(error))
                 self._closed.wait(PAUSE_S)
+
+    def _draw_overlays(self) -> None:
+        controls = self.controls
+        self._overlays.show_cameras(bool(controls.cameras.value))
+        self._overlays.draw_boxes(bool(controls.boxes.value))
+        self._overlays.draw_points(bool(controls.points.value))
 
     def _show(self, client: Any) -> None:
         """Renders the image of a window, if anything has changed or come to rest."""

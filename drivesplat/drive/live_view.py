@@ -1,22 +1,185 @@
-"""What a live viewer shows, without its server: the state that controls change, and the picture of a camera."""
+"""What a live viewer shows and changes, without its server: an edit in the making, and the picture of a camera."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
 
-from drivesplat.drive.cameras import PoseableCamera
-from drivesplat.drive.edit_session import EditSession
+from drivesplat.drive.cameras import Matrix, PoseableCamera, require_pose
 from drivesplat.drive.pictures import PICTURES, Picture, blended, error_picture, placed
 from drivesplat.drive.trained_drive import TrainedDrive
-from drivesplat.errors import DatasetError, RequestError
+from drivesplat.editing.actors import trained_actors
+from drivesplat.errors import DatasetError, DriveSplatError, RequestError, UnknownObjectError
+from drivesplat.io.storage import atomic_write
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.scene.images import read_image
+from drivesplat.scene.tracks import matching_ids
+from drivesplat.settings.names import NAME
+from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.workflow.edits_file import edit_of, read_edits
 
+DECIMALS = 3
+"""Of the metres and degrees of steps."""
+ITERATIONS = 4
+"""Steps of the search for a shift that places an object: on a bend its path is no straight line."""
 ERROR = "error"
 """The name of the picture of differences from the recorded image."""
 MIN_SIZE, MAX_SIZE = 16, 4096
 """Pixels of an edge of a picture."""
+
+
+@dataclass(frozen=True)
+class ObjectChange:
+    """What is done to an object during the whole drive: `longitudinal` and `lateral` metres ahead along its path and to
+    its left, `yaw` degrees to its left on the spot, its `colour` (None: as recorded), and whether it is `removed`."""
+
+    longitudinal: float = 0.0
+    lateral: float = 0.0
+    yaw: float = 0.0
+    colour: str | None = None
+    removed: bool = False
+
+    def steps(self, track: str) -> list[dict[str, Any]]:
+        """The steps of an edits file for the object with this id."""
+        if self.removed:
+            return [{"remove": {"track": track}}]
+        moved = {name: getattr(self, name) for name in ("lateral", "longitudinal", "yaw") if getattr(self, name)}
+        steps = [{"shift": {"track": track, **moved}}] if moved else []
+        return steps + ([{"recolour": {"track": track, "colour": self.colour}}] if self.colour else [])
+
+
+@dataclass
+class EditSession:
+    """The changes of a drive by object, and those of the ego vehicle: metres to its left, and a factor on its speed.
+
+    Objects are named by the beginnings of their ids. Raises UnknownObjectError for an object that cannot be edited,
+    ConfigError for changes beyond the limits of edits (docs/editing.md).
+
+    >>> session = EditSession(drivesplat.open("results/demo/street"))
+    >>> session.change("bf53", lateral=2.0)
+    >>> session.edited.render("CAM_FRONT", time=4.2).image.shape
+    (225, 400, 3)
+    """
+
+    drive: TrainedDrive
+    changes: dict[str, ObjectChange] = field(default_factory=dict)
+    ego_lateral: float = 0.0
+    ego_speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.drive.edit is not None:
+            raise RequestError("an edit begins with a drive as recorded, not with an edited one")
+        self._recorded = trained_actors(self.drive.model, self.drive.scene, self.drive.where)
+        self._made: tuple[list[dict[str, Any]], TrainedDrive] = [], self.drive
+
+    @property
+    def objects(self) -> list[str]:
+        """The ids of the objects that can be edited."""
+        return [actor.id for actor in self._recorded]
+
+    def steps(self) -> list[dict[str, Any]]:
+        """The steps of an edits file; none without changes."""
+        ego = {"lateral": self.ego_lateral} if self.ego_lateral else {}
+        ego |= {"speed": self.ego_speed} if self.ego_speed != 1.0 else {}
+        own = [step for track, change in self.changes.items() for step in change.steps(track)]
+        return own + ([{"ego": ego}] if ego else [])
+
+    @property
+    def edited(self) -> TrainedDrive:
+        """The drive with all changes."""
+        steps = self.steps()
+        if self._made[0] != steps:
+            self._made = steps, self.drive.edited(steps) if steps else self.drive
+        return self._made[1]
+
+    def change_of(self, name: str) -> ObjectChange:
+        """What is done to an object."""
+        return self.changes.get(self._actor(name).id, ObjectChange())
+
+    def change(self, name: str, **fields: Any) -> None:
+        """Changes fields of an object's `ObjectChange`. Nothing is changed where an edit could not do it."""
+        track = self._actor(name).id
+        rounded = {key: round(value, DECIMALS) if isinstance(value, float) else value for key, value in fields.items()}
+        changed = ObjectChange(**{**vars(self.change_of(track)), **rounded})
+        if steps := changed.steps(track):
+            edited_actors(self._recorded, edit_of(steps, f"object {track}"), self.drive.where)
+        self.changes = {**self.changes, track: changed}
+        if changed == ObjectChange():
+            del self.changes[track]
+
+    def place(self, name: str, object_to_world: Matrix, time: float) -> None:
+        """Shifts an object along and across its path so that it stands at a pose (4, 4) at a time in seconds. Its
+        height, pitch and roll stay those of its path."""
+        wanted, track = require_pose(object_to_world, f"object {name}"), self._actor(name).id
+        self.change(track, removed=False)
+        for _ in range(ITERATIONS):
+            now = self.change_of(track)
+            found = self._pose(track, time)
+            turn = np.arctan2(wanted[1, 0], wanted[0, 0]) - np.arctan2(found[1, 0], found[0, 0])
+            yaw = np.degrees(turn) + now.yaw
+            heading = np.arctan2(found[1, 0], found[0, 0]) - np.radians(now.yaw)
+            ahead, left = (np.array([np.cos(heading + a), np.sin(heading + a)]) for a in (0.0, 0.5 * np.pi))
+            missing = (wanted - found)[:2, 3]
+            self.change(
+                track,
+                longitudinal=float(now.longitudinal + missing @ ahead),
+                lateral=float(now.lateral + missing @ left),
+                yaw=float((yaw + 180.0) % 360.0 - 180.0),
+            )
+
+    def change_ego(self, lateral: float, speed: float) -> None:
+        """Moves the ego vehicle to its left by metres, at a factor on its speed. Nothing is changed where an edit could
+        not do it."""
+        before = self.ego_lateral, self.ego_speed
+        self.ego_lateral, self.ego_speed = round(lateral, DECIMALS), round(speed, DECIMALS)
+        try:
+            _ = self.edited
+        except DriveSplatError:
+            self.ego_lateral, self.ego_speed = before
+            raise
+
+    def reset(self, name: str) -> None:
+        """Takes back all changes of an object."""
+        self.changes.pop(self._actor(name).id, None)
+
+    def write(self, path: str | Path, name: str) -> None:
+        """Writes the steps as the edit `name` into an edits file; other edits of the file stay.
+
+        Raises RequestError without a change, for a name that no edit may have, and for a file with comments, which
+        would be lost; ConfigError where the file is no edits file.
+        """
+        path, steps, known = Path(path), self.steps(), {}
+        if not steps:
+            raise RequestError("nothing has been changed: there is no edit to write")
+        if not re.fullmatch(NAME, name):
+            raise RequestError(f"an edit cannot be named {name!r}: use letters, digits, '_', '-' and '.'")
+        if path.exists():
+            read_edits(path)
+            if any(line.lstrip().startswith("#") for line in path.read_text(encoding="utf-8").splitlines()):
+                raise RequestError(f"{path} has comments, which would be lost: name another file")
+            known = read_yaml(path, "edits file")["edits"] or {}
+        content = {"edits": {**known, name: steps}}
+        with atomic_write(path) as file:
+            file.write(yaml.safe_dump(content, sort_keys=False, allow_unicode=True).encode())
+
+    def _actor(self, name: str) -> EditedActor:
+        found = matching_ids(name, self.objects)
+        if len(found) != 1 or not name:
+            raise UnknownObjectError(f"no single object that can be edited has an id starting with {name!r}")
+        return next(actor for actor in self._recorded if actor.id == found[0])
+
+    def _pose(self, track: str, time: float) -> np.ndarray:
+        """The pose of an object after its changes."""
+        actor, steps = self._actor(track), self.change_of(track).steps(track)
+        if steps:
+            (actor,) = edited_actors([actor], edit_of(steps, f"object {track}"), self.drive.where)
+        return actor.poses(np.array([time]))[0]
 
 
 @dataclass(frozen=True)
@@ -127,3 +290,14 @@ class LiveView:
                 return None
         size = camera.width, camera.height
         return cv2.resize(self._images[index], size, interpolation=cv2.INTER_AREA)
+
+
+def describe(table: Any, name: str) -> str:
+    """An object in words, from the table `TrainedDrive.actors`."""
+    known = table.loc[name]
+    return f"{known['class']} {name[:8]}, up to {known['speed']:.0f} m/s"
+
+
+def wxyz_of(pose: np.ndarray) -> np.ndarray:
+    """The quaternion (4,) of a pose (4, 4), w first."""
+    return Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)

@@ -19,10 +19,9 @@ from drivesplat.drive.cameras import (
     require_pose,
     require_vector,
 )
-from drivesplat.drive.drive_scan import DriveScan
-from drivesplat.drive.drive_view import DriveView
+from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.lidars import PoseableLidar
-from drivesplat.drive.recording import Recording
+from drivesplat.drive.recorded_drive import RecordedDrive
 from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
 from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
 from drivesplat.editing.ego import EgoEdit
@@ -78,7 +77,8 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
             "results/demo/street"
         )
     checkpoint = read_checkpoint(folder / "checkpoint.npz")
-    recording = Recording.of_method(folder, checkpoint)
+    tracks = [track.id for part in checkpoint.parts for track in part.tracks]
+    recording = RecordedDrive.of_method(folder, tracks, "refine_poses" in checkpoint.provenance["stages"])
     kinds = get_args(DeviceSettings.model_fields["kind"].annotation)
     if not isinstance(device, DeviceSettings) and device not in kinds:
         raise RequestError(f"there is no device {device!r}; there are: {', '.join(kinds)}")
@@ -93,7 +93,7 @@ class TrainedDrive(Sensors):
     image, as in films and edits; world coordinates are metres, z up; `edit` is what `edited` has changed."""
 
     folder: Path
-    recording: Recording
+    recording: RecordedDrive
     model: SplatModel
     device: torch.device
     beam_spread: tuple[float, float]

@@ -23,7 +23,7 @@ from drivesplat.model.states import Want
 from drivesplat.readers.drive.write import write_record
 from drivesplat.readers.nuscenes.write import write_nuscenes
 from drivesplat.rendering.frames import film_frames
-from drivesplat.rendering.labels import depth_units, numbered, objects_in_view
+from drivesplat.rendering.labels import depth_units, numbered
 from drivesplat.scene.images import write_png
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import last_training_timestamp
@@ -112,7 +112,7 @@ def _write_label_images(
             write_png(named["depth"], depth_units(depth.cpu().numpy()))
         if "instances" in named:
             present = [actor for actor in actors if actor.present(np.array([view.time]))[0]]
-            shown = objects_in_view(model, gaussians, view).cpu().numpy()
+            shown = model.strongest(gaussians, gaussians.placement, view).cpu().numpy()
             write_png(named["instances"], numbered(shown, [numbers[actor.id] for actor in present]))
     return numbers
 

@@ -5,12 +5,13 @@ from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Int16
 from torch import Tensor, nn
 
 from drivesplat.errors import ResultError
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, GaussianSets, concatenate
+from drivesplat.model.groups import strongest_group
 from drivesplat.model.part import Part, RigidGroup, Sky
 from drivesplat.model.picture import Picture
 from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
@@ -184,6 +185,18 @@ class SplatModel(nn.Module):
     def composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
         """A rendering of `values` of Gaussians in place of their colours, without sky and exposure."""
         return rasterize(**_placed(gaussians, self.seen_from(view), self), colors=values)
+
+    def strongest(self, gaussians: Gaussians, groups: Int[Tensor, " n"] | None, view: View) -> Int16[Tensor, "h w"]:
+        """The one of `groups`, numbers from -1 of n Gaussians, that contributes most to each pixel; -1 where the sky
+        does, where nothing is met, and everywhere without groups."""
+        if groups is None:
+            return torch.full((view.height, view.width), -1, dtype=torch.int16, device=gaussians.means.device)
+
+        def composited(shares: Tensor) -> Tensor:
+            return self.composited(gaussians, shares.to(gaussians.means), view).image.squeeze(0)
+
+        sky = 1.0 - self.composited(gaussians, gaussians.means.new_ones(len(gaussians), 1), view).alpha
+        return strongest_group(groups, composited, sky.squeeze((0, 3))).to(torch.int16)
 
 
 def _sets(gaussians: Gaussians | Sequence[Gaussians]) -> GaussianSets:

@@ -1,10 +1,22 @@
 """Colours as 8-bit integers."""
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+
+from drivesplat.errors import ResultError
+
+NOT_FINITE = "a frame of a film contains NaN or Inf; delete its checkpoint.npz and rerun"
 
 
 def to_uint8(colors: Float[Tensor, "*n 3"]) -> UInt8[Tensor, "*n 3"]:
     """Colours in [0, 1] rounded to the nearest uint8, on their device; values beyond [0, 1] are clipped."""
     return (colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+
+
+def uint8_image(image: Float[Tensor, "h w 3"]) -> np.ndarray:
+    """Colours in [0, 1] as the nearest uint8, in main memory. Raises ResultError where one is NaN or Inf."""
+    if not torch.isfinite(image).all():
+        raise ResultError(NOT_FINITE)
+    return to_uint8(image).cpu().numpy()

@@ -21,7 +21,8 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.captions import Caption, captioned, drive_captions
-from drivesplat.rendering.frames import film_frame, film_frames, uint8_image
+from drivesplat.rendering.color_bytes import uint8_image
+from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.images import target_size
 from drivesplat.scene.scene import Scene

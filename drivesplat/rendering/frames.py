@@ -9,18 +9,15 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.captured_frames import FrameInput, GpuFrameRenderer, PendingFrame
-from drivesplat.rendering.color_bytes import to_uint8
+from drivesplat.rendering.color_bytes import NOT_FINITE, uint8_image
 
 T = TypeVar("T")
-NOT_FINITE = "a frame of a film contains NaN or Inf; delete its checkpoint.npz and rerun"
 
 
 def film_frames(model: SplatModel, inputs: Iterable[FrameInput]) -> Iterator[np.ndarray]:
@@ -37,13 +34,6 @@ def film_frames(model: SplatModel, inputs: Iterable[FrameInput]) -> Iterator[np.
 def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
     """Renders one view as `film_frames` does."""
     return next(film_frames(model, [(view, gaussians)]))
-
-
-def uint8_image(image: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Colours in [0, 1] as the nearest uint8, in main memory. Raises ResultError where one is NaN or Inf."""
-    if not torch.isfinite(image).all():
-        raise ResultError(NOT_FINITE)
-    return to_uint8(image).cpu().numpy()
 
 
 def _pipelined(submit: Callable[[T], PendingFrame], inputs: Iterable[T]) -> Iterator[np.ndarray]:

@@ -8,7 +8,7 @@ import torch
 from helpers.hand_made_drive import drive_of
 from helpers.hand_made_street import AHEAD, TURNING, street_model, street_scene
 
-from drivesplat.drive.edit_session import EditSession, ObjectChange
+from drivesplat.drive.live_view import EditSession, ObjectChange
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.film import edited_frames, edited_shots

@@ -11,8 +11,9 @@ from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made_drive import drive_of
 from helpers.hand_made_street import AHEAD, street_model, street_scene
 
-from drivesplat.drive.live_overlays import EDGES, wxyz_of
+from drivesplat.drive.live_overlays import EDGES
 from drivesplat.drive.live_server import LiveServer
+from drivesplat.drive.live_view import wxyz_of
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
 from drivesplat.workflow.edits_file import read_edits

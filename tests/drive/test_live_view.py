@@ -8,8 +8,7 @@ from helpers.hand_made_drive import drive_of
 from helpers.hand_made_street import AHEAD, street_model, street_scene
 
 import drivesplat
-from drivesplat.drive.edit_session import EditSession
-from drivesplat.drive.live_view import FreeCamera, LiveView
+from drivesplat.drive.live_view import EditSession, FreeCamera, LiveView
 from drivesplat.drive.pictures import PICTURES, blended, depth_picture, error_picture, number_colors, placed
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError

@@ -11,7 +11,7 @@ from helpers.scanned_street import scan_records, scanned_street
 from scipy.spatial.transform import Rotation
 
 import drivesplat
-from drivesplat.drive import sampled_world
+from drivesplat.drive import world_state
 from drivesplat.drive.cameras import mounted_velocity
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.drive.world_state import WorldState
@@ -205,7 +205,7 @@ def test_an_image_in_bands_is_the_image(world, drive, readout, monkeypatch):
     camera = drivesplat.Camera(known.width, known.height, known.K, known.camera_to_ego, readout_s=readout)
     outputs = ["rgb", "depth", "instance", "valid"]
     whole = world.render(camera, outputs=outputs, velocity=[8.0, 0, 0, 0, 0, 0.3])
-    monkeypatch.setattr(sampled_world, "MAX_PIXELS", 7 * known.width)
+    monkeypatch.setattr(world_state, "MAX_PIXELS", 7 * known.width)
     bands = world.render(camera, outputs=outputs, velocity=[8.0, 0, 0, 0, 0, 0.3])
     assert bands.rgb.shape == whole.rgb.shape
     torch.testing.assert_close(bands.rgb, whole.rgb, atol=0.02, rtol=0)

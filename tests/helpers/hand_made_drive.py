@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drivesplat.drive.recording import Recording
+from drivesplat.drive.recorded_drive import RecordedDrive
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.io.array_file import write_arrays
 from drivesplat.model.splat_model import SplatModel
@@ -26,5 +26,5 @@ def drive_of(scene: Scene, model: SplatModel, folder: Path, scans: ScanRecords |
     file = folder / "scans.npz"
     if scans is not None:
         write_arrays(file, dataclasses.asdict(scans))
-    recording = Recording("a test", scene, record, NO_EGO_MASK, file)
+    recording = RecordedDrive("a test", scene, record, NO_EGO_MASK, file)
     return TrainedDrive(folder / "street", recording, model, torch.device("cpu"), BEAM_SPREAD)

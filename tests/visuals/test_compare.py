@@ -14,7 +14,7 @@ from drivesplat.errors import DatasetError, ResultError
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.rendering.captions import BEYOND, Caption
-from drivesplat.rendering.frames import uint8_image
+from drivesplat.rendering.color_bytes import uint8_image
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.images import read_image
 from drivesplat.settings.device import DeviceSettings

@@ -1,5 +1,6 @@
 """The recording of a trained drive: its scene, and the sensors that recorded it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,6 @@ from drivesplat.editing.sensor_path import EgoPoses, recorded_ego
 from drivesplat.errors import RequestError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import SensorPoses
-from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan_record import RecordedScan, ScanRecords, read_scans
@@ -26,7 +26,7 @@ from drivesplat.trajectories.camera_path import recorded_frames, recorded_timest
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RecordedDrive:
     """A scene with the tracks of a method, its training images, the outlines of the vehicle's own body in them, and the
     file of its LiDAR scans, which may be missing. `where` names scene and method in messages. Times are seconds since
     the first image."""
@@ -38,12 +38,10 @@ class Recording:
     scans_file: Path
 
     @classmethod
-    def of_method(cls, folder: Path, checkpoint: TrainedCheckpoint) -> "Recording":
-        """The recording of the method with the result folder `folder`. Raises ResultError for missing files and those
-        of another version."""
+    def of_method(cls, folder: Path, tracks: Sequence[str], refined: bool) -> "RecordedDrive":
+        """The recording of the method with the result folder `folder`, whose model has these tracks, and poses that
+        were `refined` or not. Raises ResultError for missing files and those of another version."""
         results = folder.parent
-        tracks = [track.id for part in checkpoint.parts for track in part.tracks]
-        refined = "refine_poses" in checkpoint.provenance["stages"]
         own: Tracks = "discovered" if any(track.startswith(FOUND) for track in tracks) else "annotated"
         scene = read_scene(
             results / (REFINED if refined and own == "annotated" else Path(TRACK_FOLDERS[own], "scene.json"))
