@@ -7,11 +7,11 @@ from drivesplat.evaluation.synthetic import DriveTruth
 from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.evaluation_data import read_evaluation_data
-from drivesplat.settings.render import CompareJob
+from drivesplat.settings.render import TruthFilmJob
 from drivesplat.visuals.truth_film import render_truth_film
 
 with job(snakemake, dataset=("images",)) as current:
-    files, settings = current.input, current.settings(CompareJob)
+    files, settings = current.input, current.settings(TruthFilmJob)
     recording, upstream = read_evaluation_data(files.scene, files.parser, files.masks)
     checkpoint, known = read_checkpoint(files.checkpoint), DriveTruth.read(files.truth[0], recording)
     provenance = current.provenance(*upstream, checkpoint.provenance, inputs={"truth": sha256_file(known.path)})

@@ -1,5 +1,6 @@
 """The stage `edit`: an edited drive as a film beside the recorded one, and as labels."""
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -17,15 +18,18 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import Want
 from drivesplat.model.view import View
-from drivesplat.rendering.film import Shot, film_size, recorded_shot, write_film
+from drivesplat.rendering.film import Shot, recorded_shot, shot_of, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.images import write_png
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import EditJob, TrajectorySettings
 from drivesplat.trajectories.camera_path import film_path
 from drivesplat.trajectories.edited_actors import EditedActor
+
+log = logging.getLogger(__name__)
 
 DECIMALS = 6
 """Decimals of a pose in labels: micrometres, and 1e-4 degrees. More would double the size of the file."""
@@ -110,8 +114,21 @@ def edited_shots(scene: Scene, model: SplatModel, job: EditJob, where: str) -> E
     recorded, actors = recorded_and_edited(model, scene, job.camera, job.edit, where)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
-    before, after = (Shot(scene, cameras, job, film_size(scene, job)) for cameras in (unedited, path))
+    before, after = (shot_of(scene, cameras, job) for cameras in (unedited, path))
+    if len(after.cameras) < len(path):
+        warn_of_late_steps(job.edit, after.seconds[-1], where)
     return EditedShots(recorded, actors, before, after)
+
+
+def warn_of_late_steps(edit: Edit, end: float, where: str) -> None:
+    """Warns, beginning with `where`, of every step that changes nothing until the film's `end` in seconds."""
+    for number, step in enumerate(edit.steps, start=1):
+        if step.begins >= end:
+            log.warning(
+                "%s, step %d (%s): it begins at %.1f s, after the film's end at %.1f s, where training images end; "
+                "render: {end: recorded} shows it",
+                where, number, step.kind, step.begins, end,
+            )  # fmt: skip
 
 
 def edited_frames(

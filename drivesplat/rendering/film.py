@@ -5,7 +5,7 @@ import logging
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -95,6 +95,15 @@ class Shot:
         }
 
 
+def shot_of(scene: Scene, cameras: CameraPath, form: FilmFormat) -> Shot:
+    """The shot of a film along `cameras`, up to where `form.end` says. A camera without training images has all."""
+    shot = Shot(scene, cameras, form, film_size(scene, form))
+    if form.end == "recorded":
+        return shot
+    shown = np.array(shot.seconds) <= shot.trained_until
+    return replace(shot, cameras=cameras[: max(1, np.count_nonzero(shown))])
+
+
 def film_size(scene: Scene, job: FilmFormat) -> tuple[int, int]:
     """Width and height of a film in pixels, both even: as the settings say, otherwise those of the training images, at
     most MAX_WIDTH wide, with their aspect ratio. Raises DatasetError where the scene lacks the camera."""
@@ -113,7 +122,7 @@ def render_film(
     Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or a rendering contains NaN or Inf.
     """
-    shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, film_size(scene, job))
+    shot = shot_of(scene, film_path(scene, job.camera, job.fps, job.trajectory), job)
     model, device = open_model(checkpoint, device_settings)
     panels = Panels((f"{path.parent.name}: {path.stem}",), shot.size)
     parts = job.trajectory.parts
@@ -133,7 +142,7 @@ def render_parts(
     on plain grey. Returns the record of its cameras as `render_film` does, for one panel, with the `film` of all.
     Raises what `render_film` raises.
     """
-    shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, film_size(scene, job))
+    shot = shot_of(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job)
     model, device = open_model(checkpoint, device_settings)
     panels = Panels(("everything", "static", "moving"), shot.size)
     model.precompute(shot.seconds)

@@ -262,6 +262,14 @@ class Step(Settings):
         """The change of the step."""
         return getattr(self, self.kind)
 
+    @property
+    def begins(self) -> float:
+        """The second from which on the step changes something: 0 where it does so from the beginning."""
+        change: Any = self.change
+        if isinstance(change, Place):
+            return max(0.0, change.path[0][0])
+        return getattr(change, "start", getattr(change, "at", None)) or 0.0
+
 
 class Edit(Settings):
     """Steps that are applied in order, each to the result of the steps before it."""

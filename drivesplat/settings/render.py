@@ -9,6 +9,7 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 
 ShownParts = Literal["all", "moving", "static"]
+FilmEnd = Literal["trained", "recorded"]
 
 
 class TrajectorySettings(Settings):
@@ -39,6 +40,10 @@ class RenderSettings(Settings):
     """:printed: Horizontal field of view in degrees. null = that of the evaluated camera."""
     crf: int = Field(18, ge=1, le=51)
     """H.264 constant rate factor. Lower values give better quality and larger files; 18 is visually lossless."""
+    end: FilmEnd = "trained"
+    """:printed: Where films of images end: 'trained' at the last training image of the evaluated camera, 'recorded' at
+    the last recorded one. Beyond the training images models are blurred, or empty. Holds for films of trajectories, of
+    parts, of edits and of all methods side by side."""
     captions: bool = True
     """:printed: Write into films what is shown, the seconds of the drive, and where they go beyond the last training
     image."""
@@ -71,6 +76,7 @@ class FilmFormat(FilmEncoding):
     width: int | None
     height: int | None
     horizontal_fov: float | None
+    end: FilmEnd = "recorded"
     images: ImageSettings = Field(default_factory=ImageSettings)
     holdout: HoldoutSettings = Field(default_factory=HoldoutSettings)
 
@@ -88,12 +94,18 @@ class EditJob(FilmFormat):
     frames: bool = False
 
 
-class CompareJob(Settings):
-    """All settings that determine the film of recorded images beside the renderings of methods."""
+class TruthFilmJob(Settings):
+    """All settings that determine the film of a method beside the truth of a synthetic world."""
 
     eval_camera: str
     crf: int
     captions: bool
+
+
+class CompareJob(TruthFilmJob):
+    """All settings that determine the film of recorded images beside the renderings of methods."""
+
+    end: FilmEnd = "recorded"
 
 
 class LidarFilmJob(Settings):

@@ -36,14 +36,15 @@ def render_comparison(
     device_settings: DeviceSettings,
     path: Path,
 ) -> dict[str, Any]:
-    """Writes the MP4 `path` of the recorded images of the evaluated camera in order, trained on or held out, at the
-    size and rate at which they were recorded for training: the image, the rendering of each method with its PSNR over
-    the whole image, and the error of the last method. Returns the content of its JSON without provenance.
+    """Writes the MP4 `path` of the recorded images of the evaluated camera in order, trained on or held out, up to
+    where `job.end` says, at the size and rate at which they were recorded for training: the image, the rendering of
+    each method with its PSNR over the whole image, and the error of the last method. Returns the content of its JSON
+    without provenance.
 
     Raises DatasetError where the scene lacks the camera, DeviceError, and ResultError where the film cannot be written
     or a rendering contains NaN or Inf.
     """
-    record, images = recording.record, images_of(recording, job.eval_camera)
+    record, images = recording.record, shown_images(recording, job)
     first, last = "ground truth", f"error of {[*checkpoints][-1]}"
     panels = Panels((first, *checkpoints, last), even_size(recording.size(images[0])))
     opened = {name: open_model(checkpoint, device_settings) for name, checkpoint in checkpoints.items()}
@@ -68,6 +69,14 @@ def render_comparison(
     with explain_out_of_memory(lambda: sum(map(len, models.values()))):
         written = encode_film(path, frames(), len(images), panels, encoding)
     return film_record(job.eval_camera, encoding, panels, figures, written)
+
+
+def shown_images(recording: EvaluationData, job: CompareJob) -> list[int]:
+    """The indices of the film's images by time: up to where `job.end` says; all where none is a training image. Raises
+    what `images_of` raises."""
+    images = images_of(recording, job.eval_camera)
+    trained = [place for place, index in enumerate(images) if recording.split(index) == "train"]
+    return images[: trained[-1] + 1] if job.end == "trained" and trained else images
 
 
 def images_of(recording: EvaluationData, camera: str) -> list[int]:

@@ -18,7 +18,7 @@ from drivesplat.rendering.film import encode_film
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.render import CompareJob, FilmEncoding
+from drivesplat.settings.render import FilmEncoding, TruthFilmJob
 from drivesplat.visuals.beside_truth import even_size, film_rate, film_record, finite_image, panel_pictures, with_psnr
 
 Place = tuple[str, int, Frame, TruthFrame]
@@ -29,7 +29,7 @@ def render_truth_film(
     checkpoint: TrainedCheckpoint,
     known: DriveTruth,
     method: str,
-    job: CompareJob,
+    job: TruthFilmJob,
     device_settings: DeviceSettings,
     path: Path,
 ) -> dict[str, Any]:

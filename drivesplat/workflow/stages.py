@@ -24,7 +24,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, RegionJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
-from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob
+from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob, TruthFilmJob
 from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
@@ -249,7 +249,7 @@ def _world(at: JobScope) -> dict[str, Any]:
 
 def _film_format(at: JobScope) -> dict[str, Any]:
     """Of a `FilmFormat`."""
-    fields = ("fps", "width", "height", "horizontal_fov", "crf", "captions")
+    fields = ("fps", "width", "height", "horizontal_fov", "crf", "captions", "end")
     return {"camera": at.config.eval_camera, **{name: getattr(at.config.render, name) for name in fields}}
 
 
@@ -325,8 +325,8 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "tracks": (TracksJob, _nothing),
     "film": (FilmJob, _film),
     "film_parts": (FilmFormat, _film_format),
-    "compare": (CompareJob, _encoding),
-    "truth_film": (CompareJob, _encoding),
+    "compare": (CompareJob, lambda at: {**_encoding(at), "end": at.config.render.end}),
+    "truth_film": (TruthFilmJob, _encoding),
     "edit": (EditJob, lambda at: {**_quad(at), "frames": at.config.render.edited_frames}),
     "quad": (EditJob, _quad),
     "drive_folder": (DriveJob, _drive_folder),

@@ -15,7 +15,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.evaluation.synthetic import DriveTruth
 from drivesplat.rendering.captions import Caption
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.render import CompareJob
+from drivesplat.settings.render import TruthFilmJob
 from drivesplat.visuals import truth_film
 from drivesplat.visuals.truth_film import places_of, render_truth_film
 
@@ -32,7 +32,7 @@ def known(tmp_path_factory) -> DriveTruth:
 
 
 def film(known: DriveTruth, path: Path, **changes: Any) -> dict[str, Any]:
-    job = CompareJob(**{"eval_camera": "CAM_FRONT", "crf": 18, "captions": False, **changes})
+    job = TruthFilmJob(**{"eval_camera": "CAM_FRONT", "crf": 18, "captions": False, **changes})
     record = render_truth_film(checkpoint_of(street_model()), known, "street", job, CPU, path)
     return json.loads(json.dumps(record, allow_nan=False))
 
