@@ -25,7 +25,7 @@ from drivesplat.scene.images import write_png
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
-from drivesplat.settings.render import EditJob, TrajectorySettings
+from drivesplat.settings.render import RECORDED_IN_WORDS, EditJob, TrajectorySettings
 from drivesplat.trajectories.camera_path import film_path
 from drivesplat.trajectories.edited_actors import EditedActor
 
@@ -75,7 +75,8 @@ def render_edit(
         files.frames.rmdir()
     if job.frames:
         changed = written_frames(files.frames, changed)
-    write_film(files.film, still.pairs(shown, changed), after, model, panels, drive.notes)
+    labels = [RECORDED_IN_WORDS, f"edited: {files.film.stem}"]
+    write_film(files.film, still.pairs(shown, changed), after, model, panels, drive.notes, labels)
     write_png(files.still, still.picture)
     dynamic = {track.id for track in scene.tracks if track.object_class.is_dynamic}
     others = [item for item in other_objects(scene, drive.recorded) if item.id in dynamic]

@@ -28,7 +28,7 @@ from drivesplat.scene.images import target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import last_training_timestamp
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.render import FilmEncoding, FilmFormat, FilmJob, ShownParts, TrajectorySettings
+from drivesplat.settings.render import PARTS_IN_WORDS, FilmEncoding, FilmFormat, FilmJob, ShownParts, TrajectorySettings
 from drivesplat.trajectories.camera_path import CameraPath, film_intrinsics, film_path, recorded_frames
 
 log = logging.getLogger(__name__)
@@ -124,7 +124,7 @@ def render_film(
     """
     shot = shot_of(scene, film_path(scene, job.camera, job.fps, job.trajectory), job)
     model, device = open_model(checkpoint, device_settings)
-    panels = Panels((f"{path.parent.name}: {path.stem}",), shot.size)
+    panels = Panels((f"{path.parent.name}: {job.trajectory.in_words}",), shot.size)
     parts = job.trajectory.parts
     if parts == "all":
         pictures = recorded_shot(model, shot, device)
@@ -147,7 +147,8 @@ def render_parts(
     panels = Panels(("everything", "static", "moving"), shot.size)
     model.precompute(shot.seconds)
     of_all = (frames_of_parts(model, view, PARTS_SHOWN) for view in shot.views(device))
-    figures = write_film(path, map(panels.assembled, of_all), shot, model, panels)
+    captions = [PARTS_IN_WORDS[parts] for parts in PARTS_SHOWN]
+    figures = write_film(path, map(panels.assembled, of_all), shot, model, panels, labels=captions)
     return {**shot.record(), "shows": ["all", "still", "moving"], "film": panels.record(), **figures}
 
 
@@ -158,14 +159,15 @@ def write_film(
     model: SplatModel,
     panels: Panels,
     notes: Sequence[str] = (),
+    labels: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Writes an MP4 of one picture of `panels` for each camera of `shot`, with the captions of the drive and `notes`;
-    returns `render_seconds` and `bytes`.
+    returns `render_seconds` and `bytes`. `labels` are what captions say of each panel, by default its own label.
 
     Raises DeviceError, which tells the size of `model`, where memory is exhausted, and ResultError where the film
     cannot be written.
     """
-    captions = drive_captions(panels.labels, shot.seconds, shot.trained_until, notes)
+    captions = drive_captions(labels or panels.labels, shot.seconds, shot.trained_until, notes)
     with explain_out_of_memory(lambda: len(model)):
         frames = zip(pictures, captions, strict=True)
         return encode_film(path, frames, len(captions), panels, shot.format)

@@ -10,6 +10,12 @@ from drivesplat.settings.images import HoldoutSettings, ImageSettings
 
 ShownParts = Literal["all", "moving", "static"]
 FilmEnd = Literal["trained", "recorded"]
+RECORDED_IN_WORDS = "recorded drive, rendered"
+"""The caption of a film along the recorded path."""
+PARTS_IN_WORDS: dict[ShownParts, str] = {
+    "all": "everything", "static": "without moving objects", "moving": "moving objects alone",
+}  # fmt: skip
+"""What captions say of the parts that a film shows."""
 
 
 class TrajectorySettings(Settings):
@@ -24,6 +30,22 @@ class TrajectorySettings(Settings):
     parts: ShownParts = "all"
     """:printed: Parts of the model to show: 'all', 'moving' (objects alone, on grey) or 'static' (the background
     without them). Methods without moving parts have only films of 'all'."""
+
+    @property
+    def in_words(self) -> str:
+        """What a film along the path shows, for captions.
+
+        >>> TrajectorySettings(lateral=-2, vertical=1, yaw=10).in_words
+        '2 m to the right, 1 m up, turned 10 degrees to the left'
+        >>> TrajectorySettings().in_words
+        'recorded drive, rendered'
+        """
+        sides = {True: "to the left", False: "to the right"}
+        words = [PARTS_IN_WORDS[self.parts]] if self.parts != "all" else []
+        words += [f"{abs(self.lateral):g} m {sides[self.lateral > 0]}"] if self.lateral else []
+        words += [f"{abs(self.vertical):g} m {'up' if self.vertical > 0 else 'down'}"] if self.vertical else []
+        words += [f"turned {abs(self.yaw):g} degrees {sides[self.yaw > 0]}"] if self.yaw else []
+        return ", ".join(words) or RECORDED_IN_WORDS
 
 
 class RenderSettings(Settings):

@@ -5,11 +5,17 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from helpers.hand_made_street import AHEAD, a_format, checkpoint_of, street_model, street_scene
 
-from drivesplat.rendering.captions import BEYOND, captioned, drive_captions, text_mask
+from drivesplat.editing.film import EditFiles, render_edit
+from drivesplat.rendering.captions import BEYOND, Caption, captioned, drive_captions, text_mask
+from drivesplat.rendering.film import render_film, render_parts
 from drivesplat.rendering.panels import MAX_WIDTH, Panels
 from drivesplat.scene.splits import last_training_timestamp
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.edit import Edit
 from drivesplat.settings.images import HoldoutSettings
+from drivesplat.settings.render import EditJob, FilmJob, TrajectorySettings
 
 HEIGHT, WIDTH = 180, 640
 
@@ -90,3 +96,43 @@ def test_a_film_is_as_wide_as_browsers_play_and_each_panel_where_the_record_says
         there = film[place["top"] : place["top"] + 4, place["left"] : place["left"] + width]
         np.testing.assert_array_equal(there, pictures[number])
     assert (film > 0).sum() == count * 4 * width * 3, "places without a panel are black"
+
+
+@pytest.mark.parametrize(
+    ("offset", "words"),
+    [
+        ({}, "recorded drive, rendered"),
+        ({"lateral": 2.0}, "2 m to the left"),
+        ({"lateral": -2.5}, "2.5 m to the right"),
+        ({"vertical": -0.5, "yaw": -10.0}, "0.5 m down, turned 10 degrees to the right"),
+        ({"lateral": -2.0, "vertical": 1.0, "yaw": 10.0}, "2 m to the right, 1 m up, turned 10 degrees to the left"),
+        ({"parts": "moving"}, "moving objects alone"),
+        ({"parts": "static", "lateral": 3.0}, "without moving objects, 3 m to the left"),
+    ],
+)
+def test_a_trajectory_says_in_words_where_the_camera_is_and_what_it_shows(offset, words):
+    assert TrajectorySettings(**offset).in_words == words
+
+
+def test_films_are_captioned_in_words_beside_the_names_of_the_method_and_the_edit(tiny_scene, tmp_path, monkeypatch):
+    scene, checkpoint = street_scene(tiny_scene), checkpoint_of(street_model())
+    captions: dict[str, Caption] = {}
+
+    def encoder(path, frames, count, panels, form):
+        captions[path.stem] = [caption for _, caption in frames][-1]
+        return {}
+
+    monkeypatch.setattr("drivesplat.rendering.film.encode_film", encoder)
+    (tmp_path / "street").mkdir()
+    form, cpu = a_format(holdout=HoldoutSettings(last_block=2)).model_dump(), DeviceSettings(kind="cpu")
+    aside = FilmJob(**form, trajectory=TrajectorySettings(lateral=-2.0))
+    render_film(scene, checkpoint, aside, cpu, tmp_path / "street/aside.mp4")
+    parts = render_parts(scene, checkpoint, a_format(), cpu, tmp_path / "parts.mp4")
+    job = EditJob(**form, edit=Edit.model_validate({"steps": [{"remove": {"track": AHEAD}}]}))
+    edit = render_edit(scene, checkpoint, job, cpu, EditFiles(tmp_path / "gone.mp4", tmp_path / "gone.png"))
+    assert [*captions["aside"].labels] == ["street: 2 m to the right"]
+    assert (captions["aside"].notes[0], captions["aside"].clock) == (BEYOND, "4.5 s")
+    assert [*captions["parts"].labels] == ["everything", "without moving objects", "moving objects alone"]
+    assert [*captions["gone"].labels] == ["recorded drive, rendered", "edited: gone"]
+    shown = [[place["shows"] for place in record["film"]["panels"]] for record in (parts, edit)]
+    assert shown == [["everything", "static", "moving"], ["recorded", "gone"]], "records keep the names of panels"
