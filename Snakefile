@@ -58,6 +58,7 @@ rule metrics:
 rule films:
     input:
         plan.films,
+        film_pages.pages,
 
 
 rule edits:

@@ -43,11 +43,13 @@ try:
     plan.targets = run_targets(wanted, workflow.is_main_process) if main else None
     run_costs = RunCosts(plan, workflow, asked.targets)
     across_scenes = plan.report(wanted)
+    film_pages = plan.film_pages()
     plan.edits()
     if main and workflow.is_main_process and not asked.lint:
         plan.refuse_unknown(wanted)
         plan.refuse_download(wanted)
         across_scenes.refuse_empty()
+        film_pages.refuse_empty(wanted)
         if wanted != [COSTS]:
             plan.refuse_absent_data(wanted)
         run_costs.report_at_planning()

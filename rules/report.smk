@@ -1,9 +1,29 @@
-# The gap between static and dynamic pixels, across scenes and methods.
+# The gap between static and dynamic pixels, across scenes and methods; and the page of a scene's films.
 #
 # REQUIRED INPUTS: <results>/{scene}/metrics.json of all scenes, with their pictures and films; where the report is the
 # only target, of the measured scenes, with the files that exist.
-# OUTPUTS: <results>/gap_report.html, gap_report.json and gap_report.csv, ghosts.html, .report/gap_report.html (the page
+# OUTPUTS: <results>/{scene}/index.html; <results>/gap_report.html, gap_report.json and gap_report.csv, ghosts.html, .report/gap_report.html (the page
 # for Snakemake's report), and a table on the console.
+
+
+rule film_page:
+    """
+    Writes a page with all films of a scene and what each shows in words, its pictures, and links to figures and viewers.
+    """
+    output:
+        page="<results>/{scene}/index.html",
+    log:
+        "<logs>/{scene}/film_page.log",
+    benchmark:
+        "<benchmarks>/{scene}/film_page.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    params:
+        # no inputs: the page names files and reads none, so that it asks for no film and a new film does not change it
+        settings=film_pages.settings,
+        code=plan.code("film_page"),
+    script:
+        "../workflow_scripts/film_page.py"
 
 
 rule gap_report:

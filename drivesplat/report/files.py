@@ -15,7 +15,7 @@ from drivesplat import WORKFLOW
 from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
 from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import atomic_write, write_json
-from drivesplat.report import ghosts_page
+from drivesplat.report import film_page, ghosts_page
 from drivesplat.report.gaps import gap_report, summary_sentences
 from drivesplat.report.html import report_page
 from drivesplat.report.media import collect_media
@@ -27,9 +27,10 @@ from drivesplat.report.tables import (
     whole_image_table,
     write_figures,
 )
-from drivesplat.settings.report import ReportJob
+from drivesplat.settings.report import FilmPageJob, ReportJob
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
+from drivesplat.workflow.film_names import FILM_PAGE
 from drivesplat.workflow.report_plan import REPORT_FILES
 
 _PICTURE = re.compile(r"!\[([^\]\n]*)\]\(([^)\s]+)\)")
@@ -45,6 +46,8 @@ def write_report(
     page, record, table, ghosts, archived = (results / name for name in REPORT_FILES)
     report = gap_report(list(metrics), job, results / "logs")
     media = collect_media([*pictures, *links], results)
+    # the archive has films, but not the pages that show them
+    packed = collect_media([*pictures, *(link for link in links if Path(link).name != FILM_PAGE)], results)
     write_json(record, report)
     write_figures(table, report)
     # the costs of the configured scenes so far
@@ -54,8 +57,13 @@ def write_report(
     costs = [totals[scene] for scene in job.expected if scene in totals]
     _write_page(ghosts, render_ghosts_page())
     _write_page(page, report_page(report, media, costs))
-    _write_page(archived, report_page(report, media, costs, lambda name: address_in_archive(results / name)))
+    _write_page(archived, report_page(report, packed, costs, lambda name: address_in_archive(results / name)))
     print(console_table(report), flush=True)
+
+
+def write_film_page(path: Path, job: FilmPageJob) -> None:
+    """Writes the page of a scene's films to `path`, in the scene's folder of results."""
+    _write_page(path, filled_page(film_page, job=job))
 
 
 def _write_page(path: Path, page: str) -> None:

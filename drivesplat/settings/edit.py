@@ -227,6 +227,13 @@ class Ego(Gradual):
 Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | Rescale | Recolour | Ego
 
 
+def _short(value: Any) -> str:
+    """A value of a step's field in a line of text."""
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_short(item) for item in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 class Step(Settings):
     """One step of an edit. Exactly one field is set."""
 
@@ -261,6 +268,17 @@ class Step(Settings):
     def change(self) -> Change:
         """The change of the step."""
         return getattr(self, self.kind)
+
+    @property
+    def in_words(self) -> str:
+        """The step in one line: its name, the track, and the fields that were set.
+
+        >>> Step(stop=Stop(track="6e5c", at=3)).in_words
+        'stop 6e5c, at 3'
+        """
+        given = self.change.model_dump(exclude_defaults=True, by_alias=True, exclude={"track"})
+        track = [self.change.track] if hasattr(self.change, "track") else []
+        return ", ".join([" ".join([self.kind, *track]), *(f"{name} {_short(value)}" for name, value in given.items())])
 
     @property
     def begins(self) -> float:

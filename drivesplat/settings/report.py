@@ -1,4 +1,4 @@
-"""Settings of the report across scenes."""
+"""Settings of the report across scenes, and of the page of a scene's films."""
 
 from typing import Any
 
@@ -27,3 +27,30 @@ class ReportJob(Settings):
     """Random seed of the bootstrap over scenes."""
     published: tuple[PublishedFigures, ...] = ()
     """Published figures to show beside the measured ones."""
+
+
+class ShownFile(Settings):
+    """A film, picture or link of a page of films."""
+
+    path: str
+    """Relative to the page."""
+    words: str
+    """What it shows."""
+    poster: str | None = None
+    """A picture of a film, relative to the page. None: its first frame."""
+
+
+class FilmSection(Settings):
+    """The films of a method, or of all methods together, with pictures and links."""
+
+    title: str
+    films: tuple[ShownFile, ...] = ()
+    pictures: tuple[ShownFile, ...] = ()
+    links: tuple[ShownFile, ...] = ()
+
+
+class FilmPageJob(Settings):
+    """All settings that determine the page of a scene's films."""
+
+    scene: str
+    sections: tuple[FilmSection, ...]

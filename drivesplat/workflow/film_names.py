@@ -9,6 +9,11 @@ from drivesplat.workflow.edits_file import read_edits
 
 EDITS, TRAJECTORIES = "edits", "trajectories"
 """Kinds of folders of drives and of scans, and the folders of a method in which they lie."""
+QUAD = "quad"
+"""The folder of a method with its films of four panels."""
+
+FILM_PAGE = "index.html"
+"""The page of a scene's films, in its folder."""
 
 
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:

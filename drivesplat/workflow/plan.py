@@ -22,6 +22,7 @@ from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, no_such_edit, no_such_film, scene_edits
+from drivesplat.workflow.film_pages import FilmPages
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
 from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
@@ -95,6 +96,10 @@ class Plan(JobResources):
     def report(self, targets: list[str]) -> ReportPlan:
         """The plan of the report across scenes for these `targets`."""
         return ReportPlan(self, targets)
+
+    def film_pages(self) -> FilmPages:
+        """The pages of films for the targets of the run."""
+        return FilmPages(self, lambda: self.targets)
 
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError with the known names if a target names an unknown scene, method or film, or an ablation

@@ -6,6 +6,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.settings.report import HELD_OUT_PAIR, LIDAR_LOOKS, LOOKS, ReportJob
+from drivesplat.workflow.film_names import FILM_PAGE
 from drivesplat.workflow.outputs import Outputs
 from drivesplat.workflow.without_cameras import has_cameras
 
@@ -61,11 +62,12 @@ class ReportPlan:
         return [*_chosen(with_figures, not self._alone), *_chosen(looks, self._everything)]
 
     def links(self, _: Any = None) -> list[str]:
-        """The files that its page links to: films, edits and viewers, in an order that does not depend on files of
-        settings."""
+        """The files that its page links to: films, pages of films, edits and viewers, in an order that does not depend
+        on files of settings."""
         viewers = self._plan.of_methods(lambda *_: ["viewer.html"], self.scenes)
         films, edits = self._plan.films(scenes=self.scenes), self._plan.edits(scenes=self.scenes)
-        return _chosen(sorted([*films, *edits, *viewers]), self._everything)
+        pages = [f"{self._results}/{scene}/{FILM_PAGE}" for scene in self.scenes]
+        return _chosen(sorted([*films, *edits, *viewers, *pages]), self._everything)
 
     def settings(self, _: Any = None) -> str:
         """The settings of its job as canonical JSON."""
