@@ -72,6 +72,9 @@ class RenderSettings(Settings):
     compare: bool = True
     """:printed: Make compare.mp4 with the films of a scene: its recorded images beside the renderings of all methods.
     It can always be asked for by its name."""
+    quad: tuple[str, ...] = ()
+    """:printed: Names of edits whose films of four panels are made with the films of a scene: recorded images, their
+    reconstruction, the smooth drive, the edit. They can always be asked for: quad/{edit}.mp4."""
     lidar: bool = True
     """:printed: Make lidar.mp4 with the films of methods that render LiDAR: recorded scans beside rendered ones. It can
     always be asked for by its name."""

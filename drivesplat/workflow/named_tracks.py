@@ -9,12 +9,12 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.settings.config import Config
+from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.track_references import EditReference, TrackReferences
 from drivesplat.settings.tracks import FOUND, Tracks
 from drivesplat.settings.visuals import SubjectSettings
-from drivesplat.workflow.film_names import EDITS, scene_edits
+from drivesplat.workflow.film_names import EDITS, QUAD, scene_edits
 
 RULES_OF_EDITS = ("edit", "quad", "drive_folder", "scan_folder")
 """Rules that render an edit; the last two also render trajectories, which name no tracks."""
@@ -44,7 +44,8 @@ def track_references(
     chosen, everything = set(targets or ()), targets is not None and (not targets or "all" in targets)
     files = [path for path in map(PurePosixPath, chosen) if scene in path.parts]
     pairs = (pair for path in files for pair in pairwise(path.with_suffix("").parts))
-    films = {name for folder, name in pairs if folder in ("edits", "quad")}
+    films = {name for folder, name in pairs if folder in (EDITS, QUAD)}
+    films |= set(for_scene(config, scene).render.quad if "films" in chosen else ())
     every_edit = everything or bool({"edits", "drives"} & chosen)
     pictured = everything or "looks" in chosen or any(path.stem in FILES_OF_SUBJECT for path in files)
     editable = any(method.object_parts and method.tracks == tracks for method in config.methods.values())

@@ -11,7 +11,7 @@ from drivesplat.provenance.code_digest import code_digest
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
 from drivesplat.settings.tracks import TRACK_FOLDERS
-from drivesplat.workflow.film_names import EDITS, TRAJECTORIES
+from drivesplat.workflow.film_names import EDITS, QUAD, TRAJECTORIES, no_such_edit, scene_edits
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.named_tracks import fitting_edits
 from drivesplat.workflow.running_code import planned_digest
@@ -111,11 +111,13 @@ class Outputs(Inputs):
 
     def films(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
         """The films of every method of `scenes`, by default the batch's, of the parts of methods with moving ones,
-        of LiDAR scans, and of all methods side by side."""
+        of LiDAR scans, of four panels where the settings name edits, and of all methods side by side. Raises
+        ConfigError where they name an unknown edit."""
         chosen = self.config.batch_scenes if scenes is None else list(scenes)
         compared = [scene for scene in self._with_cameras(chosen) if for_scene(self.config, scene).render.compare]
         of_methods = self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], chosen, False)
-        return [*(f"{self.config.results_dir}/{scene}/{COMPARE_FILM}" for scene in compared), *of_methods]
+        of_edits = self.of_methods(lambda *at: [f"{QUAD}/{edit}.mp4" for edit in self._quad_names(*at)], chosen)
+        return [*(f"{self.config.results_dir}/{scene}/{COMPARE_FILM}" for scene in compared), *of_methods, *of_edits]
 
     def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
         """The films of every edit of `scenes`, by default the batch's, by every method that can be edited. Raises
@@ -191,6 +193,15 @@ class Outputs(Inputs):
         if method not in self.methods_with_actors:
             return ()
         return fitting_edits(self.config, scene, self.config.all_methods[method].tracks)
+
+    def _quad_names(self, scene: str, method: str) -> list[str]:
+        """The edits whose films of four panels a method has by the settings: of scenes with an edits file."""
+        wanted, known = for_scene(self.config, scene).render.quad, scene_edits(self.config, scene)
+        for name in wanted if known else ():
+            if name not in known:
+                raise ConfigError(f"render.quad: {no_such_edit(scene, name, known)}")
+        fitting = self._edit_names(scene, method)
+        return [name for name in wanted if name in fitting]
 
     def metrics_stages(self, scene: str) -> dict[str, Any]:
         """The settings and code that a scene's metrics.json should come from, by the names of the stages."""

@@ -8,9 +8,12 @@ import pytest
 from helpers import REPOSITORY
 
 from drivesplat.errors import ConfigError
+from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings.edit import Edit
+from drivesplat.settings.method import merged
 from drivesplat.settings.report import FilmPageJob
 from drivesplat.workflow.film_pages import FilmPages
+from drivesplat.workflow.named_tracks import track_references
 from drivesplat.workflow.plan import Plan
 
 EDITS = """\
@@ -22,16 +25,22 @@ edits:
 TRAJECTORIES = {"aside": {"lateral": -2.0}, "plain": {}, "objects": {"parts": "moving"}}
 
 
-@pytest.fixture
-def pages(tmp_path) -> FilmPages:
-    """Scenes a1, which has an edit, and a2 of a plan whose results are in `tmp_path`/out; set `targets` of its plan."""
+def plan(tmp_path: Path, **render: Any) -> Plan:
+    """Of scenes a1, which has an edit, and a2; results are in `tmp_path`/out."""
     (tmp_path / "edits.yaml").write_text(EDITS)
     dataset = {"scenes": ["a1", "a2"], "edits": {"a1": str(tmp_path / "edits.yaml")}}
     values = {
-        "datasets": {"a": dataset}, "render": {"trajectories": TRAJECTORIES}, "results_dir": str(tmp_path / "out"),
+        "datasets": {"a": dataset}, "results_dir": str(tmp_path / "out"),
+        "render": {"trajectories": TRAJECTORIES, **render},
         "methods": {"vanilla": {}, "street": {"parts": ["background", "actors"]}},
     }  # fmt: skip
-    return Plan(values, str(REPOSITORY)).film_pages()
+    return Plan(values, str(REPOSITORY))
+
+
+@pytest.fixture
+def pages(tmp_path) -> FilmPages:
+    """Of that plan, whose `targets` tests set."""
+    return plan(tmp_path).film_pages()
 
 
 def shown(pages: FilmPages, *targets: str, scene: str = "a1") -> dict[str, str]:
@@ -116,3 +125,29 @@ def test_an_edit_has_its_still_as_poster(pages):
 )
 def test_a_step_of_an_edit_is_a_line_of_words(step, words):
     assert Edit.model_validate({"steps": [step]}).steps[0].in_words == words
+
+
+# ---- films of four panels
+
+
+def test_films_of_four_panels_come_with_films_where_the_settings_name_their_edits(tmp_path):
+    chosen = plan(tmp_path, quad=["gone"])
+    film = f"{tmp_path}/out/a1/street/quad/gone.mp4"
+    assert film in chosen.films() and [path for path in chosen.films() if "quad" in path] == [film]
+    assert film not in plan(tmp_path).films()
+    assert "street/quad/gone.mp4" in shown(chosen.film_pages(), "films")
+    named = track_references(chosen.config, "a1", ["films"]).edits
+    assert {reference.track for reference in named} == {"a", "b"}, "checked before a run deletes anything"
+    assert not track_references(plan(tmp_path).config, "a1", ["films"]).edits
+
+
+def test_an_unknown_edit_of_four_panels_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"^render\.quad: scene a1 has no edit called 'halt'; there are: gone"):
+        plan(tmp_path, quad=["halt"]).films()
+
+
+def test_the_demo_makes_the_methods_side_by_side_and_one_edit_in_four_panels():
+    preset = read_yaml(REPOSITORY / "presets/demo.yaml", "preset")
+    files = Plan(merged(read_yaml(REPOSITORY / "config.yaml", "config file"), preset), str(REPOSITORY)).films()
+    assert "results/demo/compare.mp4" in files
+    assert [path for path in files if "/quad/" in path] == ["results/demo/street/quad/two_oncoming.mp4"]
