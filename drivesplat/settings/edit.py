@@ -185,8 +185,14 @@ Color = Annotated[tuple[Channel, Channel, Channel], BeforeValidator(_color)]
 """Red, green and blue in [0, 1], as images encode them. Read from these, a CSS name or '#rrggbb'."""
 
 
+MIN_CHROMA = 0.2
+"""The least difference of the channels, in [0, 1], of paint that does not look like tyres, glass and highlights."""
+
+
 class Recolour(Settings):
-    """Changes the colours of the track, all its surfaces alike."""
+    """Changes the colours of the track: those of its paint if `from` names it, otherwise of all its surfaces alike."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
 
     track: Id
     hue: float = Field(0.0, ge=-360, le=360)
@@ -197,11 +203,19 @@ class Recolour(Settings):
     """Factor on the brightness."""
     colour: Color | None = None
     """The colour that white becomes; darker surfaces become darker shades of it. Also for grey vehicles."""
+    paint: Color | None = Field(None, alias="from")
+    """The recorded colour of the paint, which becomes `colour`. Grey surfaces stay: tyres, glass, highlights."""
 
     @model_validator(mode="after")
     def _changes(self) -> "Recolour":
         if self.colour is not None and (self.hue or self.saturation != 1):
             raise ValueError("'colour' replaces hue and saturation: give it alone, or with 'value'")
+        if self.paint is not None and self.colour is None:
+            raise ValueError("'from' without 'colour': say which colour the paint becomes")
+        if self.paint is not None and max(self.paint) - min(self.paint) < MIN_CHROMA:
+            raise ValueError(
+                "'from' is a grey: white, grey and black paint looks like tyres and glass; give 'colour' alone"
+            )
         if self.colour is None and self.hue % 360 == 0 and self.saturation == self.value == 1:
             raise ValueError("give at least one of 'hue', 'saturation', 'value' and 'colour', other than 0, 1 and 1")
         return self

@@ -213,7 +213,14 @@ def color_matrix(change: Recolour) -> np.ndarray:
     A linear map applies to every spherical harmonic and to every coefficient of a colour that varies with time, so that
     shading and highlights stay. The hue is therefore a rotation about the axis of greys, which equals that of HSV for
     rotations by multiples of 120 degrees, and the saturation is the distance from that axis.
+
+    With the colour of the paint, the matrix replaces the amount of paint in a colour, its chroma along that of the
+    paint. Greys have none: white light mirrored by paint is added to it before and after.
     """
+    if change.paint is not None:
+        paint, new = np.array(change.paint), change.value * np.array(change.colour)
+        chroma = paint - paint.mean()
+        return np.eye(3) + np.outer(new - paint, chroma) / (chroma @ chroma)
     if change.colour is not None:
         return change.value * np.outer(change.colour, TO_GREY[0])
     turn = Rotation.from_rotvec(np.radians(change.hue) * GREY_AXIS).as_matrix()

@@ -46,3 +46,33 @@ def test_a_colour_replaces_that_of_grey_paint_and_keeps_its_shades():
     found = recoloured(colour=red, value=1.2)
     np.testing.assert_allclose(found, 1.2 * PAINTS.mean(axis=1, keepdims=True) * red)
     assert found[2].argmax() == 0, "a grey car becomes red"
+
+
+GOLD, BLUE = np.array([0.9, 0.7, 0.1]), (0.1, 0.2, 0.7)
+
+
+def repainted(colors: np.ndarray, **change) -> np.ndarray:
+    return colors @ color_matrix(Recolour.model_validate({"track": "x", "from": tuple(GOLD), **change})).T
+
+
+@pytest.mark.parametrize("value", [1.0, 0.6])
+def test_paint_becomes_another_in_every_shade_while_greys_and_highlights_stay(value):
+    greys = np.array([[0.05] * 3, [0.5] * 3, [1.0] * 3])
+    np.testing.assert_allclose(repainted(greys, colour=BLUE, value=value), greys, atol=1e-12)
+    for shade in (0.2, 1.0):
+        paint, new = shade * GOLD, shade * value * np.array(BLUE)
+        np.testing.assert_allclose(repainted(paint, colour=BLUE, value=value), new, atol=1e-12)
+        np.testing.assert_allclose(repainted(paint + 0.3, colour=BLUE, value=value), new + 0.3, atol=1e-12)
+
+
+def test_paint_may_become_white_or_black_and_what_it_has_no_part_of_stays():
+    for gray in (0.0, 1.0):
+        np.testing.assert_allclose(repainted(GOLD, colour=(gray,) * 3), [gray] * 3, atol=1e-12)
+    across = np.cross(GOLD - GOLD.mean(), np.ones(3)) * 0.3 + 0.4
+    np.testing.assert_allclose(repainted(across, colour=BLUE), across, atol=1e-12)
+
+
+def test_a_reading_of_the_paint_that_is_too_dark_or_too_bright_only_scales_the_new_paint():
+    for factor in (0.5, 1.1):
+        matrix = color_matrix(Recolour.model_validate({"track": "x", "from": tuple(factor * GOLD), "colour": BLUE}))
+        np.testing.assert_allclose(matrix @ GOLD, np.array(BLUE) / factor, atol=1e-12)

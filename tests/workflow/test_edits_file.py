@@ -155,6 +155,9 @@ def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, expected):
         ("recolour", "track: x", f"give {COLOURS}, other than 0, 1 and 1"),
         ("recolour", "track: x, colour: red, hue: 10",
          "'colour' replaces hue and saturation: give it alone, or with 'value'"),
+        ("recolour", "track: x, from: gold", "'from' without 'colour': say which colour the paint becomes"),
+        ("recolour", "track: x, from: silver, colour: red",
+         "'from' is a grey: white, grey and black paint looks like tyres and glass; give 'colour' alone"),
         ("recolour", "track: x, colour: rouge", "'colour' is 'rouge': no colour has this name; give a CSS name, "
          "'#rrggbb' in quotes, or [red, green, blue] from 0 to 1"),
         ("ego", "", "give 'lateral', or a 'speed' other than 1"),
