@@ -202,8 +202,8 @@ class TrainSettings(Settings):
     image_every: int = Field(5_000, ge=1)
     """Iterations between TensorBoard images. The last iteration has one, too."""
     psnr_every: int = Field(1_000, ge=0)
-    """Iterations between TensorBoard's PSNRs of a few training and held-out images. The last iteration has them, too.
-    0: none."""
+    """Iterations between TensorBoard's PSNRs of a few training and held-out images, of these by group and of static and
+    moving pixels. The last iteration has them, too. 0: none."""
 
     @model_validator(mode="after")
     def _terms_have_what_they_need(self) -> "TrainSettings":

@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import torch
 from jaxtyping import Float
@@ -32,7 +31,7 @@ from drivesplat.training.graphs.captured_steps import CapturedSteps
 from drivesplat.training.losses import Terms
 from drivesplat.training.monitor import FiniteGuard, Monitor, camera_figures
 from drivesplat.training.optimizers import DeviceSchedule, ParameterAverage, make_optimizers
-from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, curve_psnrs
+from drivesplat.training.probes import NO_PROBES, CurveImage, Probes, curve_psnrs
 from drivesplat.training.scans import TrainingScan, scan_index
 from drivesplat.training.schedule import Schedule
 from drivesplat.training.step import ITERATION, UNTIMED, Clock, TrainingState
@@ -92,7 +91,7 @@ def train(
     folders: TrainingFolders,
     road: Road | None = None,
     clock: Clock = UNTIMED,
-    curves: CurveViews = MappingProxyType({}),
+    curves: Sequence[CurveImage] = (),
     scans: Sequence[TrainingScan] = (),
     probes: Probes = NO_PROBES,
 ) -> TrainingSummary:
@@ -107,6 +106,10 @@ def train(
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, road, clock, scans)
         run = TrainingRun.begin(trainer, folders, curves, probes)
         with Monitor(folders.tensorboard, trainer.schedule.steps, trainer.state.step, folders.label) as monitor:
+            if not trainer.state.step:
+                parts = ", ".join(part.name for part in model.parts)
+                told = {"parts": parts, "random_seed": seed, **settings.model_dump(mode="json")}
+                monitor.hyperparameters(told, [name for image in curves for name in image.curves])
             _iterate(run, monitor)
         return run.summary()
 
@@ -267,12 +270,14 @@ class TrainingRun:
     began: float
     saved: float
     """When the state was last saved, or else when this run began (`time.monotonic`, as `began`)."""
-    curves: CurveViews
+    curves: Sequence[CurveImage]
     probes: Probes
     average: ParameterAverage
 
     @classmethod
-    def begin(cls, trainer: Trainer, folders: TrainingFolders, curves: CurveViews, probes: Probes) -> "TrainingRun":
+    def begin(
+        cls, trainer: Trainer, folders: TrainingFolders, curves: Sequence[CurveImage], probes: Probes
+    ) -> "TrainingRun":
         """Resumes from the state in `folders` if this training wrote it; otherwise starts at 0."""
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()

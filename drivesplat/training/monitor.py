@@ -1,16 +1,19 @@
 """Monitoring of a training: TensorBoard, a progress bar, and an error for values that are NaN or Inf."""
 
+import json
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
 
 from drivesplat.errors import ResultError, TrainingError
@@ -40,6 +43,20 @@ def camera_figures(model: SplatModel) -> dict[str, float]:
     """The learned figures of cameras by name: 'exposure/CAM_BACK/gain_red'."""
     figures = {} if model.exposure is None else model.exposure.figures()
     return {f"exposure/{name}": value for name, value in figures.items()}
+
+
+def flattened(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, float | str]]:
+    """Nested settings one by one: a number or text by its name.
+
+    >>> dict(flattened({"mcmc": {"cap": 5}, "sky": None}))
+    {'mcmc.cap': 5, 'sky': 'null'}
+    """
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from flattened(value, f"{above}{name}.")
+        else:
+            plain = isinstance(value, (int, float, str)) and not isinstance(value, bool)
+            yield f"{above}{name}", value if plain else json.dumps(value)
 
 
 class FiniteGuard:
@@ -99,6 +116,13 @@ class Monitor:
         self._bar = tqdm(
             total=iterations, initial=start, desc=label, unit="it", disable=not sys.stderr.isatty(), mininterval=1.0
         )
+
+    def hyperparameters(self, settings: Mapping[str, Any], results: Iterable[str]) -> None:
+        """Writes nested settings for TensorBoard's table of trainings, beside the last values of the scalars
+        `results`."""
+        with self._writing():
+            for summary in hparams(dict(flattened(settings)), dict.fromkeys(results)):
+                self._writer.file_writer.add_summary(summary)
 
     def scalars(self, step: int, values: dict[str, float], advanced: int) -> None:
         self.write(step, values)

@@ -1,21 +1,30 @@
 """Measurements of the model during a training: stops for others, and PSNR curves. Nothing of them enters the
 training."""
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.views import TrainingView
 
-MAX_IMAGES = 3
-"""Maximum number of images of a curve: rendering more would slow down short trainings."""
+MAX_IMAGES, MAX_OF_GROUP = 3, 2
+"""Maximum numbers of training images, and of images of each held-out group, of curves: rendering more would slow down
+short trainings."""
 
-CurveViews = Mapping[str, Sequence[TrainingView]]
-"""The images of each PSNR curve, by its name in TensorBoard."""
+
+@dataclass(frozen=True)
+class CurveImage:
+    """An image of PSNR curves: the `curves` that it is part of, by their names in TensorBoard, with the pixels that
+    count (None: all). Pixels of the ego vehicle never do."""
+
+    view: TrainingView
+    curves: Mapping[str, Bool[Tensor, "h w"] | None]
 
 
 @dataclass(frozen=True)
@@ -47,32 +56,31 @@ class Probes:
 NO_PROBES = Probes(0, lambda *_: None)
 
 
-def evenly_spaced(images: Sequence[int]) -> list[int]:
-    """Up to MAX_IMAGES of some images.
+def evenly_spaced(images: Sequence[int], count: int = MAX_IMAGES) -> list[int]:
+    """Up to `count` of some images.
 
     >>> evenly_spaced([2, 3, 5, 7, 11, 13, 17])
     [2, 7, 17]
     """
-    count = min(MAX_IMAGES, len(images))
+    count = min(count, len(images))
     return [images[round(i * (len(images) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 @torch.no_grad()
-def curve_psnrs(model: SplatModel, curves: CurveViews, sh_degree: int) -> dict[str, float]:
-    """The PSNR of each curve in dB, from the mean squared error of all its pixels outside the ego vehicle; identical
+def curve_psnrs(model: SplatModel, images: Sequence[CurveImage], sh_degree: int) -> dict[str, float]:
+    """The PSNR of each curve in dB, from the mean squared error of all its pixels. Curves without pixels and identical
     images are left out."""
-    names = [name for name, views in curves.items() if views]
-    if not names:
+    sums: dict[str, Tensor] = {}
+    for image in images:
+        view = image.view
+        rendered = model.render(view.view, sh_degree).image.clamp(0.0, 1.0)
+        error = (rendered - view.target()).square().mean(dim=-1).double()
+        for name, counted in image.curves.items():
+            weights = torch.ones_like(error) if counted is None else counted.to(error)
+            if view.ego_mask is not None:
+                weights = weights * ~view.ego_mask
+            sums[name] = sums.get(name, 0.0) + torch.stack([(error * weights).sum(), weights.sum()])
+    if not sums:
         return {}
-    errors = torch.stack([_mean_squared_error(model, curves[name], sh_degree) for name in names])
-    psnrs = (-10.0 * torch.log10(errors)).tolist()
-    return {name: psnr for name, psnr in zip(names, psnrs, strict=True) if psnr != float("inf")}
-
-
-def _mean_squared_error(model: SplatModel, views: Sequence[TrainingView], sh_degree: int) -> Tensor:
-    errors = []
-    for view in views:
-        image = model.render(view.view, sh_degree).image.clamp(0.0, 1.0)
-        error = (image - view.target()).square()
-        errors.append((error if view.ego_mask is None else error[~view.ego_mask]).flatten())
-    return torch.cat(errors).mean()
+    found = zip(sums, torch.stack([*sums.values()]).tolist(), strict=True)
+    return {name: -10.0 * math.log10(error / pixels) for name, (error, pixels) in found if error and pixels}

@@ -34,7 +34,7 @@ from drivesplat.training import resume_state
 from drivesplat.training.augmentation import choose_mirrored, dropout_share
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
-from drivesplat.training.probes import NO_PROBES, CurveViews, Probes, evenly_spaced
+from drivesplat.training.probes import MAX_OF_GROUP, NO_PROBES, CurveImage, Probes, evenly_spaced
 from drivesplat.training.road import road_of
 from drivesplat.training.road_seed import in_layer_of, road_seed
 from drivesplat.training.scans import TrainingScan, initial_lidar_logits, load_scans, with_scan_points
@@ -92,6 +92,10 @@ class TrainingInputs:
             return ()
         seen = self.record.train_cameras
         return tuple(sorted(seen - {job.reference_camera}))
+
+    def regions(self, index: int) -> dict[str, np.ndarray]:
+        """The masks (h, w) of the static and of the moving pixels of an image, as the measuring protocol has them."""
+        return {"static": region_mask(read_labels(*self._image(index)), "static"), "moving": self._moving(index)}
 
     def _moving(self, index: int) -> np.ndarray:
         labels = read_labels(*self._image(index))
@@ -158,7 +162,7 @@ class Prepared:
     views: list[TrainingView]
     settings: TrainSettings
     road: Road | None
-    curves: CurveViews
+    curves: list[CurveImage]
     scans: list[TrainingScan]
 
 
@@ -196,7 +200,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
         views = [dataclasses.replace(view, sky=None) for view in views]
     with explain_out_of_memory(lambda: 0):
-        curves = curve_views(inputs, views, job, device)
+        curves = curve_images(inputs, views, job, device)
         scans = load_scans(inputs.scans, job.train.scans, device) if job.train.scans.per_image else []
     if job.train.scans.per_image and not scans:
         raise TrainingError("no LiDAR scan is there to train with; set train.scans.per_image to 0")
@@ -205,20 +209,23 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     return Prepared(model, views, settings, road, curves, scans)
 
 
-def curve_views(
+def curve_images(
     inputs: TrainingInputs, views: list[TrainingView], job: TrainJob, device: torch.device
-) -> dict[str, list[TrainingView]]:
-    """The images of PSNR curves: a few of the training's `views`, and a few held-out ones, which nothing else in the
-    training uses."""
+) -> list[CurveImage]:
+    """The images of PSNR curves: a few of the training's `views`, and a few of each held-out group, which nothing else
+    in the training uses, with curves of their static and of their moving pixels."""
     if not job.train.psnr_every:
-        return {}
+        return []
     record = inputs.record
-    held_out = evenly_spaced([int(i) for group in HELD_OUT_GROUPS for i in record.splits.get(group, ())])
-    masks = Supervision(sky={}, moving={}, lidar={}, ego_mask=_of_each(inputs.with_ego(held_out), inputs.ego_mask))
-    return {
-        "psnr/train": [views[i] for i in evenly_spaced(range(len(views)))],
-        "psnr/held_out": load_views(record, masks, device, held_out),
-    }
+    groups = {group: [int(i) for i in record.splits.get(group, ())] for group in HELD_OUT_GROUPS}
+    held_out = {i: group for group, images in groups.items() for i in evenly_spaced(images, MAX_OF_GROUP)}
+    masks = Supervision(sky={}, moving={}, lidar={}, ego_mask=_of_each(inputs.with_ego([*held_out]), inputs.ego_mask))
+    images = [CurveImage(views[i], {"psnr/train": None}) for i in evenly_spaced(range(len(views)))]
+    for index, view in zip(held_out, load_views(record, masks, device, [*held_out]), strict=True):
+        curve = f"psnr/{held_out[index]}"
+        regions = {f"{curve}/{name}": torch.from_numpy(mask).to(device) for name, mask in inputs.regions(index).items()}
+        images.append(CurveImage(view, {"psnr/held_out": None, curve: None, **regions}))
+    return images
 
 
 def run_training(

@@ -281,15 +281,16 @@ def files_in(folder: Path) -> TrainingFiles:
 def inputs_in(folder: Path, actors: bool = False) -> TrainingInputs:
     """Recorded views; with `actors` also two cars, the lower half of each image marked as them, and depths."""
     record = parser_record(folder / "images", recorded_views())
-    if not actors:
-        return TrainingInputs(record, folder / "masks", [], [])
     for i, time in enumerate(record.timestamps):
         labels = np.full((HEIGHT, WIDTH), LABELS["static"], np.uint8)
-        labels[HEIGHT // 2 :, : WIDTH // 2], labels[HEIGHT // 2 :, WIDTH // 2 :] = LABELS["moving_car"], 8
+        if actors:
+            labels[HEIGHT // 2 :, : WIDTH // 2], labels[HEIGHT // 2 :, WIDTH // 2 :] = LABELS["moving_car"], 8
         for kind, mask in (("regions", labels), ("sky", np.eye(HEIGHT, WIDTH, i, dtype=np.uint8) * 255)):
             path = folder / "masks" / mask_name(kind, "CAM_FRONT", int(time))
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(mask).save(path)
+    if not actors:
+        return TrainingInputs(record, folder / "masks", [], [])
     depth = PixelDepths(np.arange(9, dtype=np.int32), np.arange(9, dtype=np.int32), np.full(9, 4.0))
     records = [actor_record(track, 25, seed) for seed, track in enumerate(cars())]
     return TrainingInputs(record, folder / "masks", records, [depth] * 5)

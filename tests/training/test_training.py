@@ -49,6 +49,7 @@ from helpers.trainings import (
     untrained_street,
 )
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.io import checkpoint_file
@@ -65,7 +66,7 @@ from drivesplat.training import resume_state
 from drivesplat.training.loop import Trainer, TrainingRun, train
 from drivesplat.training.monitor import NEVER, FiniteGuard, Monitor
 from drivesplat.training.optimizers import AVERAGED_EVERY, ParameterAverage
-from drivesplat.training.probes import MAX_IMAGES, Probes, curve_psnrs, evenly_spaced
+from drivesplat.training.probes import MAX_IMAGES, CurveImage, Probes, curve_psnrs, evenly_spaced
 from drivesplat.training.road import driven_road
 from drivesplat.training.schedule import Schedule
 from drivesplat.training.stage import TrainingFiles, mean_sky_color, prepare, run_training
@@ -586,6 +587,12 @@ def board_in(folder: Path) -> EventAccumulator:
     return board
 
 
+def hyperparameters_in(folder: Path) -> dict[str, Any]:
+    """The values of the settings that TensorBoard knows, by name."""
+    metadata = board_in(folder).SummaryMetadata("_hparams_/session_start_info")
+    return dict(HParamsPluginData.FromString(metadata.plugin_data.content).session_start_info.hparams)
+
+
 def test_tensorboard_holds_every_loss_and_picture_once_also_of_a_resumed_training(tmp_path):
     """It has resumed before an iteration that was logged."""
     settings = settings_of(image_every=20)
@@ -639,9 +646,13 @@ def test_a_finished_training_leaves_a_checkpoint_a_summary_and_curves(tmp_path):
     assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
     board = board_in(files.checkpoint.parent)
     assert {"loss/flatness", "loss/road"} < set(board.Tags()["scalars"])
-    assert {name for name in board.Tags()["scalars"] if name.startswith("psnr")} == {"psnr/train", "psnr/held_out"}
-    for curve in ("psnr/train", "psnr/held_out"):
+    held_out = "psnr/held_out", "psnr/interpolation", "psnr/interpolation/static"
+    assert {name for name in board.Tags()["scalars"] if name.startswith("psnr")} == {"psnr/train", *held_out}
+    for curve in ("psnr/train", *held_out):
         assert [event.step for event in board.Scalars(curve)] == [8, 16, 20]
+    told = hyperparameters_in(files.checkpoint.parent)
+    assert (told["parts"].string_value, told["road_weight"].number_value) == ("background", pytest.approx(0.1))
+    assert told["gaussians.sh_degree"].number_value == job.train.gaussians.sh_degree
     assert board.Scalars("psnr/train")[-1].value > board.Scalars("psnr/train")[0].value
     assert [event.step for event in board.Images("recorded_and_rendered")] == [15, 20]
 
@@ -735,7 +746,15 @@ def test_curves_change_no_trained_parameter(strategy, tmp_path):
     for every in (0, 3):
         settings = settings_of(strategy, iterations=15, refine_start=0.0, psnr_every=every)
         model, folders = untrained_street(settings), folders_of(tmp_path / str(every), "of this training")
-        train(model, views, settings, 0, CPU, folders, curves={"psnr/held_out": elsewhere})
+        train(
+            model,
+            views,
+            settings,
+            0,
+            CPU,
+            folders,
+            curves=[CurveImage(view, {"psnr/held_out": None}) for view in elsewhere],
+        )
         ends.append(model)
         assert ("psnr/held_out" in board_in(tmp_path / str(every)).Tags()["scalars"]) == bool(every)
     assert same_parameters(*ends)
@@ -745,17 +764,18 @@ def test_held_out_images_are_read_for_the_curves_alone(tmp_path):
     """The third image is held out; without curves nobody reads it."""
     inputs = inputs_in(tmp_path)
     with_curves = prepare(inputs, job_of(), CPU)
-    (held_out,) = with_curves.curves["psnr/held_out"]
-    assert torch.equal(held_out.pixels, recorded_views()[2].pixels)
-    own = {id(view) for view in with_curves.views}
-    assert {id(view) for view in with_curves.curves["psnr/train"]} <= own and id(held_out) not in own
+    (held_out,) = (image for image in with_curves.curves if "psnr/held_out" in image.curves)
+    assert torch.equal(held_out.view.pixels, recorded_views()[2].pixels)
+    own, others = {id(view) for view in with_curves.views}, [it for it in with_curves.curves if it is not held_out]
+    assert {id(image.view) for image in others} <= own and id(held_out.view) not in own
+    assert [[*image.curves] for image in others] == [["psnr/train"]] * MAX_IMAGES
     (tmp_path / "images/2.png").unlink()
-    assert prepare(inputs, job_of(psnr_every=0), CPU).curves == {}
+    assert prepare(inputs, job_of(psnr_every=0), CPU).curves == []
 
 
 def test_a_psnr_is_of_all_pixels_outside_the_ego_vehicle():
     views, model = recorded_views(), untrained(settings_of())
-    (psnr,) = curve_psnrs(model, {"psnr/train": views[:1], "psnr/none": []}, 1).values()
+    (psnr,) = curve_psnrs(model, [CurveImage(views[0], {"psnr/train": None})], 1).values()
     assert psnr == pytest.approx(mean_psnr(model, views[:1]), abs=1e-4)
     body = torch.zeros(views[0].pixels.shape[:2], dtype=torch.bool)
     body[HEIGHT // 2 :] = True
@@ -763,7 +783,43 @@ def test_a_psnr_is_of_all_pixels_outside_the_ego_vehicle():
     with torch.no_grad():
         image = model.render(views[0].view, 1).image.clamp(0.0, 1.0)
     error = (image - views[0].target())[: HEIGHT // 2].square().mean()
-    assert curve_psnrs(model, {"x": [masked]}, 1)["x"] == pytest.approx(-10.0 * math.log10(error), abs=1e-4)
+    image = CurveImage(masked, {"x": None, "upper": ~body, "none": torch.zeros_like(body)})
+    found, expected = curve_psnrs(model, [image], 1), pytest.approx(-10.0 * math.log10(error), abs=1e-4)
+    assert found == {"x": expected, "upper": expected}, "a curve without pixels is left out"
+
+
+def test_a_curve_pools_the_pixels_that_count_of_all_its_images():
+    """Static and moving pixels, of two images of one group."""
+    views, model, rng = recorded_views()[:2], untrained(settings_of()), np.random.default_rng(0)
+    masks = [torch.from_numpy(rng.random((HEIGHT, WIDTH)) < share) for share in (0.2, 0.7)]
+    images = [
+        CurveImage(view, {"psnr/it": None, "psnr/it/moving": mask, "psnr/it/static": ~mask})
+        for view, mask in zip(views, masks, strict=True)
+    ]
+    errors = [model.render(view.view, 1).image.detach().clamp(0.0, 1.0) - view.target() for view in views]
+    pooled = {
+        "psnr/it": torch.cat([error.flatten() for error in errors]),
+        "psnr/it/moving": torch.cat([error[mask].flatten() for error, mask in zip(errors, masks, strict=True)]),
+        "psnr/it/static": torch.cat([error[~mask].flatten() for error, mask in zip(errors, masks, strict=True)]),
+    }
+    expected = {name: -10.0 * math.log10(error.square().mean()) for name, error in pooled.items()}
+    assert curve_psnrs(model, images, 1) == pytest.approx(expected, abs=1e-4)
+    assert curve_psnrs(model, [], 1) == {}
+
+
+def test_tensorboard_knows_the_settings_of_a_training_once(tmp_path):
+    told = {"parts": "background", "mcmc": {"cap": 5, "noise": 0.5}, "sky": None, "graphs": True}
+    for start in (0, 3):
+        with Monitor(tmp_path / "tensorboard", 10, start, "it") as monitor:
+            monitor.hyperparameters(told, ["psnr/held_out"])
+    found = hyperparameters_in(tmp_path)
+    assert found.keys() == {"parts", "mcmc.cap", "mcmc.noise", "sky", "graphs"}
+    assert (found["mcmc.cap"].number_value, found["sky"].string_value, found["graphs"].string_value) == (
+        5,
+        "null",
+        "true",
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["tensorboard"], "no folder of its own"
 
 
 def test_few_images_are_spread_over_all():
