@@ -64,7 +64,8 @@ class WorkflowCopy:
             "refine_poses": {"enabled": False},
             "lidar_seed": {"max_points": 500, "far_points": 100},
             "train": TINY_TRAINING,
-            "render": {"width": 64, "height": 36, "fps": 4},
+            # of a drive of 4.5 s the usual last block leaves little
+            "render": {"width": 64, "height": 36, "fps": 4, "end": "recorded"},
             "lpips": {"enabled": False},
             "device": "cpu",
         }

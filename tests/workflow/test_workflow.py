@@ -242,10 +242,13 @@ NO_STAGE = {"refine_poses": {"rounds": 2, "enabled": False}, "device": {"kind": 
         ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
         ({"actors": {"humans": True}}, {"actors": 1, "tracks": 1, **STREETS_TRAINING_AND_AFTER}),
         ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
-        ({"render": {"compare": False, "trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2, "gap_report": 1}),
+        ({"render": {"compare": False, "trajectories": {"above": {"vertical": 3.0}}}},
+         {"film": 2, "gap_report": 1, "film_page": 1}),
+        ({"render": {"end": "trained"}}, {"film": 4, "compare": 1, **OF_ACTORS}),
         pytest.param({"export": {"sh_degree": 3, "formats": ["ply", "spz"]}}, {"export": 2, "export_spz": 2},
                      marks=SLOW),
-        ({"methods": {"third": {}}}, {**ONE_TRAINING_AND_AFTER, "export_viewer": 3, "export_colmap": 1}),
+        ({"methods": {"third": {}}},
+         {**ONE_TRAINING_AND_AFTER, "export_viewer": 3, "export_colmap": 1, "film_page": 1}),
     ],
 )  # fmt: skip
 def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, setting, expected):
@@ -274,9 +277,10 @@ def test_the_page_has_the_edits_of_a_method_with_actors_the_images_and_the_other
         assert scene["method"] == method and scene["methods"] == ["street", "vanilla"]
 
 
-PLAYED = {"export_viewer": 1}
-"""The page of the method that can be edited plays the edits. The report, which links to both, follows one run later if
-an edit is gone: Snakemake does not look at jobs behind others that run."""
+PLAYED = {"export_viewer": 1, "film_page": 1}
+"""The page of the method that can be edited plays the edits, and the page of films lists their steps. The report, which
+links to the films and to both pages, follows one run later if an edit is gone: Snakemake does not look at jobs behind
+others that run."""
 LEFT_GONE = "results/0001/street/edits/gone.mp4"
 
 
@@ -307,7 +311,7 @@ def test_a_changed_step_hides_no_change_of_the_report(finished):
     with changed(
         finished, ("edits.yaml", "at: 2}", "at: 2.5}"), ("drivesplat/report/gaps.py", "SCHEMA = 3", "SCHEMA = 4")
     ):
-        assert finished.planned() == {"edit": 1, "export_viewer": 1, "gap_report": 1}
+        assert finished.planned() == {"edit": 1, **PLAYED, "gap_report": 1}
 
 
 def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
