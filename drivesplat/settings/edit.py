@@ -242,9 +242,11 @@ Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | Re
 
 
 def _short(value: Any) -> str:
-    """A value of a step's field in a line of text."""
+    """A value of a step's field in a line of text; colours as '#rrggbb'."""
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_short(item) for item in value) + "]"
+        if value and isinstance(value[0], float):
+            return "#" + "".join(f"{round(255 * channel):02x}" for channel in value)
+        return ", ".join("[" + " ".join(_short(number) for number in point) + "]" for point in value)
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

@@ -120,7 +120,8 @@ def test_an_edit_has_its_still_as_poster(pages):
         ({"remove": {"track": "6e5c"}}, "remove 6e5c"),
         ({"swap": {"track": "6e5c", "with": "7"}}, "swap 6e5c, with 7"),
         ({"ego": {"lateral": 3.5, "start": 1}}, "ego, start 1, lateral 3.5"),
-        ({"place": {"track": "a", "as": "b", "path": [[0, 9.5, 0]]}}, "place a, as b, path [[0, 9.5, 0]]"),
+        ({"place": {"track": "a", "as": "b", "path": [[0, 9.5, 0]]}}, "place a, as b, path [0 9.5 0]"),
+        ({"recolour": {"track": "a", "from": "gold", "colour": "#0a2040"}}, "recolour a, colour #0a2040, from #ffd700"),
     ],
 )
 def test_a_step_of_an_edit_is_a_line_of_words(step, words):
