@@ -19,6 +19,7 @@ from drivesplat.report.gaps import moving_gap, shows_other_tracks, shows_people,
 from drivesplat.report.lidar import page_table
 from drivesplat.report.media import MethodMedia, data_url, difference_position, read_image
 from drivesplat.report.tables import pixels_label, scene_label
+from drivesplat.workflow.film_names import FILM_PAGE
 
 MediaByMethod = Mapping[tuple[str, str], MethodMedia]
 NAMES = [{"key": name, "title": name, "form": "{}", "kind": "name"} for name in ("scene", "method", "tracks")]
@@ -98,6 +99,7 @@ def report_page(
         links_of=lambda scene: media.get((scene, ""), MethodMedia()).links,
         media_of=lambda row: _looks(row, media.get((row["scene"], row["method"]), MethodMedia())),
         address=address,
+        film_page=FILM_PAGE,
         fixes=PUBLISHED_FIXES,
         document=GHOSTS_DOCUMENT,
         costs=costs,

@@ -90,6 +90,8 @@ def test_a_page_has_the_images_and_links_of_its_methods(results, page):
     assert 'href="0061/vanilla/original.mp4"' in page and "key frame 12, held out between training frames" in page
     film = report_page(made(results), collect_media([results / "0061/compare.mp4"], results))
     assert 'href="0061/compare.mp4">compare.mp4<' in film and film.count(".mp4") == 2
+    films = report_page(made(results), collect_media([results / "0061/index.html"], results))
+    assert 'href="0061/index.html">all films<' in films
     bare = report_page(made(results), {})
     assert "data:image/jpeg" not in bare and ".mp4" not in bare and 'id="scene-0061"' in bare
 
