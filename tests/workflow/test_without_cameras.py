@@ -42,7 +42,8 @@ def test_a_batch_measures_it_by_the_methods_that_render_lidar_and_shows_its_scan
     report = made.report([])
     shown = [*made.films(), *made.looks(), *made.exports(), *made.drives(), *made.edits(), *report.pictures()]
     of_alone = {path for path in (*shown, *report.links()) if "/a2/" in path}
-    assert of_alone == {"there/a2/with_lidar/lidar.png", "there/a2/with_lidar/lidar.mp4"}
+    scans = {"there/a2/with_lidar/lidar.png", "there/a2/with_lidar/lidar.mp4"}
+    assert of_alone == {*scans, "there/a2/index.html"}, "the page of its films"
     assert "there/a1/vanilla/ghost_panel.png" in shown and "there/a1/street/original.mp4" in shown
     assert made.scenes(cameras=True) == ["a1"] and made.scenes(cameras=False) == ["a2"]
 
