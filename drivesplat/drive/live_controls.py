@@ -185,7 +185,8 @@ class LiveControls:
 
     def _paint(self) -> None:
         colour = "#{:02x}{:02x}{:02x}".format(*self.colour.value)
-        self._change(lambda session, track: session.change(track, colour=colour))
+        paint = self.view.paint_of(self._required())
+        self._change(lambda session, track: session.change(track, colour=colour, paint=paint))
 
     def _reset(self) -> None:
         self._change(lambda session, track: session.reset(track))

@@ -20,6 +20,7 @@ from drivesplat.io.storage import atomic_write
 from drivesplat.io.yaml_file import read_yaml
 from drivesplat.scene.images import read_image
 from drivesplat.scene.tracks import matching_ids
+from drivesplat.settings.edit import MIN_CHROMA
 from drivesplat.settings.names import NAME
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
 from drivesplat.workflow.edits_file import edit_of, read_edits
@@ -30,6 +31,8 @@ ITERATIONS = 4
 """Steps of the search for a shift that places an object: on a bend its path is no straight line."""
 ERROR = "error"
 """The name of the picture of differences from the recorded image."""
+PAINTED = 0.3
+"""Share of an object's pixels, the most colourful ones, that show its paint."""
 MIN_SIZE, MAX_SIZE = 16, 4096
 """Pixels of an edge of a picture."""
 
@@ -37,12 +40,14 @@ MIN_SIZE, MAX_SIZE = 16, 4096
 @dataclass(frozen=True)
 class ObjectChange:
     """What is done to an object during the whole drive: `longitudinal` and `lateral` metres ahead along its path and to
-    its left, `yaw` degrees to its left on the spot, its `colour` (None: as recorded), and whether it is `removed`."""
+    its left, `yaw` degrees to its left on the spot, its `colour` (None: as recorded) in place of that of its `paint`
+    (None: of all its surfaces), and whether it is `removed`."""
 
     longitudinal: float = 0.0
     lateral: float = 0.0
     yaw: float = 0.0
     colour: str | None = None
+    paint: str | None = None
     removed: bool = False
 
     def steps(self, track: str) -> list[dict[str, Any]]:
@@ -51,7 +56,10 @@ class ObjectChange:
             return [{"remove": {"track": track}}]
         moved = {name: getattr(self, name) for name in ("lateral", "longitudinal", "yaw") if getattr(self, name)}
         steps = [{"shift": {"track": track, **moved}}] if moved else []
-        return steps + ([{"recolour": {"track": track, "colour": self.colour}}] if self.colour else [])
+        if self.colour:
+            known = {"from": self.paint} if self.paint else {}
+            steps.append({"recolour": {"track": track, **known, "colour": self.colour}})
+        return steps
 
 
 @dataclass
@@ -271,6 +279,23 @@ class LiveView:
         if self.shows == ERROR:
             return error_picture(picture, recorded)
         return blended(picture, recorded, self.recorded)
+
+    def paint_of(self, track: str) -> str | None:
+        """The colour of an object's paint, as an edits file writes it, in the image that is followed, or else of the
+        first camera: the median of its most colourful pixels. None for a grey one, and where it is not seen."""
+        drive = self.session.drive
+        camera = self.follow or next(iter(drive.cameras), None)
+        if camera is None:
+            return None
+        view = drive.render(camera, self.time, outputs=["rgb", "instance"], outside="clamp")
+        if track not in view.objects:
+            return None
+        pixels = view.image[view.arrays()["instance"] == view.objects.index(track)].astype(float)
+        if not len(pixels):
+            return None
+        chroma = np.ptp(pixels, axis=1)
+        paint = np.median(pixels[chroma >= np.quantile(chroma, 1.0 - PAINTED)], axis=0)
+        return None if np.ptp(paint) < 255.0 * MIN_CHROMA else "#{:02x}{:02x}{:02x}".format(*paint.round().astype(int))
 
     def nearest_image(self) -> int | None:
         """The index in `scene.frames` of the image of the followed camera that is nearest in time."""

@@ -109,6 +109,22 @@ def test_colours_of_pictures():
     assert (placed(white, np.array([0.0, 0.0]), 6, 4)[..., 0] > 0).sum() == 2 * 3
 
 
+def test_the_colour_of_paint_is_that_of_the_most_colourful_pixels(view, drive):
+    image = drive.render(CAMERA, 1.0, outputs=["rgb", "instance"])
+    pixels = image.image[image.arrays()["instance"] == image.objects.index(AHEAD)].astype(int)
+    found = view.paint_of(AHEAD)
+    assert found is not None
+    red, green, blue = (int(found[i : i + 2], 16) for i in (1, 3, 5))
+    assert (
+        np.abs(pixels - [red, green, blue]).sum(axis=1).min() < 120
+        and max(red, green, blue) - min(red, green, blue) > 12
+    )
+    view.session.change(AHEAD, colour="#1020f0", paint=found)
+    assert view.session.steps() == [{"recolour": {"track": AHEAD, "from": found, "colour": "#1020f0"}}]
+    assert not np.array_equal(view.session.edited.render(CAMERA, 1.0).image, image.image)
+    assert view.paint_of("nobody") is None
+
+
 def test_methods_of_different_scenes_and_none_are_refused(drive):
     other = dataclasses.replace(drive.scene, name="another")
     elsewhere = dataclasses.replace(drive, recording=dataclasses.replace(drive.recording, scene=other))
