@@ -83,7 +83,7 @@ class LiveControls:
         button.on_click(lambda _: self.changing(change))
 
     def changing(self, change: Callable[[], None]) -> None:
-        """Makes a change. One that cannot be made is told in the window."""
+        """Makes a change, or shows in the window why it cannot be made."""
         with self.lock:
             try:
                 change()

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from drivesplat.drive.drive_view import DriveView
 
 Picture = UInt8[np.ndarray, "_ _ 3"]
-NEAREST, FARTHEST = 2.0, 80.0
+MIN_DEPTH, MAX_DEPTH = 2.0, 80.0
 """Metres between which the colours of depth run; they are logarithmic."""
 GOLDEN = 0.61803398875
 """Turns of the hue from one number to the next, so that neighbouring ones differ."""
@@ -28,7 +28,7 @@ def number_colors(count: int) -> UInt8[np.ndarray, "n 3"]:
 
 def depth_picture(depth: np.ndarray) -> Picture:
     """Near surfaces red, far ones blue, none black. `depth` (h, w) in metres."""
-    far = np.log(np.clip(depth, NEAREST, FARTHEST) / NEAREST) / np.log(FARTHEST / NEAREST)
+    far = np.log(np.clip(depth, MIN_DEPTH, MAX_DEPTH) / MIN_DEPTH) / np.log(MAX_DEPTH / MIN_DEPTH)
     colors = cv2.applyColorMap((255.0 * (1.0 - far)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
     return np.where(depth[..., None] > 0.0, colors, 0).astype(np.uint8)
 
