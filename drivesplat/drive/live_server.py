@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.drive.live_controls import LiveControls
 from drivesplat.drive.live_overlays import Overlays
 from drivesplat.drive.live_view import EditSession, FreeCamera, LiveView, wxyz_of
-from drivesplat.drive.trained_drive import TrainedDrive
+from drivesplat.drive.trained_drive import TrainedDrive, model_file, open_drive
 from drivesplat.errors import DriveSplatError, RequestError
 from drivesplat.scene.rigid import rigid
 
@@ -35,6 +35,8 @@ QUALITY = {False: 80, True: 95}
 """JPEG quality of images while something moves, and at rest."""
 POLL_S, PAUSE_S = 0.005, 1.0
 """Seconds between two looks for changes, and after an error."""
+LOOK_EVERY_S = 2.0
+"""Seconds between two looks for later states of a training."""
 FIRST_FOV = 1.0
 """Vertical field of view in radians of a window that follows no camera."""
 
@@ -74,6 +76,7 @@ class LiveServer:
         self.view, self.controls = view, LiveControls(self._server, view, Path(edits_file))
         self._overlays = Overlays(self._server.scene, view, self.controls.click)
         self._closed, self._windows = threading.Event(), dict[int, WindowState]()
+        self._stamps = [_stamp(drive) for drive in drives]
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(lambda client: self._windows.pop(client.client_id, None))
         self._worker = threading.Thread(target=self._work, name="drivesplat-viewer", daemon=True)
@@ -100,11 +103,30 @@ class LiveServer:
             _set_camera(client.camera, followed)
         self._windows[client.client_id] = WindowState()
 
+    def _follow_trainings(self) -> None:
+        """Goes on with the models of trainings that have saved a later state, or have ended."""
+        for i, session in enumerate(self.view.sessions):
+            stamp = _stamp(session.drive)
+            if stamp in (None, self._stamps[i]):
+                continue
+            try:
+                later = open_drive(session.drive.folder, session.drive.device.type)
+            except DriveSplatError as error:  # the training has just removed the state
+                log.info("%s", error)
+                continue
+            with self.controls.lock:
+                session.follow(later)
+                self.controls.version += 1
+            self._stamps[i] = stamp
+
     def _work(self) -> None:
-        last, drawn = time.monotonic(), -1
+        last, drawn, looked = time.monotonic(), -1, time.monotonic()
         while not self._closed.wait(POLL_S):
             now = time.monotonic()
             try:
+                if now - looked > LOOK_EVERY_S:
+                    looked = now
+                    self._follow_trainings()
                 with self.controls.lock:
                     self.controls.advance(now - last)
                     if drawn != self.controls.version:
@@ -156,6 +178,15 @@ class LiveServer:
             on_cpu = self.view.session.drive.device.type == "cpu"
             width = min(width, SMALL if on_cpu else max(SMALL, round(MOVING_SHARE * width)))
         return width, max(1, round(width * window[1] / window[0]))
+
+
+def _stamp(drive: TrainedDrive) -> tuple[str, int] | None:
+    """What tells the files of a drive's model apart; None where there is none."""
+    try:
+        file = model_file(drive.folder)
+        return file.name, file.stat().st_mtime_ns
+    except (RequestError, FileNotFoundError):
+        return None
 
 
 def _set_camera(camera: Any, to: FreeCamera) -> None:

@@ -83,8 +83,14 @@ class EditSession:
     def __post_init__(self) -> None:
         if self.drive.edit is not None:
             raise RequestError("an edit begins with a drive as recorded, not with an edited one")
-        self._recorded = trained_actors(self.drive.model, self.drive.scene, self.drive.where)
-        self._made: tuple[list[dict[str, Any]], TrainedDrive] = [], self.drive
+        self.follow(self.drive)
+
+    def follow(self, drive: TrainedDrive) -> None:
+        """Goes on with another model of the same drive, such as a later one of the same training."""
+        self.drive = drive
+        self._recorded = trained_actors(drive.model, drive.scene, drive.where)
+        self._made: tuple[list[dict[str, Any]], TrainedDrive] = [], drive
+        self.changes = {track: change for track, change in self.changes.items() if track in self.objects}
 
     @property
     def objects(self) -> list[str]:

@@ -1,9 +1,10 @@
 """The recording of a trained drive: its scene, and the sensors that recorded it."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,11 +19,20 @@ from drivesplat.lidar.scans import SensorPoses
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan_record import RecordedScan, ScanRecords, read_scans
-from drivesplat.scene.scene import REFINED, Frame, Scene, read_scene
+from drivesplat.scene.scene import REFINED, Frame, Scene, Track, read_scene
 from drivesplat.scene.shutter import readout_of
+from drivesplat.scene.tracks import box_at, ever_moves
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
 from drivesplat.settings.tracks import FOUND, TRACK_FOLDERS, Tracks
 from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, smooth_poses
+
+if TYPE_CHECKING:
+    import pandas
+
+COLUMNS = [
+    "id", "class", "category", "length", "width", "height", "first", "last", "speed", "editable", "why_not",
+]  # fmt: skip
+"""The columns of `object_table`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,3 +158,23 @@ class RecordedDrive:
             return ego(time + offsets) @ inverse(self.ego(scan.seconds + offsets)) @ sensor(offsets)
 
         return at
+
+
+def object_table(scene: Scene, editable: Collection[str]) -> "pandas.DataFrame":
+    """The objects of a scene as a table: see `TrainedDrive.actors`. `editable` are the ids of those that the model has
+    Gaussians of."""
+    from pandas import DataFrame  # here: it takes long to import
+
+    rows = [_row(scene, track, editable) for track in scene.tracks if track.object_class.is_dynamic]
+    table = DataFrame(rows, columns=COLUMNS).set_index("id")
+    return table.sort_values(["editable", "first"], ascending=[False, True])
+
+
+def _row(scene: Scene, track: Track, editable: Collection[str]) -> list[Any]:
+    boxes = (box_at(track, int(timestamp), 0.0) for timestamp in track.timestamps)
+    speed = max((box.speed for box in boxes if box is not None), default=0.0)
+    first, last = (scene.seconds(track.timestamps[i]) for i in (0, -1))
+    own = track.id in editable
+    why_not = "" if own else "no Gaussians of its own in this method" if ever_moves(track) else "parked"
+    size = [round(float(edge), 3) for edge in track.size]
+    return [track.id, track.object_class.value, track.category, *size, first, last, round(speed, 2), own, why_not]

@@ -21,7 +21,7 @@ from drivesplat.drive.cameras import (
 )
 from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.lidars import PoseableLidar
-from drivesplat.drive.recorded_drive import RecordedDrive
+from drivesplat.drive.recorded_drive import RecordedDrive, object_table
 from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
 from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
 from drivesplat.editing.ego import EgoEdit
@@ -30,12 +30,11 @@ from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.errors import RequestError
 from drivesplat.lidar.moved_sensor import moved, steady_motion
 from drivesplat.lidar.scans import SensorPoses
-from drivesplat.model.checkpoint import open_model, read_checkpoint
+from drivesplat.model.checkpoint import STATE, open_model, read_checkpoint, read_snapshot
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.scan_record import RecordedScan
-from drivesplat.scene.scene import Scene, Track
-from drivesplat.scene.tracks import box_at, ever_moves
+from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
@@ -46,10 +45,6 @@ from drivesplat.workflow.edits_file import edit_of
 if TYPE_CHECKING:
     import pandas
 
-COLUMNS = [
-    "id", "class", "category", "length", "width", "height", "first", "last", "speed", "editable", "why_not",
-]  # fmt: skip
-"""The columns of `TrainedDrive.actors`."""
 OUTSIDE = ("refuse", "clamp")
 """What can happen to a time outside of the recording."""
 HALF_SPAN = 0.05
@@ -57,7 +52,8 @@ HALF_SPAN = 0.05
 
 
 def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "TrainedDrive":
-    """The drive whose model a method has trained, from the method's result folder.
+    """The drive whose model a method has trained, from the method's result folder. While the training runs, the model
+    is that of its last saved state.
 
     Args:
         folder: `results/{scene}/{method}`, with `checkpoint.npz`; scene and training record lie beside it.
@@ -71,12 +67,8 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
     (225, 400, 3)
     """
     folder = Path(folder)
-    if not (folder / "checkpoint.npz").is_file():
-        raise RequestError(
-            f"{folder} has no checkpoint.npz: name the folder of a method that has been trained, such as "
-            "results/demo/street"
-        )
-    checkpoint = read_checkpoint(folder / "checkpoint.npz")
+    file = model_file(folder)
+    checkpoint = read_checkpoint(file) if file.parent == folder else read_snapshot(file.parent)
     tracks = [track.id for part in checkpoint.parts for track in part.tracks]
     recording = RecordedDrive.of_method(folder, tracks, "refine_poses" in checkpoint.provenance["stages"])
     kinds = get_args(DeviceSettings.model_fields["kind"].annotation)
@@ -85,6 +77,18 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
     settings = device if isinstance(device, DeviceSettings) else DeviceSettings.model_validate(device)
     model, chosen = open_model(checkpoint, settings)
     return TrainedDrive(folder, recording, model, chosen, checkpoint.job.train.scans.beam_spread_rad)
+
+
+def model_file(folder: Path) -> Path:
+    """The file of a method's model: its checkpoint, or the last state of a training that runs or was interrupted.
+    Raises RequestError where there is neither."""
+    for file in (folder / "checkpoint.npz", folder / "resume" / STATE):
+        if file.is_file():
+            return file
+    raise RequestError(
+        f"{folder} has no checkpoint.npz: name the folder of a method that has been trained, such as "
+        "results/demo/street; a training that runs saves its first state after a minute"
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,12 +162,7 @@ class TrainedDrive(Sensors):
         """A table of the objects as recorded, by `id`: `class` and the dataset's `category`; `length`, `width` and
         `height` in metres; `first` and `last`, the seconds of their boxes; `speed`, the largest horizontal one in m/s;
         `editable`, whether the object has Gaussians of its own and can be moved and removed; and `why_not`."""
-        from pandas import DataFrame  # here: it takes long to import
-
-        editable = {actor.id for actor in trained_actors(self.model, self.scene, self.where)}
-        rows = [_row(self.scene, track, editable) for track in self.scene.tracks if track.object_class.is_dynamic]
-        table = DataFrame(rows, columns=COLUMNS).set_index("id")
-        return table.sort_values(["editable", "first"], ascending=[False, True])
+        return object_table(self.scene, {actor.id for actor in trained_actors(self.model, self.scene, self.where)})
 
     def edited(self, edit: Edit | list[dict[str, Any]]) -> "TrainedDrive":
         """The drive after an edit: its steps as in an edits file (docs/editing.md).
@@ -386,13 +385,3 @@ class TrainedDrive(Sensors):
 def _velocity(given: Vector | None) -> np.ndarray:
     """A velocity (6,) of the user; zeros for None."""
     return np.zeros(6) if given is None else require_vector(given, 6, "the velocity")
-
-
-def _row(scene: Scene, track: Track, editable: set[str]) -> list[Any]:
-    boxes = (box_at(track, int(timestamp), 0.0) for timestamp in track.timestamps)
-    speed = max((box.speed for box in boxes if box is not None), default=0.0)
-    first, last = (scene.seconds(track.timestamps[i]) for i in (0, -1))
-    own = track.id in editable
-    why_not = "" if own else "no Gaussians of its own in this method" if ever_moves(track) else "parked"
-    size = [round(float(edge), 3) for edge in track.size]
-    return [track.id, track.object_class.value, track.category, *size, first, last, round(speed, 2), own, why_not]

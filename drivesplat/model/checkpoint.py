@@ -3,7 +3,7 @@
 The stage `train` makes it (`drivesplat.training.stage`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -21,6 +21,8 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 
 RULE = "train"
+UNFINISHED, STATE = "training.npz", "state.npz"
+"""Files of an unfinished training: the record that all its states share, and the last state."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,27 @@ def read_checkpoint(path: str | Path) -> TrainedCheckpoint:
         return typed_record(TrainedCheckpoint, {**content, "model": state, "job": job, "path": str(path)})
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise _no_checkpoint(path, error) from error
+
+
+def write_training_record(folder: Path, model: SplatModel, job: TrainJob, provenance: Provenance) -> None:
+    """Writes what `read_snapshot` needs beside the resume states of a training into its folder."""
+    checkpoint = TrainedCheckpoint.of(model, job, provenance)
+    write_checkpoint(folder / UNFINISHED, replace(checkpoint, model={}))
+
+
+def read_snapshot(folder: Path) -> TrainedCheckpoint:
+    """The model of an unfinished training, from the folder of its resume state. Raises ResultError where it is not
+    there, or is of another version."""
+    checkpoint, path = read_checkpoint(folder / UNFINISHED), folder / STATE
+    try:
+        saved = read_arrays(path, RULE, torch.from_numpy)["state"]
+        state = dict(saved["model"])
+        for i, rows in enumerate(saved["preallocated"]):  # these are no Gaussians yet
+            own = [name for name in state if name.startswith(f"parts.{i}.params.")] if rows else []
+            state |= {name: state[name][:-rows] for name in own}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise _no_checkpoint(path, error) from error
+    return replace(checkpoint, model=state, path=str(path))
 
 
 def _no_checkpoint(path: str | Path, error: Exception) -> ResultError:

@@ -4,7 +4,7 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from drivesplat.io import checkpoint_file
 from drivesplat.kernels.cuda_graphs import capture_stream
 from drivesplat.kernels.road_distance import Road
 from drivesplat.machine.device import device_name, explain_out_of_memory
+from drivesplat.model.checkpoint import STATE
 from drivesplat.model.picture import Picture
 from drivesplat.model.reach import bound_positions, reach_of
 from drivesplat.model.road import RoadPart
@@ -50,16 +51,18 @@ class TrainingFolders:
     """The folders of a training's resume state and TensorBoard log.
 
     No rule declares `resume`; `fingerprint` is that of settings, code and inputs, `label` that of the progress bar.
+    `describe` writes into `resume`, after each state, what makes a model of it.
     """
 
     resume: Path
     tensorboard: Path
     fingerprint: str
     label: str
+    describe: Callable[[Path], None] = lambda _: None
 
     @property
     def state(self) -> Path:
-        return self.resume / "state.npz"
+        return self.resume / STATE
 
 
 @dataclass(frozen=True)
@@ -323,6 +326,7 @@ class TrainingRun:
             "average": self.average.state(),
         }
         checkpoint_file.save(self.folders.state, content)
+        self.folders.describe(self.folders.resume)
         self.saved = time.monotonic()
 
     def psnrs(self) -> dict[str, float]:

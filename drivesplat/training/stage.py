@@ -19,7 +19,7 @@ from drivesplat.kernels.road_distance import Road
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.machine.device import choose_device, explain_out_of_memory, flush_denormals
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
-from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
+from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint, write_training_record
 from drivesplat.model.road import RoadPart
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.images import below_horizon
@@ -249,8 +249,11 @@ def run_training(
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
-        folders = TrainingFolders(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
         model, seed = begun.model, job.random_seed
+        folders = TrainingFolders(
+            files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label,
+            lambda resume: write_training_record(resume, model, job, provenance),
+        )  # fmt: skip
         summary = train(
             model, begun.views, begun.settings, seed, device, folders, begun.road,
             curves=begun.curves, scans=begun.scans, probes=probes,

@@ -1,5 +1,6 @@
 """The live viewer in a browser: time, a drag, the edits file that comes out; and what it refuses."""
 
+import dataclasses
 import socket
 import sys
 import time
@@ -9,13 +10,17 @@ import numpy as np
 import pytest
 from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made_drive import drive_of
-from helpers.hand_made_street import AHEAD, street_model, street_scene
+from helpers.hand_made_street import AHEAD, checkpoint_of, street_model, street_scene
+from helpers.trainings import PROVENANCE
 
 from drivesplat.drive.live_overlays import EDGES
 from drivesplat.drive.live_server import LiveServer
 from drivesplat.drive.live_view import wxyz_of
-from drivesplat.drive.trained_drive import TrainedDrive
+from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.errors import RequestError
+from drivesplat.io.array_file import write_arrays
+from drivesplat.model.checkpoint import write_checkpoint
+from drivesplat.scene.scene import write_scene
 from drivesplat.workflow.edits_file import read_edits
 
 WIDTH, HEIGHT, PATIENCE_S = 1000, 600, 60.0
@@ -59,6 +64,27 @@ def test_the_edges_of_a_box_are_those_of_a_cube():
     assert EDGES.shape == (12, 2, 3) and np.allclose(np.linalg.norm(EDGES[:, 0] - EDGES[:, 1], axis=1), 1.0)
     assert np.allclose(np.abs(EDGES), 0.5) and len(np.unique(EDGES.reshape(12, 6), axis=0)) == 12
     assert wxyz_of(np.eye(4)).tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.viewers
+def test_a_later_checkpoint_is_shown_and_changes_stay(drive, tmp_path):
+    pytest.importorskip("viser")
+    scene, folder = drive.scene, tmp_path / "results/0001/street"
+    folder.mkdir(parents=True)
+    write_scene(folder.parent / "scene.json", scene)
+    write_arrays(folder.parent / "parser.npz", dataclasses.asdict(drive.record))
+    checkpoint = dataclasses.replace(checkpoint_of(drive.model), provenance=PROVENANCE)
+    write_checkpoint(folder / "checkpoint.npz", checkpoint)
+    opened = open_drive(folder, "cpu")
+    server = LiveServer([opened], port=free_port(), edits_file=tmp_path / "mine.yaml")
+    try:
+        session = server.view.session
+        session.change(AHEAD, lateral=1.0)
+        write_checkpoint(folder / "checkpoint.npz", checkpoint)
+        wait_until(lambda: session.drive is not opened)
+        assert session.change_of(AHEAD).lateral == 1.0 and session.edited.edit is not None
+    finally:
+        server.close()
 
 
 @in_a_browser

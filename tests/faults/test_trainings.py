@@ -33,7 +33,7 @@ from helpers.trainings import (
 from drivesplat.workflow.job import job
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.io import checkpoint_file
-from drivesplat.model.checkpoint import TrainedCheckpoint
+from drivesplat.model.checkpoint import STATE, UNFINISHED, TrainedCheckpoint, read_snapshot, trained_model
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training.monitor import Monitor
 from drivesplat.training.stage import run_training
@@ -100,6 +100,24 @@ def test_only_the_same_settings_code_and_inputs_resume(interrupted, tmp_path, ca
     ignored = f"{files.resume / 'state.npz'} belongs to other settings, code or inputs: training starts at 0"
     assert (ignored in caplog.text) == (other is not None)
     assert ("resuming at iteration 10 of 20" in caplog.text) == (other is None)
+
+
+def test_the_model_of_an_unfinished_training_can_be_looked_at(interrupted, tmp_path):
+    """Rows that were preallocated at the end of a part's parameters are no Gaussians."""
+    resume = files_in(interrupted / "it").resume
+    saved = checkpoint_file.load(resume / STATE, "train")
+    found = trained_model(read_snapshot(resume)).state_dict()
+    assert found.keys() == saved["state"]["model"].keys()
+    assert all(torch.equal(found[name], values) for name, values in saved["state"]["model"].items())
+    folder = tmp_path / "resume"
+    shutil.copytree(resume, folder)
+    saved["state"]["preallocated"] = [3, *[0] * (len(saved["state"]["preallocated"]) - 1)]
+    checkpoint_file.save(folder / STATE, saved)
+    fewer = trained_model(read_snapshot(folder))
+    assert len(fewer.parts[0]) == len(saved["state"]["model"]["parts.0.params.means"]) - 3
+    (folder / UNFINISHED).unlink()
+    with pytest.raises(ResultError, match=UNFINISHED):
+        read_snapshot(folder)
 
 
 def train_and_kill_the_parent(folder: str) -> None:
