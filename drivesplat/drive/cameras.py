@@ -32,7 +32,8 @@ class PoseableCamera:
     `width` and `height` in pixels; `K` in continuous pixels, in which the centre of the first pixel is at (0.5, 0.5).
     `camera_to_ego` is its mount on the ego vehicle (ego: x forward, y left, z up; camera: x right, y down, z forward),
     None for a camera that is always placed by its own pose. With `exposure_of`, images have the exposure that was
-    learned for this recorded camera; otherwise the model's own colours, as films have.
+    learned for this recorded camera; otherwise the model's own colours, as films have. Without a pose it is on the path
+    of the recorded camera `path_of`, or else where its mount is on the vehicle.
 
     `readout_s` are the seconds from the left edge to the right one and from the top edge to the bottom one at which
     lines are read, negative if read the other way, and from the image's time to the middle of the readout; zeros: a
@@ -50,6 +51,7 @@ class PoseableCamera:
     K: Float64[np.ndarray, "3 3"]
     camera_to_ego: Float64[np.ndarray, "4 4"] | None = None
     exposure_of: str | None = None
+    path_of: str | None = None
     readout_s: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     distortion: Float64[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
     distortion_model: DistortionModel = "none"
@@ -57,9 +59,11 @@ class PoseableCamera:
 
     def __post_init__(self) -> None:
         try:
-            checked_size(self.width, self.height, "the camera")
+            width, height = checked_size(self.width, self.height, "the camera")
         except DatasetError as error:
             raise RequestError(str(error)) from None
+        object.__setattr__(self, "width", width)
+        object.__setattr__(self, "height", height)
         object.__setattr__(self, "K", _checked(checked_intrinsics, self.K, "the camera"))
         object.__setattr__(self, "readout_s", require_vector(self.readout_s, 3, "the camera's readout_s"))
         object.__setattr__(self, "distortion", require_vector(self.distortion, None, "the camera's distortion"))
@@ -102,7 +106,10 @@ class PoseableCamera:
     @cached_property
     def faces(self) -> list[LensFace]:
         """The pinhole images that a distorted image is resampled from."""
-        return faces_of(self.lens)
+        faces = faces_of(self.lens)
+        if not faces:
+            raise RequestError("the camera: its lens images no direction within its image")
+        return faces
 
     def resized(self, width: int) -> "PoseableCamera":
         """The same field of view in images of another width."""

@@ -68,9 +68,12 @@ class LensFace:
 
 
 def faces_of(lens: Camera) -> list[LensFace]:
-    """The pinhole images that show what a distorted camera sees, at the resolution of its centre."""
+    """The pinhole images that show what a distorted camera sees, at the resolution of its centre; none where its lens
+    images no direction within its image."""
     rays, k = directions(lens), central_intrinsics(lens)
     known = np.isfinite(rays).all(axis=-1)
+    if not known.any():
+        return []
     widest = np.arccos(np.clip(rays[known][:, 2].min(initial=1.0), -1.0, 1.0))
     if widest <= MAX_HALF_ANGLE:
         return [_face(TURNS[0], rays, known, k)]

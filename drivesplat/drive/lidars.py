@@ -39,9 +39,10 @@ class PoseableLidar:
     def __post_init__(self) -> None:
         if self.sensor_to_ego is not None:
             object.__setattr__(self, "sensor_to_ego", require_pose(self.sensor_to_ego, "the LiDAR's mount"))
-        for spread in self.beam_spread or ():
-            if not 0.0 < spread < 0.1:
-                raise RequestError(f"a beam_spread of {spread:g} rad is no LiDAR's: it is about 0.0003")
+        if self.beam_spread is not None:
+            spread = require_vector(self.beam_spread, 2, "beam_spread")
+            if not ((spread > 0.0) & (spread < 0.1)).all():
+                raise RequestError(f"a beam_spread of {self.beam_spread} rad is no LiDAR's: it is about 0.0003")
 
     @classmethod
     def spinning(
@@ -59,13 +60,13 @@ class PoseableLidar:
         beams = require_vector(beam_elevations, None, "beam_elevations")
         if not len(beams) or np.abs(beams).max() > np.pi / 2:
             raise RequestError("beam_elevations are at least one angle in radians, within 1.57 of the horizontal plane")
-        if azimuth_steps < 1 or len(beams) * azimuth_steps > MAX_RAYS:
+        if azimuth_steps != azimuth_steps // 1 or azimuth_steps < 1 or len(beams) * azimuth_steps > MAX_RAYS:
             raise RequestError(
                 f"{len(beams)} beams with {azimuth_steps} azimuth_steps: a scan has 1 to {MAX_RAYS} rays"
             )
         if not 0.0 <= revolution_s < 10.0:
             raise RequestError(f"revolution_s is {revolution_s:g}; a revolution takes about 0.1 s")
-        fractions = (np.arange(azimuth_steps) + 0.5) / azimuth_steps
+        fractions = (np.arange(int(azimuth_steps)) + 0.5) / azimuth_steps
         azimuths = wrapped(np.pi + 2.0 * np.pi * fractions * (-1.0 if clockwise else 1.0))
         grids = np.broadcast_arrays(azimuths, beams[:, None], revolution_s * (fractions - 0.5))
         rays = ScanRays(*(np.ascontiguousarray(grid, dtype=np.float32) for grid in grids))

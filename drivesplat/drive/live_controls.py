@@ -1,5 +1,6 @@
 """The controls of a live viewer: what is shown, and how objects and the vehicle are changed."""
 
+import logging
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from drivesplat.drive.live_view import ERROR, EditSession, LiveView, describe, wxyz_of
 from drivesplat.drive.pictures import PICTURES
 from drivesplat.errors import DriveSplatError, RequestError
+
+log = logging.getLogger(__name__)
 
 FREE, SAME = "none (free camera)", "the same"
 """The entries with which the user moves the camera, and with which both halves show one method."""
@@ -24,7 +27,7 @@ class LiveControls:
     def __init__(self, server: Any, view: LiveView, edits_file: Path):
         self.view, self.edits_file, self.version, self.lock = view, edits_file, 0, threading.RLock()
         self.selected: str | None = None
-        self._server, self._handle = server, None
+        self._server, self._handle, self._dragged = server, None, False
         self._names = [f"{session.drive.folder.name} ({i + 1})" for i, session in enumerate(view.sessions)]
         self._add_of_view()
         self._add_of_edit()
@@ -33,7 +36,8 @@ class LiveControls:
     def _add_of_view(self) -> None:
         gui, drive = self._server.gui, self.view.session.drive
         with gui.add_folder("Drive"):
-            self.time = gui.add_slider("seconds", 0.0, round(drive.duration, 2), 0.01, 0.0)
+            end = np.floor(100.0 * drive.duration) / 100.0
+            self.time = gui.add_slider("seconds", 0.0, float(end), 0.01, 0.0)
             self.play = gui.add_checkbox("play", False)
             cameras = [FREE, *drive.cameras]
             self.follow = gui.add_dropdown("follow", cameras, initial_value=cameras[min(1, len(cameras) - 1)])
@@ -87,9 +91,16 @@ class LiveControls:
         with self.lock:
             try:
                 change()
-            except DriveSplatError as error:
-                self.say(str(error))
+            except Exception as error:
+                self.report(error)
+                self._show_change()
             self.version += 1
+
+    def report(self, error: Exception) -> None:
+        """Shows an error in every window, and one that is no fault of the user's in the log, too."""
+        if not isinstance(error, DriveSplatError):
+            log.error("the live viewer", exc_info=error)
+        self.say(str(error) or type(error).__name__)
 
     def say(self, text: str) -> None:
         """Shows a text in every window for some seconds."""
@@ -106,6 +117,7 @@ class LiveControls:
             later = self.view.time + seconds
             self.view.time = later if later <= self.view.session.drive.duration else 0.0
             self.time.value = round(self.view.time, 2)
+            self._place_handle()
             self.version += 1
 
     # ---- what is shown
@@ -124,6 +136,8 @@ class LiveControls:
         beside = self.beside.value
         self.view.method = self._names.index(self.method.value)
         self.view.beside = None if beside == SAME else self._names.index(beside)
+        self.points.disabled = not self.view.session.drive.renders_lidar
+        self.points.value = self.points.value and not self.points.disabled
         self.select(None)
 
     # ---- edits
@@ -136,13 +150,17 @@ class LiveControls:
             self.message.content = CLICK
             return
         self._handle = self._server.scene.add_transform_controls("/handle", scale=2.5, depth_test=False)
-        self._handle.on_update(lambda event: self.changing(lambda: self._dragged(event.phase == "end")))
+        self._handle.on_update(lambda event: self._drag(event.phase == "end"))
         self._show_change()
 
     def _show_change(self) -> None:
-        """Gives the controls the changes of the selected object."""
-        change = self.view.session.change_of(self._required())
-        self.message.content = describe(self.view.session.drive.actors, self._required())
+        """Gives the controls the changes of the vehicle and of the selected object."""
+        session = self.view.session
+        self.ego_lateral.value, self.ego_speed.value = session.ego_lateral, session.ego_speed
+        if self.selected is None:
+            return
+        change = session.change_of(self.selected)
+        self.message.content = describe(session.drive, self.selected)
         self.lateral.value, self.longitudinal.value = change.lateral, change.longitudinal
         self.yaw.value, self.removed.value = change.yaw, change.removed
         self._place_handle()
@@ -161,23 +179,40 @@ class LiveControls:
             raise RequestError("click an object first")
         return self.selected
 
+    def _of_all(self, change: Callable[[EditSession], None]) -> None:
+        """Makes a change in every method, or in none."""
+        before = [(session.changes, session.ego_lateral, session.ego_speed) for session in self.view.sessions]
+        try:
+            for session in self.view.sessions:
+                change(session)
+        except DriveSplatError:
+            for session, state in zip(self.view.sessions, before, strict=True):
+                session.changes, session.ego_lateral, session.ego_speed = state
+            raise
+
     def _change(self, change: Callable[[EditSession, str], None], show: bool = True) -> None:
         """Changes the selected object in every method that has it, and shows the change in the controls."""
         track = self._required()
-        for session in self.view.sessions:
-            if track in session.objects:
-                change(session, track)
+        self._of_all(lambda session: change(session, track) if track in session.objects else None)
         if show:
             self._show_change()
 
-    def _dragged(self, ends: bool) -> None:
-        """Places the selected object where its handle is; at the end the handle goes where the object then is."""
-        if self._handle is None:
+    def _drag(self, ends: bool) -> None:
+        """Remembers that the handle has moved: the next picture places the object. At the end that is done at once."""
+        self._dragged = True
+        if ends:
+            self.changing(lambda: self.place_dragged(show=True))
+
+    def place_dragged(self, show: bool = False) -> None:
+        """Places the selected object where its handle was dragged to, if it was."""
+        if not self._dragged or self._handle is None:
             return
+        self._dragged = False
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(self._handle.wxyz, scalar_first=True).as_matrix()
         pose[:3, 3] = self._handle.position
-        self._change(lambda session, track: session.place(track, pose, self.view.time), ends)
+        self._change(lambda session, track: session.place(track, pose, self.view.time), show)
+        self.version += 1
 
     def _edit_selected(self) -> None:
         fields = {name: float(getattr(self, name).value) for name in ("lateral", "longitudinal", "yaw")}
@@ -192,8 +227,8 @@ class LiveControls:
         self._change(lambda session, track: session.reset(track))
 
     def _edit_ego(self) -> None:
-        for session in self.view.sessions:
-            session.change_ego(float(self.ego_lateral.value), float(self.ego_speed.value))
+        lateral, speed = float(self.ego_lateral.value), float(self.ego_speed.value)
+        self._of_all(lambda session: session.change_ego(lateral, speed))
 
     def _write(self) -> None:
         self.view.session.write(self.edits_file, self.name.value)

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from drivesplat.drive.live_view import LiveView, describe, wxyz_of
-from drivesplat.drive.pictures import number_colors
+from drivesplat.drive.pictures import name_colors, with_rest
+from drivesplat.drive.world_actor import WorldActor
 
 FRUSTUM_EVERY = 5
 """Every this many-th key frame is drawn as a camera."""
@@ -16,8 +17,6 @@ EDGES = np.array([(a, b) for a, b in itertools.combinations(_CORNERS, 2) if np.a
 """The edges (12, 2, 3) of a box with edges of length 1."""
 MAX_POINTS = 100_000
 """LiDAR returns that are sent at once."""
-STATIC_COLOR = 220
-"""The grey level of returns of what is no object."""
 
 
 class Overlays:
@@ -40,9 +39,13 @@ class Overlays:
         self._frustums.visible = visible
 
     def draw_boxes(self, visible: bool) -> None:
-        """Draws the boxes of the objects that can be edited, at the time of the view."""
-        state = self._view.drive.state(self._view.time, outside="clamp")
-        shown = dict(state.actors.items()) if visible else {}
+        """Draws the boxes of the objects that can be edited, at the time of the view; those that are removed where they
+        were recorded."""
+        session, shown = self._view.session, dict[str, WorldActor]()
+        if visible:
+            drives = [session.drive] if any(change.removed for change in session.changes.values()) else []
+            for drive in (*drives, session.edited):
+                shown |= drive.state(self._view.time, outside="clamp").actors
         for name in self._boxes.keys() - shown.keys():
             for handle in self._boxes.pop(name):
                 handle.remove()
@@ -54,12 +57,11 @@ class Overlays:
                 handle.position, handle.wxyz = pose[:3, 3], wxyz_of(pose)
 
     def _new_box(self, name: str, size: np.ndarray) -> list[Any]:
-        objects, table = self._view.session.objects, self._view.session.drive.actors
-        color = tuple(number_colors(len(objects))[objects.index(name)].tolist())
+        color = tuple(name_colors([name])[0].tolist())
         key, edges = f"/objects/{name.replace('/', '_')}", tuple(size.tolist())
         box = self._nodes.add_box(f"{key}/box", color, edges, opacity=0.15)
         lines = self._nodes.add_line_segments(f"{key}/lines", size * EDGES, colors=color)
-        label = self._nodes.add_label(f"{key}/label", describe(table, name))
+        label = self._nodes.add_label(f"{key}/label", describe(self._view.session.drive, name))
         box.on_click(lambda _: self._select(name))
         return [box, lines, label]
 
@@ -73,8 +75,7 @@ class Overlays:
         arrays, points = scan.arrays(), scan.points()
         numbers = arrays["instance"][arrays["returned"]]
         chosen = slice(None, None, max(1, len(points) // MAX_POINTS))
-        static = np.full((1, 3), STATIC_COLOR, dtype=np.uint8)
-        colors = np.concatenate([number_colors(len(scan.objects)), static])  # -1 finds the last
+        colors = with_rest(name_colors(scan.objects))
         self._nodes.add_point_cloud(
             "/lidar", points[chosen].astype(np.float32), colors[numbers[chosen]], point_size=0.06
         )

@@ -8,7 +8,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ MOVING_SHARE = 0.5
 QUALITY = {False: 80, True: 95}
 """JPEG quality of images while something moves, and at rest."""
 POLL_S, PAUSE_S = 0.005, 1.0
-"""Seconds between two looks for changes, and after an error."""
+"""Seconds between two looks for changes, and between two looks for the end."""
 LOOK_EVERY_S = 2.0
 """Seconds between two looks for later states of a training."""
 FIRST_FOV = 1.0
@@ -43,11 +43,13 @@ FIRST_FOV = 1.0
 
 @dataclass
 class WindowState:
-    """The image of a browser window: what it `shows`, since when, and whether it has the size of the window."""
+    """The image of a browser window: what it `shows`, since when, and whether it has the size of the window; and when
+    its camera was `placed` last, by `time.monotonic`."""
 
     shows: tuple = ()
     since: float = 0.0
     whole: bool = True
+    placed: float = 0.0
 
 
 class LiveServer:
@@ -77,6 +79,8 @@ class LiveServer:
         self._overlays = Overlays(self._server.scene, view, self.controls.click)
         self._closed, self._windows = threading.Event(), dict[int, WindowState]()
         self._stamps = [_stamp(drive) for drive in drives]
+        self._drawn = self._failed = -1
+        self._followed: FreeCamera | None = None
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(lambda client: self._windows.pop(client.client_id, None))
         self._worker = threading.Thread(target=self._work, name="drivesplat-viewer", daemon=True)
@@ -109,6 +113,7 @@ class LiveServer:
             stamp = _stamp(session.drive)
             if stamp in (None, self._stamps[i]):
                 continue
+            self._stamps[i] = stamp
             try:
                 later = open_drive(session.drive.folder, session.drive.device.type)
             except DriveSplatError as error:  # the training has just removed the state
@@ -117,59 +122,70 @@ class LiveServer:
             with self.controls.lock:
                 session.follow(later)
                 self.controls.version += 1
-            self._stamps[i] = stamp
 
     def _work(self) -> None:
-        last, drawn, looked = time.monotonic(), -1, time.monotonic()
+        last = looked = time.monotonic()
         while not self._closed.wait(POLL_S):
             now = time.monotonic()
-            try:
-                if now - looked > LOOK_EVERY_S:
-                    looked = now
-                    self._follow_trainings()
-                with self.controls.lock:
-                    self.controls.advance(now - last)
-                    if drawn != self.controls.version:
-                        drawn = self.controls.version
-                        self._draw_overlays()
-                last = now
-                for client in self._server.get_clients().values():
-                    self._show(client)
-            except DriveSplatError as error:
-                log.warning("%s", error)
-                self.controls.say(str(error))
-                self._closed.wait(PAUSE_S)
+            if now - looked > LOOK_EVERY_S:
+                looked = now
+                self._attempt(self._follow_trainings)
+            last, seconds = now, now - last
+            self._attempt(lambda seconds=seconds: self._step(seconds))
+            for client in self._server.get_clients().values():
+                self._attempt(lambda client=client: self._show(client))
 
-    def _draw_overlays(self) -> None:
+    def _attempt(self, part: Callable[[], None]) -> None:
+        """Does a part of the loop. An error is shown once for each change, and the rest goes on."""
+        try:
+            part()
+        except Exception as error:
+            if self._failed != self.controls.version:
+                self._failed = self.controls.version
+                self.controls.report(error)
+
+    def _step(self, seconds: float) -> None:
+        """Plays the drive, and draws what lies over the picture where something has changed."""
         controls = self.controls
-        self._overlays.show_cameras(bool(controls.cameras.value))
-        self._overlays.draw_boxes(bool(controls.boxes.value))
-        self._overlays.draw_points(bool(controls.points.value))
+        with controls.lock:
+            controls.place_dragged()
+            controls.advance(seconds)
+            if self._drawn == controls.version:
+                return
+            self._drawn = controls.version
+            self._followed = self.view.followed()
+            self._overlays.show_cameras(bool(controls.cameras.value))
+            self._overlays.draw_boxes(bool(controls.boxes.value))
+            try:
+                self._overlays.draw_points(bool(controls.points.value))
+            except DriveSplatError:
+                controls.points.value = False
+                raise
 
     def _show(self, client: Any) -> None:
         """Renders the image of a window, if anything has changed or come to rest."""
         window, camera, now = self._windows.get(client.client_id), client.camera, time.monotonic()
         if window is None or not camera.image_height:
             return
-        with self.controls.lock:
-            followed, version = self.view.followed(), self.controls.version
-        if followed is not None:
-            free = followed
-        else:
-            turn = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
-            free = FreeCamera(rigid(turn, np.array(camera.position)), float(camera.fov))
+        followed, turn = self._followed, Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
+        own = FreeCamera(rigid(turn, np.array(camera.position)), float(camera.fov))
+        if followed is not None and not followed.is_near(own) and now - window.placed > REST_S:
+            _set_camera(camera, followed)
+            window.placed = now
+        free = own if followed is None else followed
         size = camera.image_width, camera.image_height
-        shows = version, free.camera_to_world.tobytes(), free.vertical_fov, size
+        shows = self._drawn, free.camera_to_world.tobytes(), free.vertical_fov, size
         moved = shows != window.shows
         if not moved and (window.whole or now - window.since < REST_S):
             return
+        window.shows, window.whole = shows, not moved
+        window.since = now if moved else window.since
         with self.controls.lock:
             picture = self.view.picture(free, *self._size_of(size, whole=not moved))
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=QUALITY[not moved])
         if followed is not None:
             _set_camera(camera, followed)
-        window.shows, window.whole = shows, not moved
-        window.since = now if moved else window.since
+            window.placed = now
 
     def _size_of(self, window: tuple[int, int], whole: bool) -> tuple[int, int]:
         """The width and height of an image in pixels for a window of this size."""
@@ -210,6 +226,6 @@ def _require_free(host: str, port: int) -> None:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
-        except OSError as error:
-            reason = error.strerror or error
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise RequestError(f"the viewer cannot use {host}:{port} ({reason}); choose another --port") from None

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,15 @@ from drivesplat.io.yaml_file import read_yaml
 from drivesplat.scene.images import read_image
 from drivesplat.scene.tracks import matching_ids
 from drivesplat.settings.edit import MIN_CHROMA
-from drivesplat.settings.names import NAME
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
-from drivesplat.workflow.edits_file import edit_of, read_edits
+from drivesplat.workflow.edits_file import edit_of, read_edits, require_edit_name
 
 DECIMALS = 3
 """Of the metres and degrees of steps."""
 ITERATIONS = 4
 """Steps of the search for a shift that places an object: on a bend its path is no straight line."""
+COMMENT = r"(^|\s)#"
+"""Where a comment of an edits file begins; colours such as '#ff0000' are in quotes."""
 ERROR = "error"
 """The name of the picture of differences from the recorded image."""
 PAINTED = 0.3
@@ -87,9 +88,9 @@ class EditSession:
 
     def follow(self, drive: TrainedDrive) -> None:
         """Goes on with another model of the same drive, such as a later one of the same training."""
-        self.drive = drive
         self._recorded = trained_actors(drive.model, drive.scene, drive.where)
         self._made: tuple[list[dict[str, Any]], TrainedDrive] = [], drive
+        self.drive = drive
         self.changes = {track: change for track, change in self.changes.items() if track in self.objects}
 
     @property
@@ -120,62 +121,62 @@ class EditSession:
         """Changes fields of an object's `ObjectChange`. Nothing is changed where an edit could not do it."""
         track = self._actor(name).id
         rounded = {key: round(value, DECIMALS) if isinstance(value, float) else value for key, value in fields.items()}
-        changed = ObjectChange(**{**vars(self.change_of(track)), **rounded})
-        if steps := changed.steps(track):
-            edited_actors(self._recorded, edit_of(steps, f"object {track}"), self.drive.where)
-        self.changes = {**self.changes, track: changed}
-        if changed == ObjectChange():
-            del self.changes[track]
+        self._attempt({**self.changes, track: ObjectChange(**{**vars(self.change_of(track)), **rounded})})
+
+    def _attempt(self, changes: dict[str, ObjectChange], ego: tuple[float, float] | None = None) -> None:
+        """Takes over changes, and perhaps those of the ego vehicle, if they are an edit of the drive."""
+        before = self.changes, self.ego_lateral, self.ego_speed
+        self.changes = {track: change for track, change in changes.items() if change != ObjectChange()}
+        if ego is not None:
+            self.ego_lateral, self.ego_speed = ego
+        try:
+            _ = self.edited
+        except DriveSplatError:
+            self.changes, self.ego_lateral, self.ego_speed = before
+            raise
 
     def place(self, name: str, object_to_world: Matrix, time: float) -> None:
         """Shifts an object along and across its path so that it stands at a pose (4, 4) at a time in seconds. Its
         height, pitch and roll stay those of its path."""
-        wanted, track = require_pose(object_to_world, f"object {name}"), self._actor(name).id
-        self.change(track, removed=False)
+        wanted, actor = require_pose(object_to_world, f"object {name}"), self._actor(name)
+        change = replace(self.change_of(name), removed=False)
         for _ in range(ITERATIONS):
-            now = self.change_of(track)
-            found = self._pose(track, time)
+            found = self._pose(actor, change, time)
             turn = np.arctan2(wanted[1, 0], wanted[0, 0]) - np.arctan2(found[1, 0], found[0, 0])
-            yaw = np.degrees(turn) + now.yaw
-            heading = np.arctan2(found[1, 0], found[0, 0]) - np.radians(now.yaw)
+            heading = np.arctan2(found[1, 0], found[0, 0]) - np.radians(change.yaw)
             ahead, left = (np.array([np.cos(heading + a), np.sin(heading + a)]) for a in (0.0, 0.5 * np.pi))
             missing = (wanted - found)[:2, 3]
-            self.change(
-                track,
-                longitudinal=float(now.longitudinal + missing @ ahead),
-                lateral=float(now.lateral + missing @ left),
-                yaw=float((yaw + 180.0) % 360.0 - 180.0),
+            change = replace(
+                change,
+                longitudinal=round(float(change.longitudinal + missing @ ahead), DECIMALS),
+                lateral=round(float(change.lateral + missing @ left), DECIMALS),
+                yaw=round(float((np.degrees(turn) + change.yaw + 180.0) % 360.0 - 180.0), DECIMALS),
             )
+        self._attempt({**self.changes, actor.id: change})
 
     def change_ego(self, lateral: float, speed: float) -> None:
         """Moves the ego vehicle to its left by metres, at a factor on its speed. Nothing is changed where an edit could
         not do it."""
-        before = self.ego_lateral, self.ego_speed
-        self.ego_lateral, self.ego_speed = round(lateral, DECIMALS), round(speed, DECIMALS)
-        try:
-            _ = self.edited
-        except DriveSplatError:
-            self.ego_lateral, self.ego_speed = before
-            raise
+        self._attempt(self.changes, (round(lateral, DECIMALS), round(speed, DECIMALS)))
 
     def reset(self, name: str) -> None:
         """Takes back all changes of an object."""
-        self.changes.pop(self._actor(name).id, None)
+        gone = self._actor(name).id
+        self.changes = {track: change for track, change in self.changes.items() if track != gone}
 
     def write(self, path: str | Path, name: str) -> None:
         """Writes the steps as the edit `name` into an edits file; other edits of the file stay.
 
-        Raises RequestError without a change, for a name that no edit may have, and for a file with comments, which
-        would be lost; ConfigError where the file is no edits file.
+        Raises RequestError without a change, and for a file with comments, which would be lost; ConfigError for a name
+        that no edit may have, and where the file is no edits file.
         """
         path, steps, known = Path(path), self.steps(), {}
         if not steps:
             raise RequestError("nothing has been changed: there is no edit to write")
-        if not re.fullmatch(NAME, name):
-            raise RequestError(f"an edit cannot be named {name!r}: use letters, digits, '_', '-' and '.'")
+        require_edit_name(name, f"{path}: edit")
         if path.exists():
             read_edits(path)
-            if any(line.lstrip().startswith("#") for line in path.read_text(encoding="utf-8").splitlines()):
+            if re.search(COMMENT, path.read_text(encoding="utf-8"), flags=re.MULTILINE):
                 raise RequestError(f"{path} has comments, which would be lost: name another file")
             known = read_yaml(path, "edits file")["edits"] or {}
         content = {"edits": {**known, name: steps}}
@@ -188,11 +189,10 @@ class EditSession:
             raise UnknownObjectError(f"no single object that can be edited has an id starting with {name!r}")
         return next(actor for actor in self._recorded if actor.id == found[0])
 
-    def _pose(self, track: str, time: float) -> np.ndarray:
-        """The pose of an object after its changes."""
-        actor, steps = self._actor(track), self.change_of(track).steps(track)
-        if steps:
-            (actor,) = edited_actors([actor], edit_of(steps, f"object {track}"), self.drive.where)
+    def _pose(self, actor: EditedActor, change: ObjectChange, time: float) -> np.ndarray:
+        """The pose of an object after a change."""
+        if steps := change.steps(actor.id):
+            (actor,) = edited_actors([actor], edit_of(steps, f"object {actor.id}"), self.drive.where)
         return actor.poses(np.array([time]))[0]
 
 
@@ -203,6 +203,10 @@ class FreeCamera:
 
     camera_to_world: np.ndarray
     vertical_fov: float
+
+    def is_near(self, other: "FreeCamera") -> bool:
+        """Whether another camera has the same place and direction but for rounding."""
+        return bool(np.allclose(self.camera_to_world, other.camera_to_world, atol=1e-3))
 
     def sized(self, width: int, height: int) -> PoseableCamera:
         """The camera with images of this size."""
@@ -256,15 +260,21 @@ class LiveView:
         return FreeCamera(pose, 2.0 * np.arctan(0.5 * camera.height / camera.K[1, 1]))
 
     def picture(self, free: FreeCamera, width: int, height: int) -> Picture:
-        """What a window of this size in pixels shows from `free`. Where a recorded image is wanted, it is the image of
-        the camera that the view follows, with the principal point in the middle of the window."""
+        """What a window of this size in pixels shows from `free`. Where a recorded image is wanted, it shows the time
+        of the nearest image of the camera that the view follows, with the principal point in the middle of the
+        window."""
         width, height = (int(np.clip(edge, MIN_SIZE, MAX_SIZE)) for edge in (width, height))
         followed = self.followed()
         if followed is None or self.follow is None or not (self.recorded or self.shows == ERROR):
             return self._compared(free.sized(width, height), free.camera_to_world, None)
-        camera = self.drive.camera(self.follow)
+        camera, index = self.drive.camera(self.follow, exposure=self.shows == ERROR), self.nearest_image()
+        if index is None:
+            return self._compared(free.sized(width, height), free.camera_to_world, None)
         camera = camera.resized(max(MIN_SIZE, round(camera.width * height / camera.height)))
-        picture = self._compared(camera, followed.camera_to_world, self._recorded(camera))
+        frame = self.session.drive.scene.frames[index]
+        at = replace(self, time=self.session.drive.scene.seconds(frame.timestamp))
+        there = at.followed() or followed
+        picture = at._compared(camera, there.camera_to_world, self._recorded(index, camera))
         return placed(picture, camera.K[:2, 2], width, height)
 
     def _compared(self, camera: PoseableCamera, pose: np.ndarray, recorded: Picture | None) -> Picture:
@@ -309,10 +319,7 @@ class LiveView:
         own = [i for i, frame in enumerate(scene.frames) if frame.camera == self.follow]
         return min(own, key=lambda i: abs(scene.seconds(scene.frames[i].timestamp) - self.time), default=None)
 
-    def _recorded(self, camera: PoseableCamera) -> Picture | None:
-        index = self.nearest_image()
-        if index is None:
-            return None
+    def _recorded(self, index: int, camera: PoseableCamera) -> Picture | None:
         if index not in self._images:
             self._images.clear()
             try:
@@ -323,10 +330,14 @@ class LiveView:
         return cv2.resize(self._images[index], size, interpolation=cv2.INTER_AREA)
 
 
-def describe(table: Any, name: str) -> str:
-    """An object in words, from the table `TrainedDrive.actors`."""
-    known = table.loc[name]
-    return f"{known['class']} {name[:8]}, up to {known['speed']:.0f} m/s"
+def describe(drive: TrainedDrive, name: str) -> str:
+    """An object of a drive in words."""
+    track = drive.scene.track(name)
+    if track is None:
+        return name[:8]
+    table = drive.actors
+    speed = f", up to {table.loc[name, 'speed']:.0f} m/s" if name in table.index else ""
+    return f"{track.object_class.value} {name[:8]}{speed}"
 
 
 def wxyz_of(pose: np.ndarray) -> np.ndarray:

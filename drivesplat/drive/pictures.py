@@ -1,7 +1,8 @@
 """Renderings of a drive as pictures to look at: colours, depth, opacity, objects, classes, and errors of an image."""
 
 import colorsys
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -26,6 +27,12 @@ def number_colors(count: int) -> UInt8[np.ndarray, "n 3"]:
     return (255.0 * np.array(shades).reshape(-1, 3)).round().astype(np.uint8)
 
 
+def name_colors(names: Sequence[str]) -> UInt8[np.ndarray, "n 3"]:
+    """A colour for each name, always the same for a name."""
+    shades = [colorsys.hsv_to_rgb(zlib.crc32(name.encode()) / 2**32, 0.75, 1.0) for name in names]
+    return (255.0 * np.array(shades).reshape(-1, 3)).round().astype(np.uint8)
+
+
 def depth_picture(depth: np.ndarray) -> Picture:
     """Near surfaces red, far ones blue, none black. `depth` (h, w) in metres."""
     far = np.log(np.clip(depth, MIN_DEPTH, MAX_DEPTH) / MIN_DEPTH) / np.log(MAX_DEPTH / MIN_DEPTH)
@@ -33,8 +40,9 @@ def depth_picture(depth: np.ndarray) -> Picture:
     return np.where(depth[..., None] > 0.0, colors, 0).astype(np.uint8)
 
 
-def _numbers(values: np.ndarray, count: int) -> Picture:
-    return np.concatenate([number_colors(count), np.full((1, 3), GREY, dtype=np.uint8)])[values]  # -1 finds the last
+def with_rest(colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "_ 3"]:
+    """Colours, and last the grey of what has none, which the index -1 finds."""
+    return np.concatenate([colors, np.full((1, 3), GREY, dtype=np.uint8)])
 
 
 def _depth(view: DriveView) -> Picture:
@@ -50,8 +58,8 @@ PICTURES: dict[str, tuple[str, Callable[[DriveView], Picture]]] = {
     "colour": ("rgb", lambda view: view.image),
     "depth": ("depth", _depth),
     "opacity": ("alpha", _alpha),
-    "objects": ("instance", lambda view: _numbers(view.arrays()["instance"], len(view.objects))),
-    "classes": ("semantic", lambda view: _numbers(view.arrays()["semantic"], len(view.classes))),
+    "objects": ("instance", lambda view: with_rest(name_colors(view.objects))[view.arrays()["instance"]]),
+    "classes": ("semantic", lambda view: number_colors(len(view.classes))[view.arrays()["semantic"]]),
 }
 """What can be looked at: the output that it needs, and the picture of a rendering with this output."""
 

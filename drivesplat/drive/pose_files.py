@@ -56,7 +56,7 @@ def read_poses(path: str | Path) -> TimedPoses:
 def _rows_of_table(path: Path, text: str) -> list[list[float]]:
     table = csv.DictReader(text.splitlines())
     if missing := [name for name in COLUMNS if name not in (table.fieldnames or ())]:
-        raise RequestError(f"{path} has no column {missing[0]!r}; its first line names {', '.join(COLUMNS)}")
+        raise RequestError(f"{path} has no column {missing[0]!r}; its first line must name {', '.join(COLUMNS)}")
     return [_checked([row[name] for name in COLUMNS], f"{path}, line {table.line_num}") for row in table]
 
 

@@ -18,6 +18,7 @@ from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import SensorPoses
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scan import ScanRays
 from drivesplat.scene.scan_record import RecordedScan, ScanRecords, read_scans
 from drivesplat.scene.scene import REFINED, Frame, Scene, Track, read_scene
 from drivesplat.scene.shutter import readout_of
@@ -84,11 +85,12 @@ class RecordedDrive:
     def checked(self, time: float) -> float:
         """A time within the recording. Raises RequestError for any other."""
         if not 0.0 <= time <= self.duration:
-            raise RequestError(
-                f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s; outside='clamp' "
-                "renders its start or its end"
-            )
+            raise RequestError(self.outside(time))
         return time
+
+    def outside(self, time: float) -> str:
+        """A sentence about a time outside of the recording."""
+        return f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s"
 
     def camera(self, name: str, exposure: bool, rolling_shutter: bool) -> PoseableCamera:
         """A recorded camera: see `TrainedDrive.camera`."""
@@ -99,7 +101,7 @@ class RecordedDrive:
             readout = np.append(readout_of(known[name]), frame.readout_middle_s)
         return PoseableCamera(
             width, height, self.record.Ks[index].astype(np.float64), frame.camera_to_ego, name if exposure else None,
-            readout, covered=tuple(self.ego_mask.outlines.get(name, ())),
+            name, readout, covered=tuple(self.ego_mask.outlines.get(name, ())),
         )  # fmt: skip
 
     def first_image(self, name: str) -> tuple[int, Frame]:
@@ -112,19 +114,30 @@ class RecordedDrive:
     def camera_to_world(self, name: str, time: float) -> Float64[np.ndarray, "4 4"]:
         """The pose of a camera on the smooth path through its images. Raises RequestError for a time at which it did
         not record."""
-        frames, stamps = recorded_frames(self.scene, name), recorded_timestamps(self.scene, name)
-        recorded = self.scene.seconds(stamps[0]) + (stamps - stamps[0]) * 1e-6
-        if not recorded[0] - MAX_LEAD <= self.checked(time) <= recorded[-1] + MAX_LEAD:
-            raise RequestError(
-                f"camera {name} recorded from {recorded[0]:.2f} to {recorded[-1]:.2f} s, not at {time:g} s"
-            )
-        poses = np.stack([frame.camera_to_world for frame in frames])
+        recorded = self._path(name, time)
+        poses = np.stack([frame.camera_to_world for frame in recorded_frames(self.scene, name)])
         return smooth_poses(recorded * 1e6, poses, np.array([time]) * 1e6)[0]
 
     @cached_property
     def ego(self) -> EgoPoses:
-        """The poses of the vehicle."""
+        """The poses of the vehicle, by the images of the first camera; without cameras by sweeps."""
         return recorded_ego(self.scene, self.cameras[0] if self.cameras else None)
+
+    def ego_to_world(self, time: float) -> Float64[np.ndarray, "4 4"]:
+        """The pose of the vehicle. Raises RequestError for a time at which the first camera did not record."""
+        if self.cameras:
+            self._path(self.cameras[0], time)
+        return self.ego(np.array([self.checked(time)]))[0]
+
+    def _path(self, camera: str, time: float) -> Float64[np.ndarray, " n"]:
+        """The seconds of the images of a camera. Raises RequestError for a time at which it did not record."""
+        stamps = recorded_timestamps(self.scene, camera)
+        recorded = self.scene.seconds(stamps[0]) + (stamps - stamps[0]) * 1e-6
+        if not recorded[0] - MAX_LEAD <= self.checked(time) <= recorded[-1] + MAX_LEAD:
+            raise RequestError(
+                f"camera {camera} recorded from {recorded[0]:.2f} to {recorded[-1]:.2f} s, not at {time:g} s"
+            )
+        return recorded
 
     @cached_property
     def _scans(self) -> ScanRecords:
@@ -148,7 +161,9 @@ class RecordedDrive:
         """A recorded LiDAR with the rays of its scan that is nearest in time, and its mount."""
         scan = self.nearest_scan(name, time)
         ego = self.ego(np.array([scan.seconds]))[0]
-        return PoseableLidar(scan.scan.rays, inverse(ego) @ scan.sensor_to_world, scan.blocked)
+        rays = scan.scan.rays
+        copied = ScanRays(rays.azimuths.copy(), rays.elevations.copy(), rays.offsets_s.copy())
+        return PoseableLidar(copied, inverse(ego) @ scan.sensor_to_world, scan.blocked.copy())
 
     def carried(self, scan: RecordedScan, ego: EgoPoses, time: float) -> SensorPoses:
         """The poses of the sensor of a recorded scan at a time, on a vehicle that drives as `ego` says."""

@@ -42,8 +42,16 @@ def render_poses(
     if unknown := [name for name in outputs if name not in WRITTEN]:
         raise RequestError(f"output {unknown[0]!r} cannot be written; there are: {', '.join(WRITTEN)}")
     folder, known = Path(folder), read_poses(poses)
-    for name in outputs:
-        (folder / name).mkdir(parents=True, exist_ok=True)
+    for time in known.times.tolist():
+        drive.recording.checked(time)
+    try:
+        for name in WRITTEN:  # of an earlier run
+            for file in folder.glob(f"{name}/{'[0-9]' * 6}.png"):
+                file.unlink()
+        for name in outputs:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"{folder} cannot be made: {error.strerror}") from None
     numbers: dict[str, int] = {}
     frames = []
     for number, (time, pose) in enumerate(zip(known.times.tolist(), known.poses, strict=True)):

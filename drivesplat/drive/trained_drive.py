@@ -56,7 +56,7 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
     is that of its last saved state.
 
     Args:
-        folder: `results/{scene}/{method}`, with `checkpoint.npz`; scene and training record lie beside it.
+        folder: `results/{scene}/{method}`; scene and training record lie beside it.
         device: 'any' (the GPU where there is one), 'cuda' or 'cpu', or settings as under `device` in config.yaml.
 
     Raises RequestError where the folder has no checkpoint, ResultError for files of another version, and DeviceError
@@ -147,6 +147,8 @@ class TrainedDrive(Sensors):
         """The objects of which the model has Gaussians, after the edit."""
         if self.edit is None:
             return trained_actors(self.model, self.scene, self.where)
+        if all(step.kind == "ego" for step in self.edit.steps):
+            return trained_actors(self.model, self.scene, self.where)
         return recorded_and_edited(self.model, self.scene, self._reference, self.edit, self.where)[1]
 
     @cached_property
@@ -162,6 +164,10 @@ class TrainedDrive(Sensors):
         """A table of the objects as recorded, by `id`: `class` and the dataset's `category`; `length`, `width` and
         `height` in metres; `first` and `last`, the seconds of their boxes; `speed`, the largest horizontal one in m/s;
         `editable`, whether the object has Gaussians of its own and can be moved and removed; and `why_not`."""
+        return self._object_table.copy()
+
+    @cached_property
+    def _object_table(self) -> "pandas.DataFrame":
         return object_table(self.scene, {actor.id for actor in trained_actors(self.model, self.scene, self.where)})
 
     def edited(self, edit: Edit | list[dict[str, Any]]) -> "TrainedDrive":
@@ -176,6 +182,7 @@ class TrainedDrive(Sensors):
             raise RequestError("the drive is edited already: give all steps at once to the drive as recorded")
         checked = edit if isinstance(edit, Edit) else edit_of(edit, f"{self.where}, edit")
         changed = replace(self, edit=checked)
+        vars(changed)["_static"] = self._static  # which no edit changes
         _ = changed.edited_actors, changed._ego_edit  # an edit that does not fit is refused here
         return changed
 
@@ -195,12 +202,13 @@ class TrainedDrive(Sensors):
         a time outside of the recording, and where an edited vehicle has left the recorded path."""
         if self._ego_edit is not None:
             return self._edited_poses(self._reference, time)[1]
-        return self.recording.ego(np.array([self.recording.checked(time)]))[0]
+        return self.recording.ego_to_world(time)
 
     def ego_velocity(self, time: float) -> np.ndarray:
         """The velocity (6,) of the ego vehicle along its own axes: linear (m/s), then angular (rad/s). Raises
         RequestError for a time outside of the recording."""
-        ends = np.clip(self.recording.checked(time) + np.array([-HALF_SPAN, HALF_SPAN]), 0.0, self.duration)
+        _ = self.ego_to_world(time)  # refuses where there is none
+        ends = np.clip(time + np.array([-HALF_SPAN, HALF_SPAN]), 0.0, self.duration)
         now, first, last = self._ego_path(np.array([time, *ends]))
         if not ends[1] > ends[0]:
             return np.zeros(6)
@@ -226,6 +234,8 @@ class TrainedDrive(Sensors):
     ) -> PlacedCamera:
         """A camera at a time, a pose and a velocity; see `WorldState.render`."""
         known = self.camera(camera) if isinstance(camera, str) else camera
+        if not isinstance(known, PoseableCamera):
+            raise RequestError(f"a camera is a name or a drivesplat.Camera, not {camera!r}")
         moving = _velocity(velocity)
         if camera_to_world is not None:
             if ego_to_world is not None:
@@ -237,8 +247,8 @@ class TrainedDrive(Sensors):
         if ego_to_world is not None:
             pose = require_pose(ego_to_world, "the ego vehicle") @ mount
         else:
-            by_name = isinstance(camera, str)
-            pose = self.camera_to_world(camera, time) if by_name else self.ego_to_world(time) @ mount
+            path = known.path_of
+            pose = self.ego_to_world(time) @ mount if path is None else self.camera_to_world(path, time)
             if velocity is None and known.readout_s.any():
                 moving = self.ego_velocity(time)
         return PlacedCamera(known, pose, mounted_velocity(moving, mount), time)
@@ -300,11 +310,14 @@ class TrainedDrive(Sensors):
         """The drive at a time. One outside of the recording is refused by a RequestError, or clamped to it."""
         if outside not in OUTSIDE:
             raise RequestError(f"outside is {outside!r}; it is one of {', '.join(OUTSIDE)}")
+        if not isinstance(time, float | int | np.floating | np.integer):
+            raise RequestError(f"a time is a number of seconds, not {time!r}")
+        if outside == "refuse" and not 0.0 <= time <= self.duration:
+            raise RequestError(f"{self.recording.outside(time)}; outside='clamp' renders its start or its end")
         inside = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else time
         classes = {track.id: track.object_class for track in self.scene.tracks}
-        objects = self.edited_actors, self._static, classes
-        now = self.recording.checked(inside)
-        return WorldState(self.model, *objects, self, float(now), self.edit is None)
+        now = float(self.recording.checked(inside))
+        return WorldState(self.model, self.edited_actors, self._static, classes, self, now, self.edit is None)
 
     @overload
     def render(

@@ -71,21 +71,37 @@ class WorldActor:
 
 
 class ActorsById(Mapping[str, WorldActor]):
-    """Objects by their ids, or by the first characters of an id that only one begins with. Raises UnknownObjectError,
-    which is a KeyError, for any other name."""
+    """Objects by their ids, or by the first characters of an id that only one begins with. `missing` says why other
+    objects are not among them. Raises UnknownObjectError, which is a KeyError, for any other name."""
 
-    def __init__(self, actors: Mapping[str, WorldActor]):
-        self._actors = dict(actors)
+    def __init__(self, actors: Mapping[str, WorldActor], missing: Mapping[str, str]):
+        self._actors, self._missing = dict(actors), dict(missing)
+
+    def __repr__(self) -> str:
+        return f"<objects {', '.join(self) or 'none'}>"
 
     def __getitem__(self, name: str) -> WorldActor:
-        found = matching_ids(name, self._actors)
-        if len(found) != 1 or not name:
-            count = "no object has" if not found else f"{len(found)} objects have"
-            raise UnknownObjectError(f"{count} an id starting with {name!r}; there are: {', '.join(self) or 'none'}")
-        return self._actors[found[0]]
+        found = matching_ids(name, self._actors) if isinstance(name, str) and name else []
+        if len(found) == 1:
+            return self._actors[found[0]]
+        there = f"there are: {', '.join(self) or 'none'}"
+        known = matching_ids(name, self._missing) if isinstance(name, str) and name and not found else []
+        if len(known) == 1:
+            raise UnknownObjectError(f"object {known[0]} {self._missing[known[0]]}; {there}")
+        count = f"{len(found)} objects have" if found else "no object has"
+        raise UnknownObjectError(f"{count} an id starting with {name!r}; {there}")
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._actors)
 
     def __len__(self) -> int:
         return len(self._actors)
+
+    def without(self, name: str) -> "ActorsById":
+        """The objects but for the one with this id."""
+        kept = {known: actor for known, actor in self._actors.items() if known != name}
+        return ActorsById(kept, {**self._missing, name: "has been removed"})
+
+    def with_one(self, actor: WorldActor) -> "ActorsById":
+        """The objects and another one."""
+        return ActorsById({**self._actors, actor.id: actor}, self._missing)

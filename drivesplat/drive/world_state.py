@@ -230,15 +230,19 @@ class WorldState:
         self._model, self._static, self._class_of = model, static, class_of
         self._sensors, self._as_recorded = sensors, as_recorded
         self._taken = {item.id for item in (*actors, *static.others)}
+        absent = {item.id: "is not there at this time" for item in actors}
+        fixed = {item.id: "is not editable (the table `actors` of the drive says why)" for item in static.others}
         present = [actor for actor in actors if actor.present(now)[0]]
         (placed,) = actor_placements(present, now)
         own = zip(present, placed, strict=True)
-        self.actors = ActorsById({actor.id: WorldActor(actor, placement, time) for actor, placement in own})
+        self.actors = ActorsById(
+            {actor.id: WorldActor(actor, placement, time) for actor, placement in own}, {**absent, **fixed}
+        )
 
     def remove(self, name: str) -> None:
         """Removes an object, named as in `actors`."""
         gone = self.actors[name].id
-        self.actors = ActorsById({known: actor for known, actor in self.actors.items() if known != gone})
+        self.actors = self.actors.without(gone)
         self._as_recorded = False
 
     def add(self, source: str, name: str, object_to_world: Matrix) -> WorldActor:
@@ -247,7 +251,7 @@ class WorldState:
             raise RequestError(f"a copy cannot be named {name!r}: choose a name that no other object has")
         copy = self.actors[source].copied(name)
         copy.pose = object_to_world
-        self.actors = ActorsById({**self.actors, name: copy})
+        self.actors = self.actors.with_one(copy)
         return copy
 
     @overload
@@ -288,13 +292,15 @@ class WorldState:
                 once for all of a list.
             ego_to_world: Pose (4, 4) of the vehicle that carries the camera; None: its pose in the drive at this time.
             camera_to_world: Pose (4, 4) of the camera itself, in place of a vehicle's; for one camera.
-            velocity: Linear (m/s), then angular velocity (rad/s) along the axes of what the pose is given for, which
-                rolling shutters see. None: at rest where a pose is given, otherwise as the vehicle drives.
+            velocity: Linear (m/s), then angular velocity (rad/s), which rolling shutters see, of what the pose is given
+                for, or else of the vehicle, along its own axes. None: at rest where a pose is given, otherwise as the
+                vehicle drives.
             outputs: Names from OUTPUTS.
 
         Raises RequestError for an unknown camera or output, an invalid pose or velocity, and for two poses; ResultError
         for images that contain NaN (when `DriveView.image` is read), DeviceError where memory is exhausted.
         """
+        outputs = (outputs,) if isinstance(outputs, str) else outputs
         if unknown := [name for name in outputs if name not in OUTPUTS]:
             raise RequestError(f"there is no output {unknown[0]!r}; there are: {', '.join(OUTPUTS)}")
         several = not isinstance(camera, str | PoseableCamera)

@@ -80,7 +80,9 @@ def read_snapshot(folder: Path) -> TrainedCheckpoint:
         for i, rows in enumerate(saved["preallocated"]):  # these are no Gaussians yet
             own = [name for name in state if name.startswith(f"parts.{i}.params.")] if rows else []
             state |= {name: state[name][:-rows] for name in own}
-    except (AttributeError, KeyError, TypeError) as error:
+        for name, value in state.items():
+            require_finite(name, value.numpy())
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise _no_checkpoint(path, error) from error
     return replace(checkpoint, model=state, path=str(path))
 

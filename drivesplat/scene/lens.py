@@ -14,14 +14,17 @@ Radii of the two polynomials are measured along x; K scales y by fy / fx.
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from numpy.polynomial import polynomial
+from scipy.interpolate import RectBivariateSpline
 
 from drivesplat.scene.sensors import Camera
 
 POLYNOMIALS = ("angle_to_radius", "radius_to_angle")
 STEPS, STEP = 8, 1e-4
 """Iterations of Newton's method for the direction of a pixel, and the step in radians of its differences."""
+NODE_SPACING = 8
+"""Pixels between those at which directions are searched."""
 MAX_ERROR = 0.05
 """Pixels by which the image of a direction may miss its pixel; a farther one has no direction."""
 SAMPLES = 20_000
@@ -76,27 +79,54 @@ def pixels_of(camera: Camera, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
 
 
 def directions(camera: Camera) -> Float64[np.ndarray, "h w 3"]:
-    """The unit direction of every pixel of a distorted camera (x right, y down, z forward); NaN where it has none."""
+    """The unit direction of every pixel of a distorted camera (x right, y down, z forward); NaN where it has none.
+
+    They are searched at every NODE_SPACING-th pixel and interpolated between. Near nodes without a direction every
+    pixel is searched.
+    """
+    size = np.array([camera.width, camera.height])
+    x, y = (np.arange(-NODE_SPACING, edge + 2 * NODE_SPACING, NODE_SPACING) for edge in size)
+    nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
+    turns, found = _turns(camera, nodes)
+    shape = len(y), len(x)
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    dense = np.stack(
+        [RectBivariateSpline(y, x, turns[:, i].reshape(shape))(np.arange(size[1]), np.arange(size[0])) for i in (0, 1)],
+        axis=-1,
+    ).reshape(-1, 2)
+    missed = cv2.dilate((~found).reshape(shape).astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
+    at_node = (pixels // NODE_SPACING).astype(int) + 1
+    exact = missed[at_node[:, 1], at_node[:, 0]]
+    rays = _turned(dense)
+    if exact.any():
+        turns, found = _turns(camera, pixels[exact])
+        rays[exact] = np.where(found[:, None], _turned(turns), np.nan)
+    return rays.reshape(camera.height, camera.width, 3)
+
+
+def _turns(
+    camera: Camera, pixels: Float64[np.ndarray, "n 2"]
+) -> tuple[Float64[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """The angles (radians) by which the optical axis is turned to the right and down towards pixels, and whether a
+    pixel has such a direction."""
     k = central_intrinsics(camera)
     across = (pixels - camera.intrinsics[:2, 2]) / [1.0, k[1, 1] / k[0, 0]]
     radius = np.linalg.norm(across, axis=1)
     known, radii = radial_profile(camera)
     angles = np.interp(radius, radii, known)
-    turn = angles[:, None] * across / np.maximum(radius, 1e-12)[:, None]  # the angle, towards the pixel
+    turns = angles[:, None] * across / np.maximum(radius, 1e-12)[:, None]
+    first = turns.copy()
     for _ in range(STEPS):
-        found = pixels_of(camera, _turned(turn))
-        by_x, by_y = (pixels_of(camera, _turned(turn + step)) for step in (np.array([STEP, 0.0]), [0.0, STEP]))
-        slopes = np.stack([by_x - found, by_y - found], axis=-1) / STEP
-        determinant = np.linalg.det(slopes)
-        missing = ~(np.abs(determinant) > 1e-9)
-        slopes[missing] = np.eye(2)
-        turn = turn + np.where(missing[:, None], 0.0, np.linalg.solve(slopes, (pixels - found)[..., None])[..., 0])
-    rays = _turned(turn)
-    missed = ~(np.linalg.norm(pixels_of(camera, rays) - pixels, axis=1) < MAX_ERROR)
-    rays[missed] = np.nan
-    return rays.reshape(camera.height, camera.width, 3)
+        found = pixels_of(camera, _turned(turns))
+        by_x, by_y = (pixels_of(camera, _turned(turns + step)) for step in (np.array([STEP, 0.0]), [0.0, STEP]))
+        (a, c), (b, d) = ((by_x - found) / STEP).T, ((by_y - found) / STEP).T
+        determinant, (x, y) = a * d - b * c, (pixels - found).T
+        with np.errstate(all="ignore"):
+            change = np.stack([d * x - b * y, a * y - c * x], axis=1) / determinant[:, None]
+        turns = turns + np.where(np.abs(determinant)[:, None] > 1e-9, change, 0.0)
+    hit = np.linalg.norm(pixels_of(camera, _turned(turns)) - pixels, axis=1) < MAX_ERROR
+    return np.where(hit[:, None], turns, first), hit
 
 
 def _turned(turn: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ def read_edits(path: str | Path) -> dict[str, Edit]:
         raise ConfigError(f"{path}: 'edits' is {quoted(edits)}; it holds a list of steps per name")
     found = {}
     for name, steps in edits.items():
-        _require_name(name, f"{path}: edit")
+        require_edit_name(name, f"{path}: edit")
         found[name] = edit_of(steps, f"{path}: edit {name!r}")
     return found
 
@@ -66,13 +66,14 @@ def _step(step: Any, where: str) -> Step:
     checked = Step(**{kind: validated(record, fields, f"{where}: ", keys=keys)})
     copy = checked.duplicate or checked.place
     if copy is not None:
-        _require_name(copy.name, f"{where}: 'as'")
+        require_edit_name(copy.name, f"{where}: 'as'")
         if copy.name in RESERVED:
             raise ConfigError(f"{where}: 'as' {copy.name!r} is a name kept for the camera's car; choose another")
     return checked
 
 
-def _require_name(name: Any, what: str) -> None:
+def require_edit_name(name: Any, what: str) -> None:
+    """Raises ConfigError, which begins with `what`, for a name that neither an edit nor a copy may have."""
     if not isinstance(name, str):
         raise ConfigError(f"{what} {name!r} is not text: put the name in quotes")
     if not re.fullmatch(NAME, name):

@@ -97,9 +97,12 @@ def test_other_edits_of_the_file_stay_and_comments_are_not_lost(session, tmp_pat
     assert list(read_edits(path)) == ["gone", "aside"]
     session.write(path, "gone")
     assert [step.kind for step in read_edits(path)["gone"].steps] == ["shift"]
-    path.write_text("# mine\n" + path.read_text())
-    with pytest.raises(RequestError, match="comments"):
-        session.write(path, "another")
+    written = path.read_text()
+    for commented in ("# mine\n" + written, written.replace("gone:", "gone:  # mine")):
+        path.write_text(commented)
+        with pytest.raises(RequestError, match="comments"):
+            session.write(path, "another")
+        assert path.read_text() == commented
 
 
 def test_a_removed_object_that_is_placed_is_there_again(session):
@@ -128,10 +131,31 @@ def test_what_cannot_be_done_changes_nothing(session, tmp_path, call, error, wor
     assert session.steps() == [] and not list(tmp_path.iterdir())
 
 
+def test_the_vehicle_alone_can_be_moved_where_no_object_can(tiny_scene, tmp_path):
+    """A method without actors, whose drive has no objects to edit."""
+    background = street_model().parts[0]
+    session = EditSession(drive_of(street_scene(tiny_scene), street_model(background), tmp_path))
+    before = session.edited.camera_to_world(CAMERA, TIME)
+    session.change_ego(1.0, 1.0)
+    after = session.edited.camera_to_world(CAMERA, TIME)
+    assert session.objects == [] and np.linalg.norm((after - before)[:3, 3]) == pytest.approx(1.0, abs=0.05)
+    assert not session.edited.render(CAMERA, TIME).objects
+
+
+def test_another_model_of_the_drive_keeps_the_changes(session, drive):
+    session.change(AHEAD, lateral=1.0)
+    session.follow(dataclasses.replace(drive))
+    assert session.change_of(AHEAD).lateral == 1.0 and session.edited.edit is not None
+    session.follow(dataclasses.replace(drive, model=street_model(street_model().parts[0])))
+    assert session.changes == {} and session.edited is session.drive
+
+
 def test_names_that_no_edit_may_have_and_edited_drives_are_refused(session, tmp_path):
     session.change(AHEAD, lateral=1.0)
-    with pytest.raises(RequestError, match="named"):
-        session.write(tmp_path / "edits.yaml", "a b")
+    for name in ("a b", "a" * 300):
+        with pytest.raises(ConfigError, match="a"):
+            session.write(tmp_path / "edits.yaml", name)
+    assert not list(tmp_path.iterdir())
     with pytest.raises(RequestError, match="recorded"):
         EditSession(session.edited)
     assert dataclasses.asdict(ObjectChange())["removed"] is False

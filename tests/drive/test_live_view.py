@@ -9,7 +9,15 @@ from helpers.hand_made_street import AHEAD, street_model, street_scene
 
 import drivesplat
 from drivesplat.drive.live_view import EditSession, FreeCamera, LiveView
-from drivesplat.drive.pictures import PICTURES, blended, depth_picture, error_picture, number_colors, placed
+from drivesplat.drive.pictures import (
+    PICTURES,
+    blended,
+    depth_picture,
+    error_picture,
+    name_colors,
+    number_colors,
+    placed,
+)
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
 
@@ -101,6 +109,7 @@ def test_colours_of_pictures():
     none, near, far, beyond = depth_picture(depth)[0].astype(int)
     assert not none.any() and near[0] > near[2] and far[2] > far[0] and (far == beyond).all()
     assert len(np.unique(number_colors(20), axis=0)) == 20 and number_colors(0).shape == (0, 3)
+    np.testing.assert_array_equal(name_colors(["b", "a"])[1], name_colors(["a"])[0])
     black, white = np.zeros((2, 4, 3), np.uint8), np.full((2, 4, 3), 255, np.uint8)
     assert not error_picture(black, black).any() and (error_picture(black, white) == 255).all()
     assert (blended(black, white, 0.5) == 128).all() and (blended(black, white, 0.0) == 0).all()
