@@ -23,7 +23,7 @@ from drivesplat.scene.sensors import Camera
 POLYNOMIALS = ("angle_to_radius", "radius_to_angle")
 STEPS, STEP = 8, 1e-4
 """Iterations of Newton's method for the direction of a pixel, and the step in radians of its differences."""
-NODE_SPACING = 8
+NODE_SPACING = 4
 """Pixels between those at which directions are searched."""
 MAX_ERROR = 0.05
 """Pixels by which the image of a direction may miss its pixel; a farther one has no direction."""

@@ -142,7 +142,7 @@ def test_a_lens_without_distortion_shows_the_pinhole_image(world):
     )
     outputs = ["rgb", "alpha", "depth", "instance", "semantic", "valid"]
     expected, found = (world.render(one, camera_to_world=pose, outputs=outputs) for one in (plain, lens))
-    torch.testing.assert_close(found.rgb, expected.rgb, atol=2e-3, rtol=0)
+    torch.testing.assert_close(found.rgb, expected.rgb, atol=1e-3, rtol=0)
     torch.testing.assert_close(found.alpha, expected.alpha, atol=1e-3, rtol=0)
     assert (found.instance == expected.instance).float().mean() > 0.999 and found.valid.all()
     rays = torch.from_numpy(directions(lens.lens))
