@@ -4,13 +4,13 @@ import dataclasses
 import socket
 import sys
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made_drive import drive_of
 from helpers.hand_made_street import AHEAD, checkpoint_of, street_model, street_scene
+from helpers.patience import wait_until
 from helpers.trainings import PROVENANCE
 
 from drivesplat.drive.live_overlays import EDGES
@@ -23,7 +23,7 @@ from drivesplat.model.checkpoint import write_checkpoint
 from drivesplat.scene.scene import write_scene
 from drivesplat.workflow.edits_file import read_edits
 
-WIDTH, HEIGHT, PATIENCE_S = 1000, 600, 60.0
+WIDTH, HEIGHT = 1000, 600
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +35,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
-
-
-def wait_until(holds: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < end, "it does not happen"
-        time.sleep(0.1)
 
 
 def test_without_viser_it_says_what_to_install(drive, monkeypatch):
