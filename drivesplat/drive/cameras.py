@@ -143,6 +143,38 @@ class PlacedCamera:
         return View(K, pose, camera.width, camera.height, self.time, camera.exposure_of, rolling)
 
 
+@dataclass(frozen=True, eq=False)
+class GivenPose:
+    """What a user gives of a sensor's pose at a time: `ego_to_world` (4, 4) of the vehicle that carries it, or its own
+    `sensor_to_world`, and the `velocity` (6,) of what the pose is given for, or else of the vehicle, along its own
+    axes. What is None is as in the drive; a given pose without a velocity rests."""
+
+    ego_to_world: Float64[np.ndarray, "4 4"] | None = None
+    sensor_to_world: Float64[np.ndarray, "4 4"] | None = None
+    velocity: Float64[np.ndarray, "6"] | None = None
+
+    @classmethod
+    def checked(
+        cls, sensor: str, ego_to_world: Matrix | None, sensor_to_world: Matrix | None, velocity: Vector | None
+    ) -> "GivenPose":
+        """Raises RequestError, which names the `sensor`, for two poses and for what is no pose or velocity."""
+        if ego_to_world is not None and sensor_to_world is not None:
+            raise RequestError(f"{sensor} has one pose: give that of the vehicle or its own, not both")
+        return cls(
+            None if ego_to_world is None else require_pose(ego_to_world, "the ego vehicle"),
+            None if sensor_to_world is None else require_pose(sensor_to_world, sensor),
+            None if velocity is None else require_vector(velocity, 6, "the velocity"),
+        )
+
+    @property
+    def motion(self) -> Float64[np.ndarray, "6"]:
+        """The velocity, zeros where none is given."""
+        return np.zeros(6) if self.velocity is None else self.velocity
+
+
+AS_DRIVEN = GivenPose()
+
+
 def require_pose(pose: Matrix, of: str) -> Float64[np.ndarray, "4 4"]:
     """A pose as an array. Raises RequestError, which names what it is the pose `of`, unless it is a matrix (4, 4) of a
     rotation and a translation."""

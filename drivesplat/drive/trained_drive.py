@@ -11,13 +11,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from drivesplat.drive.cameras import (
+    AS_DRIVEN,
+    GivenPose,
     Matrix,
     PlacedCamera,
     PoseableCamera,
     Vector,
     mounted_velocity,
-    require_pose,
-    require_vector,
 )
 from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.lidars import PoseableLidar
@@ -224,32 +224,22 @@ class TrainedDrive(Sensors):
             return self._edited_poses(name, time)[0]
         return self.recording.camera_to_world(name, time)
 
-    def placed_camera(
-        self,
-        camera: AnyCamera,
-        time: float,
-        ego_to_world: Matrix | None = None,
-        camera_to_world: Matrix | None = None,
-        velocity: Vector | None = None,
-    ) -> PlacedCamera:
-        """A camera at a time, a pose and a velocity; see `WorldState.render`."""
+    def placed_camera(self, camera: AnyCamera, time: float, at: GivenPose = AS_DRIVEN) -> PlacedCamera:
+        """A camera at a time; see `WorldState.render`."""
         known = self.camera(camera) if isinstance(camera, str) else camera
         if not isinstance(known, PoseableCamera):
             raise RequestError(f"a camera is a name or a drivesplat.Camera, not {camera!r}")
-        moving = _velocity(velocity)
-        if camera_to_world is not None:
-            if ego_to_world is not None:
-                raise RequestError("a camera has one pose: give ego_to_world or camera_to_world, not both")
-            return PlacedCamera(known, require_pose(camera_to_world, "the camera"), moving, time)
-        mount = known.camera_to_ego
+        if at.sensor_to_world is not None:
+            return PlacedCamera(known, at.sensor_to_world, at.motion, time)
+        mount, moving = known.camera_to_ego, at.motion
         if mount is None:
             raise RequestError("a camera of one's own without camera_to_ego needs camera_to_world")
-        if ego_to_world is not None:
-            pose = require_pose(ego_to_world, "the ego vehicle") @ mount
+        if at.ego_to_world is not None:
+            pose = at.ego_to_world @ mount
         else:
             path = known.path_of
             pose = self.ego_to_world(time) @ mount if path is None else self.camera_to_world(path, time)
-            if velocity is None and known.readout_s.any():
+            if at.velocity is None and known.readout_s.any():
                 moving = self.ego_velocity(time)
         return PlacedCamera(known, pose, mounted_velocity(moving, mount), time)
 
@@ -262,44 +252,31 @@ class TrainedDrive(Sensors):
         velocity: Vector | None = None,
     ) -> View:
         """A camera at a time and a pose as `SplatModel.render` takes it; see `WorldState.render`."""
-        return self.placed_camera(camera, time, ego_to_world, camera_to_world, velocity).view(self.device)
+        at = GivenPose.checked("the camera", ego_to_world, camera_to_world, velocity)
+        return self.placed_camera(camera, time, at).view(self.device)
 
     def placed_lidar(
-        self,
-        lidar: str | PoseableLidar,
-        time: float,
-        ego_to_world: Matrix | None = None,
-        sensor_to_world: Matrix | None = None,
-        velocity: Vector | None = None,
+        self, lidar: str | PoseableLidar, time: float, at: GivenPose = AS_DRIVEN
     ) -> tuple[RecordedScan, tuple[float, float]]:
-        """The rays of a LiDAR at a time, a pose and a velocity, and the spread of its beams; see `WorldState.scan`."""
+        """The rays of a LiDAR at a time, and the spread of its beams; see `WorldState.scan`."""
         recorded = self.recording.nearest_scan(lidar, time) if isinstance(lidar, str) else None
         known = self.lidar(lidar, time) if isinstance(lidar, str) else lidar
-        path = self._lidar_path(known, recorded, time, ego_to_world, sensor_to_world, velocity)
+        path = self._lidar_path(known.sensor_to_ego, recorded, time, at)
         sensor = known.placed(path, time) if recorded is None else replace(moved(recorded, path), seconds=time)
         return sensor, known.beam_spread or self.beam_spread
 
     def _lidar_path(
-        self,
-        lidar: PoseableLidar,
-        recorded: RecordedScan | None,
-        time: float,
-        ego_to_world: Matrix | None,
-        sensor_to_world: Matrix | None,
-        velocity: Vector | None,
+        self, mount: np.ndarray | None, recorded: RecordedScan | None, time: float, at: GivenPose
     ) -> SensorPoses:
         """The poses of a LiDAR in the world at offsets in seconds from a time; `recorded` is the scan whose rays it
         fires."""
-        linear, angular = _velocity(velocity).reshape(2, 3)
-        if sensor_to_world is not None:
-            if ego_to_world is not None:
-                raise RequestError("a LiDAR has one pose: give ego_to_world or sensor_to_world, not both")
-            return steady_motion(require_pose(sensor_to_world, "the LiDAR"), linear, angular)
-        mount = lidar.sensor_to_ego
+        linear, angular = at.motion.reshape(2, 3)
+        if at.sensor_to_world is not None:
+            return steady_motion(at.sensor_to_world, linear, angular)
         if mount is None:
             raise RequestError("a LiDAR of one's own without sensor_to_ego needs sensor_to_world")
-        ego = self.ego_to_world(time) if ego_to_world is None else require_pose(ego_to_world, "the ego vehicle")
-        if ego_to_world is not None or velocity is not None:
+        ego = self.ego_to_world(time) if at.ego_to_world is None else at.ego_to_world
+        if at.ego_to_world is not None or at.velocity is not None:
             of_ego = steady_motion(ego, linear, angular)
             return lambda offsets: of_ego(offsets) @ mount
         if recorded is not None:
@@ -393,8 +370,3 @@ class TrainedDrive(Sensors):
             raise RequestError(f"{self.where}: at {time:g} s the edited vehicle has left the recorded path")
         camera_to_world, ego_to_world = change.poses(frames, at)
         return camera_to_world[0], ego_to_world[0]
-
-
-def _velocity(given: Vector | None) -> np.ndarray:
-    """A velocity (6,) of the user; zeros for None."""
-    return np.zeros(6) if given is None else require_vector(given, 6, "the velocity")

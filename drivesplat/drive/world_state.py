@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Int16
 from torch import Tensor
 
-from drivesplat.drive.cameras import Matrix, PlacedCamera, PoseableCamera, Vector
+from drivesplat.drive.cameras import AS_DRIVEN, GivenPose, Matrix, PlacedCamera, PoseableCamera, Vector
 from drivesplat.drive.drive_view import DriveScan, DriveView, ObjectBox
 from drivesplat.drive.lenses import resampled
 from drivesplat.drive.lidars import PoseableLidar
@@ -48,24 +48,12 @@ class Sensors(ABC):
     """The sensors of a drive, placed at a time: see `TrainedDrive`."""
 
     @abstractmethod
-    def placed_camera(
-        self,
-        camera: AnyCamera,
-        time: float,
-        ego_to_world: Matrix | None = None,
-        camera_to_world: Matrix | None = None,
-        velocity: Vector | None = None,
-    ) -> PlacedCamera:
+    def placed_camera(self, camera: AnyCamera, time: float, at: GivenPose = AS_DRIVEN) -> PlacedCamera:
         """A camera at a time."""
 
     @abstractmethod
     def placed_lidar(
-        self,
-        lidar: str | PoseableLidar,
-        time: float,
-        ego_to_world: Matrix | None = None,
-        sensor_to_world: Matrix | None = None,
-        velocity: Vector | None = None,
+        self, lidar: str | PoseableLidar, time: float, at: GivenPose = AS_DRIVEN
     ) -> tuple[RecordedScan, tuple[float, float]]:
         """The rays of a LiDAR at a time, and the spread of its beams in radians."""
 
@@ -307,8 +295,8 @@ class WorldState:
         cameras = list(camera) if several else [camera]
         if several and camera_to_world is not None:
             raise RequestError("several cameras are placed by one ego_to_world: camera_to_world is for one camera")
-        at = ego_to_world, camera_to_world, velocity
-        placed = [self._sensors.placed_camera(one, self.time, *at) for one in cameras]
+        at = GivenPose.checked("the camera", ego_to_world, camera_to_world, velocity)
+        placed = [self._sensors.placed_camera(one, self.time, at) for one in cameras]
         world = self._sampled()
         with explain_out_of_memory(lambda: len(self._model)):
             views = [world.image(one, outputs) for one in placed]
@@ -334,7 +322,8 @@ class WorldState:
 
         Raises RequestError as `render`, ResultError for a model that was trained without LiDAR.
         """
-        sensor, spread = self._sensors.placed_lidar(lidar, self.time, ego_to_world, sensor_to_world, velocity)
+        at = GivenPose.checked("the LiDAR", ego_to_world, sensor_to_world, velocity)
+        sensor, spread = self._sensors.placed_lidar(lidar, self.time, at)
         with explain_out_of_memory(lambda: len(self._model)):
             return self._sampled().scan(sensor, spread)
 
