@@ -108,7 +108,7 @@ class ObjectTrajectory:
     """The trajectory of a motion.
 
     Distance is horizontal, in metres from the first annotation; it never decreases and is constant while the object
-    stands. Past its ends the trajectory is extrapolated straight on (`extrapolation`); a gap of the track is bridged
+    stands. Past its ends the trajectory is extrapolated straight on; a gap of the track is bridged
     smoothly.
     """
 
