@@ -11,12 +11,12 @@ from drivesplat.world.generate import require_free_places
 from drivesplat.world.optics.imaging import to_bytes
 from drivesplat.world.recorder import Recorder, Viewpoint
 from drivesplat.world.street.objects import EGO_BODY
+from drivesplat.world.tokens import instance_token
 
 FILM_START = -0.0355
 """Seconds of the first image after the first key frame: the zero of an edit's seconds."""
 TIMES = np.linspace(0.0, 9.4, 48)
-NUMBERED = recorder_of(cyclists=1)
-AHEAD, ONCOMING = (NUMBERED.instance(f"vehicle {i}") for i in (0, 1))
+AHEAD, ONCOMING = (instance_token("demo", f"vehicle {i}") for i in (0, 1))
 EDITS = {
     "removed": edit_of({"remove": {"track": ONCOMING}}),
     "aside": edit_of({"shift": {"track": AHEAD, "lateral": 1.5}}),
@@ -152,7 +152,7 @@ def placed(*path: list) -> dict:
 
 def test_people_riders_and_unknown_tracks_are_refused_with_the_tracks_there_are():
     nobody = "scene demo, edit 'odd', step 1 (remove): no editable track has an id starting with "
-    person, rider = (NUMBERED.instance(name) for name in ("pedestrian 0", "cyclist 0"))
+    person, rider = (instance_token("demo", name) for name in ("pedestrian 0", "cyclist 0"))
     for track in ("ffff0000", person, rider):
         said = refusal({"remove": {"track": track}}, cyclists=1)
         assert said.startswith(f"{nobody}'{track}'") and AHEAD[:8] in said

@@ -23,11 +23,12 @@ from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.scans import ScanSettings, ScansJob
 from drivesplat.world.generate import make_world
 from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
+from drivesplat.world.tokens import instance_token
 
 pytestmark = pytest.mark.slow
 
 KEY_FRAMES = 7
-AHEAD = recorder_of().instance("vehicle 0")
+AHEAD = instance_token("demo", "vehicle 0")
 JOB = job_of(
     world_of(
         key_frames=KEY_FRAMES, key_frame_hz=10, image_hz=20, lidar_hz=20, sweeps=("CAM_FRONT",), class_maps=True,
