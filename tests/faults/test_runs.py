@@ -135,8 +135,11 @@ GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
 @pytest.mark.parametrize(
     ("edits", "subject", "target", "words", "extracted"),
     [
-        (GONE.format("0001 instance 1"), None, "edits/gone.mp4",
-         ["edit 'gone'", "no editable track", "editable tracks: 0001", "people need presets/people.yaml"], True),
+        pytest.param(
+            GONE.format("0001 instance 1"), None, "edits/gone.mp4",
+            ["edit 'gone'", "no editable track", "editable tracks: 0001", "people need presets/people.yaml"], True,
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             EDITS, "0001", "removal.png", ["subjects.0001", "no track '0001'", "that move: 0001 instance 0"], False,
             marks=pytest.mark.slow,

@@ -81,10 +81,10 @@ def test_a_person_is_found_as_one():
     assert np.median(np.abs(offsets(item, person))) < 0.15 and abs(item.size[2] - 1.75) < 0.4
 
 
-def test_where_nothing_moves_nothing_is_found():
+@pytest.mark.parametrize("speed", [8.0, pytest.param(0.0, marks=pytest.mark.slow)])
+def test_where_nothing_moves_nothing_is_found(speed):
     parked = [Mover((8.0 + 7.0 * i, side), (0.0, 0.0)) for i in range(5) for side in (-5.0, 5.0)]
-    assert found_in(*parked, speed=8.0) == []
-    assert found_in(*parked, speed=0.0) == []
+    assert found_in(*parked, speed=speed) == []
 
 
 @pytest.mark.slow

@@ -91,7 +91,14 @@ def fits(world: World, frame, image: PixelDepths, within: float = 0.02) -> np.nd
     return (image.depth > truth.min(axis=1) - within) & (image.depth < truth.max(axis=1) + within)
 
 
-@pytest.mark.parametrize("things", [World().things, [CROSSING], [SPEEDING]], ids=["street", "crossing", "speeding"])
+@pytest.mark.parametrize(
+    "things",
+    [
+        pytest.param(World().things, id="street"),
+        pytest.param([CROSSING], id="crossing", marks=pytest.mark.slow),
+        pytest.param([SPEEDING], id="speeding", marks=pytest.mark.slow),
+    ],
+)
 def test_depths_match_the_surfaces_visible_at_the_images_own_time(tmp_path, things):
     """Images are taken up to a quarter of a second after the sweep, in which objects move by a metre. LiDAR and camera
     have different positions, so some returns are occluded in the image."""
@@ -102,7 +109,10 @@ def test_depths_match_the_surfaces_visible_at_the_images_own_time(tmp_path, thin
     assert np.concatenate(fitting).mean() > 0.96
 
 
-@pytest.mark.parametrize("things", [World().things, [CROSSING]], ids=["street", "crossing"])
+@pytest.mark.parametrize(
+    "things",
+    [pytest.param(World().things, id="street", marks=pytest.mark.slow), pytest.param([CROSSING], id="crossing")],
+)
 def test_depths_are_at_the_pixels_and_times_of_a_rolling_shutter(tmp_path, things):
     """Against rays cast at the time of each row of a camera that takes 0.4 seconds to read them."""
     world, still = World(things=things), drive(tmp_path, *things)
@@ -122,7 +132,10 @@ def test_depths_are_at_the_pixels_and_times_of_a_rolling_shutter(tmp_path, thing
     assert fitting(rolling) > 0.97 and fitting(still) < 0.95
 
 
-@pytest.mark.parametrize("dynamic_object", [CROSSING, SPEEDING], ids=["crossing", "speeding"])
+@pytest.mark.parametrize(
+    "dynamic_object",
+    [pytest.param(CROSSING, id="crossing", marks=pytest.mark.slow), pytest.param(SPEEDING, id="speeding")],
+)
 def test_depths_of_a_moving_object_match_its_position_in_the_image(tmp_path, dynamic_object):
     """Depths at its pixels are correct to a centimetre, except for returns from the road, also while it accelerates:
     linear interpolation between annotations would err by 9 cm. The first and last second are left out, since a natural

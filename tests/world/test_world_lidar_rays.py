@@ -69,10 +69,14 @@ def test_some_ranges_are_those_of_every_triangle_tried_in_double_precision(recor
     numbers = [n for n, item in enumerate(recorder.objects) if item.moves and (found.object == n).any()]
     rays = [tuple(np.argwhere(found.object == n)[len(np.argwhere(found.object == n)) // 2]) for n in numbers]
     rays += [(beam, step) for beam in (2, 9, 17, 25) for step in range(40, found.range.shape[1], 411)]
+    by_step: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     good = 0
     for beam, step in rays:
-        seconds, origin, directions = rays_of(recorder, int(step), left)
-        triangles = np.concatenate([meshes_at(item, seconds) for item in recorder.objects if not_ego(item, left)])
+        if step not in by_step:
+            seconds, origin, directions = rays_of(recorder, int(step), left)
+            triangles = np.concatenate([meshes_at(item, seconds) for item in recorder.objects if not_ego(item, left)])
+            by_step[step] = triangles, origin, directions
+        triangles, origin, directions = by_step[step]
         good += abs(by_hand(triangles, origin, directions[beam]) - found.range[beam, step]) < 1e-3 or (
             not np.isfinite(found.range[beam, step])
         )

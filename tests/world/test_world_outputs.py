@@ -7,7 +7,7 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
-from helpers.demo_worlds import CAMERAS, LIDAR, edit_of, job_of, recorder_of, world_of
+from helpers.demo_worlds import CAMERAS, LIDAR, edit_of, job_of, world_of
 from helpers.drives import scene_at
 from PIL import Image
 
