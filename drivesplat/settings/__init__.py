@@ -8,6 +8,7 @@ users read first; docs/settings.md and config.schema.json have all fields.
 
 from collections.abc import Collection, Mapping, Sequence
 from datetime import date
+from functools import cache
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
@@ -31,13 +32,19 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_text_for_numbers(cls, value: Any, info: Any) -> Any:
-        kinds = cls.model_fields[info.field_name].annotation
-        wanted = {kinds, *get_args(kinds)} & {int, float, bool}
+        wanted = _numeric_kinds(cls, info.field_name)
         if wanted == {bool} and not isinstance(value, bool):
             raise ValueError("input should be true or false")
         if wanted and wanted != {bool} and isinstance(value, (str, bool)):
             raise ValueError("input should be a number (YAML reads 1e-3 as text: write 1.0e-3)")
         return value
+
+
+@cache
+def _numeric_kinds(model: type[Settings], field: str) -> frozenset[type]:
+    """Which of int, float and bool a field may hold. Every value of every settings record asks for it."""
+    kinds = model.model_fields[field].annotation
+    return frozenset({kinds, *get_args(kinds)} & {int, float, bool})
 
 
 def validated(

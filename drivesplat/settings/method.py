@@ -131,7 +131,7 @@ def with_seed(method: str, seed: int) -> str:
 def with_seeds(methods: Mapping[str, MethodSettings], seeds: Iterable[int]) -> dict[str, MethodSettings]:
     """One method per method and seed, by name."""
     return {
-        with_seed(name, seed): method.varied(None, {"random_seed": seed})
+        with_seed(name, seed): method.model_copy(update={"overrides": {**method.overrides, "random_seed": seed}})
         for name, method in methods.items()
         for seed in seeds
     }
