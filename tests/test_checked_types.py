@@ -40,3 +40,22 @@ def test_the_first_calls_of_a_function_in_each_test_are_checked():
             with pytest.raises(TypeCheckError):
                 same("3")
         assert same("3") == "3"
+
+
+def test_types_that_an_unchecked_call_compares_with_have_lengths_of_their_own():
+    @jaxtyped(typechecker=checked)
+    def is_vector(values: np.ndarray) -> bool:
+        return isinstance(values, Float[np.ndarray, " n"])
+
+    @jaxtyped(typechecker=checked)
+    def are_vectors(several: list) -> bool:
+        return all(isinstance(values, Float[np.ndarray, " n"]) for values in several)
+
+    @jaxtyped(typechecker=checked)
+    def seen_from(values: Float[np.ndarray, " n"], others: list) -> bool:
+        return are_vectors(others) and all(map(is_vector, others))
+
+    begin_test()
+    for _ in range(CHECKED_CALLS + 1):
+        assert is_vector(np.ones(2)) and are_vectors([np.ones(2)])
+    assert seen_from(np.ones(3), [np.ones(2)])

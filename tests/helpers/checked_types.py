@@ -3,7 +3,7 @@ for each nested function."""
 
 from collections.abc import Callable
 from functools import wraps
-from types import FunctionType
+from types import CodeType, FunctionType
 from typing import Any
 
 import jaxtyping
@@ -28,8 +28,8 @@ def begin_test() -> None:
 
 
 def _in_first_calls(jaxtyped: Callable) -> Callable:
-    """jaxtyping's decorator, whose functions check their first calls. Others have letters of their own for lengths:
-    the library compares fields of records with such types, too."""
+    """jaxtyping's decorator, whose functions check their first calls. Other calls have letters of their own for lengths
+    where they compare values with types, as the library does with fields of records."""
     own_letters = jaxtyped("context")
 
     def decorator(function: Any = None, *, typechecker: Any = None) -> Any:
@@ -40,7 +40,7 @@ def _in_first_calls(jaxtyped: Callable) -> Callable:
     def decorate(function: Any, typechecker: Any) -> Any:
         if not isinstance(function, FunctionType):
             return jaxtyped(function, typechecker=typechecker)
-        code, whole = id(function.__code__), None
+        code, whole, compares = id(function.__code__), None, _compares_types(function.__code__)
 
         @wraps(function)
         def called(*args: Any, **kwargs: Any) -> Any:
@@ -48,6 +48,8 @@ def _in_first_calls(jaxtyped: Callable) -> Callable:
             __tracebackhide__ = True
             count = _calls.get(code, 0)
             if count >= CHECKED_CALLS:
+                if not compares:
+                    return function(*args, **kwargs)
                 with own_letters:
                     return function(*args, **kwargs)
             _calls[code] = count + 1
@@ -57,6 +59,12 @@ def _in_first_calls(jaxtyped: Callable) -> Callable:
         return called
 
     return decorator
+
+
+def _compares_types(code: CodeType) -> bool:
+    """Whether a function, or one inside it, asks for the type of a value."""
+    inside = (const for const in code.co_consts if isinstance(const, CodeType))
+    return "isinstance" in code.co_names or any(map(_compares_types, inside))
 
 
 def checked(signature: Callable[..., Any]) -> Callable[..., Any]:
