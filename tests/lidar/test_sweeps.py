@@ -83,6 +83,8 @@ HOLDOUTS = {
     "at a range's first frame": ({"every_nth": 4, "offset": 0, "last_block": 0}, (3, 7), {3}),
 }
 """The hold-out, the range of key frames that is read, and the key frames of the dataset held out then."""
+BY_DEFAULT = {BOTH_KINDS, IN_A_RANGE}
+"""Those that `make test` tries; tests/scene/test_splits.py has the groups of all kinds."""
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +99,9 @@ def whole(rich_root, tmp_path_factory) -> Callable[[str], dict[str, bytes]]:
     return inputs
 
 
-@pytest.fixture(params=HOLDOUTS)
+@pytest.fixture(
+    params=[name if name in BY_DEFAULT else pytest.param(name, marks=pytest.mark.slow) for name in HOLDOUTS]
+)
 def case(request, root, whole) -> tuple[Path, dict, tuple[int, int] | None, set[str], dict[str, bytes]]:
     """A drive, a hold-out, a range, the held-out and excluded files, determined from the tables alone, and the inputs
     of a training before any file is damaged."""
@@ -159,7 +163,7 @@ def test_nothing_near_a_held_out_key_frame_reaches_a_training(case, tmp_path):
     assert {name for name in before if before[name] != after[name]} == set()
 
 
-@pytest.mark.parametrize("case", [BOTH_KINDS, IN_A_RANGE], indirect=True)
+@pytest.mark.parametrize("case", [pytest.param(BOTH_KINDS, marks=pytest.mark.slow), IN_A_RANGE], indirect=True)
 def test_recordings_just_beyond_the_excluded_ones_reach_a_training(case, tmp_path):
     """Each kind of recording next to the held-out and excluded ones reaches the expected inputs."""
     root, holdout, frames, near, before = case

@@ -9,13 +9,14 @@ import pytest
 from helpers.street_scans import Mover, street_scans
 
 from drivesplat.errors import DatasetError, ResultError
+from drivesplat.lidar.objects import tracks
 from drivesplat.lidar.objects.boxes import Discovered
 from drivesplat.lidar.objects.discover import discovered
 from drivesplat.lidar.objects.quality import tracks_quality
 from drivesplat.lidar.objects.record import DiscoveredTracks, read_discovered, write_discovered
 from drivesplat.lidar.objects.tracks import discovered_tracks, searched, tracks_of
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.scene.scan_record import ScanRecords
+from drivesplat.scene.scan_record import RecordedScan, ScanRecords
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.discover import DiscoverSettings
 
@@ -48,9 +49,28 @@ def records() -> ScanRecords:
     return ScanRecords(street_scans([AHEAD, PARKED], SECONDS), ["ahead", "parked"])
 
 
-def test_an_annotated_mover_is_found_and_a_parked_car_is_none(tiny_scene, records):
+@pytest.fixture(scope="module")
+def search(tiny_scene, records) -> tuple[DiscoveredTracks, list[Discovered]]:
+    """What is found in a scene in which both vehicles are annotated, and the objects that it is made of."""
+    objects: list[Discovered] = []
+
+    def kept(scans: list[RecordedScan], threads: int) -> list[Discovered]:
+        objects.extend(discovered(scans, threads))
+        return objects
+
     scene = scene_of(tiny_scene, annotated(AHEAD, "ahead"), annotated(PARKED, "parked"))
-    found = discovered_tracks(scene, records, ANY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracks, "discovered", kept)
+        return discovered_tracks(scene, records, ANY), objects
+
+
+@pytest.fixture(scope="module")
+def objects(search) -> list[Discovered]:
+    return search[1]
+
+
+def test_an_annotated_mover_is_found_and_a_parked_car_is_none(tiny_scene, search):
+    found, scene = search[0], scene_of(tiny_scene)
     (track,) = found.tracks
     assert (found.lidar, found.scans, track.id, track.category) == ("TOP", 46, "found_0001", "discovered.car")
     np.testing.assert_array_equal(track.timestamps, scene.key_frame_timestamps[track.sample_indices])
@@ -62,11 +82,6 @@ def test_an_annotated_mover_is_found_and_a_parked_car_is_none(tiny_scene, record
     assert found.quality["human"] == {"movers": 0, "tracks": 0} | dict.fromkeys(
         ("recall", "precision", "along_m", "lateral_m", "distance_m")
     )
-
-
-@pytest.fixture(scope="module")
-def objects(records) -> list[Discovered]:
-    return discovered(records.scans)
 
 
 def quality_of(scene: Scene, objects: list[Discovered], records: ScanRecords) -> dict[str, Any]:

@@ -89,7 +89,13 @@ def jumping(poses: np.ndarray) -> np.ndarray:
     return moved
 
 
-@pytest.mark.parametrize("spoil", [lambda poses: wander(poses, 0.4, 0.6), jumping], ids=["wander", "jump"])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(lambda poses: wander(poses, 0.4, 0.6), id="wander", marks=pytest.mark.slow),
+        pytest.param(jumping, id="jump"),
+    ],
+)
 def test_wrong_poses_are_corrected_to_centimetres(tmp_path, spoil):
     truth = path_of()
     scene = recorded(tmp_path, spoil(truth), truth, street())

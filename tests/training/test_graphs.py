@@ -288,7 +288,9 @@ def replayed(monkeypatch: pytest.MonkeyPatch, trainer: Trainer) -> list[Recordin
     return captured
 
 
-@pytest.mark.parametrize(("people", "exposed"), [(False, False), (True, False), (False, True)])
+@pytest.mark.parametrize(
+    ("people", "exposed"), [pytest.param(False, False, marks=pytest.mark.slow), (True, False), (False, True)]
+)
 def test_replays_train_as_iterations_do(people, exposed, monkeypatch):
     """With images of two cameras, reduced at first: after the first of each kind all iterations are replays."""
     settings = settings_of(**ALL_TERMS, refine_start=1.0, iterations=24, mcmc=McmcSettings(noise_lr=0.0))

@@ -328,7 +328,7 @@ def test_a_training_killed_halfway_resumes_and_ends_as_an_uninterrupted_one(unin
     assert mean_psnr(resumed, views) == pytest.approx(mean_psnr(uninterrupted, views), abs=0.1)
 
 
-@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+@pytest.mark.parametrize("strategy", ["mcmc", pytest.param("default", marks=pytest.mark.slow)])
 def test_a_resumed_training_of_actors_is_the_same_training_on_the_cpu(strategy, tmp_path):
     """With all terms of the loss, corrections of tracks, and Gaussians that come and go."""
     settings = settings_of(strategy, iterations=30, checkpoint_every=12, refine_start=0.0, **ALL_TERMS)
@@ -843,7 +843,7 @@ def averages(monkeypatch) -> list[dict[str, torch.Tensor]]:
     return recorded
 
 
-@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+@pytest.mark.parametrize("strategy", [pytest.param("mcmc", marks=pytest.mark.slow), "default"])
 def test_a_training_ends_with_the_mean_of_its_last_parameters(strategy, monkeypatch, tmp_path):
     """Of 40 iterations every fifth of the last 20: densification ends with the 16th. Owners of Gaussians stay. The
     last PSNR is that of this mean, too."""
