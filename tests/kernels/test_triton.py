@@ -172,7 +172,7 @@ def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
     assert found == [True, False, not used]
 
 
-@pytest.mark.parametrize(("objects", "annotations"), [(3, 20), (40, 300)])
+@pytest.mark.parametrize(("objects", "annotations"), [(3, 20), (5, 300)])
 def test_corrected_poses_and_their_gradients_agree_with_torch(objects, annotations):
     torch.manual_seed(0)
     quats = F.normalize(torch.randn(objects, 4, device=DEVICE), dim=1)
