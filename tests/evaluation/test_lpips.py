@@ -7,11 +7,9 @@ from http.client import BadStatusLine, IncompleteRead
 from pathlib import Path
 from unittest.mock import Mock
 
-import lpips
 import numpy as np
 import pytest
 import torch
-import torchvision
 from helpers.archive_server import Site, served
 
 from drivesplat.errors import ResultError
@@ -28,6 +26,8 @@ DIGEST = hashlib.sha256(CONTENT).hexdigest()
 @pytest.fixture(scope="module")
 def alexnet() -> dict[str, torch.Tensor]:
     """Random weights under torchvision's names, with a small classifier in place of the large one."""
+    import torchvision  # takes seconds, of every worker
+
     torch.manual_seed(0)
     with torch.device("meta"):
         shapes = torchvision.models.alexnet(weights=None).state_dict()
@@ -55,6 +55,8 @@ def images(seed: int, height: int = 70, width: int = 90) -> tuple[np.ndarray, np
 
 @pytest.mark.parametrize(("height", "width"), [(70, 90), (65, 64)])
 def test_the_map_equals_that_of_the_lpips_package(distance, alexnet, height, width):
+    import lpips  # takes seconds, of every worker
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reference = lpips.LPIPS(net="alex", spatial=True, pnet_rand=True, verbose=False)
