@@ -42,6 +42,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 CPU = DeviceSettings(kind="cpu")
 RESUMABLE = job_of(iterations=20, checkpoint_every=10)
+FEW = settings_of(iterations=24, checkpoint_every=10)
 
 
 def write_until_killed(folder: str) -> None:
@@ -60,7 +61,7 @@ def write_until_killed(folder: str) -> None:
         whole(archive)
 
     zipfile.ZipFile.close = close
-    trained(Path(folder), settings_of(checkpoint_every=20))
+    trained(Path(folder), FEW)
 
 
 def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(tmp_path):
@@ -69,9 +70,9 @@ def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(t
     assert process.returncode == -signal.SIGKILL, errors
     (half,) = (tmp_path / "resume").glob(".state.*.partial.npz")
     assert half.stat().st_size > 0
-    assert checkpoint_file.load(tmp_path / "resume/state.npz", "train")["step"] == 20
-    _, summary = trained(tmp_path, settings_of(checkpoint_every=20))
-    assert summary.resumed_at == [20] and summary.iterations == 60
+    assert checkpoint_file.load(tmp_path / "resume/state.npz", "train")["step"] == 10
+    _, summary = trained(tmp_path, FEW)
+    assert summary.resumed_at == [10] and summary.iterations == 24
 
 
 @pytest.fixture(scope="module")
