@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import re
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -11,6 +10,7 @@ from gsplat import DefaultStrategy
 from gsplat.cuda import _torch_impl
 from gsplat.strategy import ops
 from helpers import REPOSITORY
+from helpers.syntax_trees import tree_of
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 from torch.cuda import _utils
@@ -76,20 +76,29 @@ def test_gsplat_grows_gaussians_and_its_strategies_call_kernels_where_we_replace
 
 def private_names(tree: ast.AST) -> Iterator[str]:
     """Private names of LIBRARIES that a module imports, or reads from a name that it has imported from them."""
-    imported = set()
-    for node in ast.walk(tree):
+    imported, nodes = set(), [*ast.walk(tree)]
+    for node in nodes:
         if isinstance(node, ast.Import):
             imported |= {(a.asname or a.name).partition(".")[0] for a in node.names if a.name.startswith(LIBRARIES)}
         elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in LIBRARIES:
             imported |= {alias.asname or alias.name for alias in node.names}
             paths = (f"{node.module}.{alias.name}" for alias in node.names)
             yield from (path for path in paths if is_private(path))
-    for node in ast.walk(tree):
-        name = ast.unparse(node) if isinstance(node, ast.Attribute) else ""
-        if re.fullmatch(r"[\w.]+", name) and name.partition(".")[0] in imported and is_private(name):
+    for node in nodes:
+        if not isinstance(node, ast.Attribute):
+            continue
+        name = dotted(node)
+        if name.partition(".")[0] in imported and is_private(name):
             yield name
-        elif isinstance(node, ast.Attribute) and node.attr in ("_version", "_buffers", "_parameters", "_schema"):
+        elif node.attr in ("_version", "_buffers", "_parameters", "_schema"):
             yield ast.unparse(node)
+
+
+def dotted(node: ast.expr) -> str:
+    """'torch._C.f' for an attribute of a name; what belongs to any other expression begins with a full stop."""
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
 
 
 def is_private(path: str) -> bool:
@@ -98,7 +107,7 @@ def is_private(path: str) -> bool:
 
 def test_private_names_are_used_in_one_module_per_library():
     files = [file for file in (REPOSITORY / "drivesplat").rglob("*.py") if "__pycache__" not in file.parts]
-    uses = {str(file.relative_to(REPOSITORY)): set(private_names(ast.parse(file.read_text()))) for file in files}
+    uses = {str(file.relative_to(REPOSITORY)): set(private_names(tree_of(file))) for file in files}
     assert {file: names for file, names in uses.items() if names and file not in MODULES} == {}
     assert all(uses[file] for file in MODULES)
 
