@@ -114,8 +114,8 @@ class SampledWorld:
         view = view_of_scan(sensor, beam_spread, self.device)
         _, gaussians = self._sampled(SCAN, placed=True)
         picture = self.model.scan(view, gaussians=gaussians)
-        unblocked = torch.from_numpy(~sensor.blocked).to(self.device)
-        returned = (picture.returned > 0.5) & (picture.range > 0.0) & unblocked
+        measured = torch.from_numpy(sensor.measured).to(self.device)
+        returned = (picture.returned > 0.5) & (picture.range > 0.0) & measured
         met = torch.full(sensor.blocked.shape, -1, dtype=torch.int16, device=self.device)
         if gaussians.placement is not None:
             met = group_met(gaussians, view, gaussians.placement).to(torch.int16)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers.hand_made_drive import K, drive_of
 from helpers.hand_made_street import AHEAD, GONE, street_model, street_scene
-from helpers.scanned_street import scan_records, scanned_street
+from helpers.scanned_street import UNMEASURED, scan_records, scanned_street
 from scipy.spatial.transform import Rotation
 
 import drivesplat
@@ -228,6 +228,18 @@ def test_a_scan_at_a_recorded_time_is_that_of_scan_folders(drive):
     np.testing.assert_allclose(found.points(), expected.places()[0], atol=5e-3)
     ids = [actor.id for actor in plan.actors]
     assert (arrays["instance"] >= 0).any() == (expected.objects == ids.index(CAR)).any()
+
+
+def test_rays_that_say_nothing_in_the_recording_do_not_return(drive):
+    """As in scan folders: rays that meet the vehicle itself. Here a car stands where they look."""
+    world = drive.state(TIME)
+    pose = world.scan(LIDAR).sensor.sensor_to_world
+    behind = pose.copy()
+    behind[:3, 3] -= 6.0 * pose[:3, 0]
+    world.actors[CAR].pose = behind
+    arrays = world.scan(LIDAR).arrays()
+    assert (arrays["instance"][:, UNMEASURED] == 0).any() and (arrays["probability"][:, UNMEASURED] > 0.5).any()
+    assert not arrays["returned"][:, UNMEASURED].any() and arrays["returned"][arrays["instance"] == 0].any()
 
 
 def test_a_pattern_of_ones_own_measures_an_object_where_it_stands(world):
