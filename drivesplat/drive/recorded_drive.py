@@ -25,7 +25,8 @@ from drivesplat.scene.shutter import readout_of
 from drivesplat.scene.tracks import box_at, ever_moves
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
 from drivesplat.settings.tracks import FOUND, TRACK_FOLDERS, Tracks
-from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, smooth_poses
+from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, smooth_path
+from drivesplat.trajectories.lateral_offset import PosesAt
 
 if TYPE_CHECKING:
     import pandas
@@ -114,9 +115,26 @@ class RecordedDrive:
     def camera_to_world(self, name: str, time: float) -> Float64[np.ndarray, "4 4"]:
         """The pose of a camera on the smooth path through its images. Raises RequestError for a time at which it did
         not record."""
-        recorded = self._path(name, time)
-        poses = np.stack([frame.camera_to_world for frame in recorded_frames(self.scene, name)])
-        return smooth_poses(recorded * 1e6, poses, np.array([time]) * 1e6)[0]
+        self._require_recorded(name, time)
+        return self._camera_paths[name](np.array([time]) * 1e6)[0]
+
+    @cached_property
+    def _camera_paths(self) -> dict[str, PosesAt]:
+        """The path of each camera by time in microseconds since the first image of the scene."""
+        paths = {}
+        for name, seconds in self._image_seconds.items():
+            poses = np.stack([frame.camera_to_world for frame in recorded_frames(self.scene, name)])
+            paths[name] = smooth_path(seconds * 1e6, poses)
+        return paths
+
+    @cached_property
+    def _image_seconds(self) -> dict[str, Float64[np.ndarray, " n"]]:
+        """The seconds of the images of each camera."""
+        found = {}
+        for name in self.cameras:
+            stamps = recorded_timestamps(self.scene, name)
+            found[name] = self.scene.seconds(stamps[0]) + (stamps - stamps[0]) * 1e-6
+        return found
 
     @cached_property
     def ego(self) -> EgoPoses:
@@ -126,18 +144,16 @@ class RecordedDrive:
     def ego_to_world(self, time: float) -> Float64[np.ndarray, "4 4"]:
         """The pose of the vehicle. Raises RequestError for a time at which the first camera did not record."""
         if self.cameras:
-            self._path(self.cameras[0], time)
+            self._require_recorded(self.cameras[0], time)
         return self.ego(np.array([self.checked(time)]))[0]
 
-    def _path(self, camera: str, time: float) -> Float64[np.ndarray, " n"]:
-        """The seconds of the images of a camera. Raises RequestError for a time at which it did not record."""
-        stamps = recorded_timestamps(self.scene, camera)
-        recorded = self.scene.seconds(stamps[0]) + (stamps - stamps[0]) * 1e-6
+    def _require_recorded(self, camera: str, time: float) -> None:
+        """Raises RequestError for a time at which a camera did not record."""
+        recorded = self._image_seconds[camera]
         if not recorded[0] - MAX_LEAD <= self.checked(time) <= recorded[-1] + MAX_LEAD:
             raise RequestError(
                 f"camera {camera} recorded from {recorded[0]:.2f} to {recorded[-1]:.2f} s, not at {time:g} s"
             )
-        return recorded
 
     @cached_property
     def _scans(self) -> ScanRecords:

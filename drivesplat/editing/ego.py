@@ -10,7 +10,7 @@ from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.edit import Edit, Ego
 from drivesplat.settings.render import TrajectorySettings
-from drivesplat.trajectories.camera_path import CameraPath, film_path, recorded_frames, smooth_poses
+from drivesplat.trajectories.camera_path import CameraPath, film_path, recorded_frames, smooth_path
 from drivesplat.trajectories.ego_path import edited_poses, recorded_time
 from drivesplat.trajectories.lateral_offset import PosesAt
 
@@ -62,12 +62,12 @@ class EgoEdit:
         camera_to_world = np.stack([frame.camera_to_world for frame in frames])
 
         def interpolated(poses: np.ndarray) -> PosesAt:
-            return lambda times: smooth_poses(recorded, poses, (times - first) * 1e6)
+            path = smooth_path(recorded, poses)
+            return lambda times: path((times - first) * 1e6)
 
-        clock = recorded_time(self.steps, self.begin, times)
-        ego, camera = interpolated(ego_to_world)(clock), interpolated(camera_to_world)(clock)
-        edited = edited_poses(interpolated(ego_to_world), self.steps, self.begin, times)
-        return edited @ inverse(ego) @ camera, edited
+        clock, ego = recorded_time(self.steps, self.begin, times), interpolated(ego_to_world)
+        edited = edited_poses(ego, self.steps, self.begin, times)
+        return edited @ inverse(ego(clock)) @ interpolated(camera_to_world)(clock), edited
 
 
 def edited_camera_path(scene: Scene, camera: str, fps: int, edit: Edit, where: str) -> CameraPath:

@@ -11,7 +11,7 @@ from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.render import TrajectorySettings
-from drivesplat.trajectories.camera_path import displaced, recorded_frames, smooth_poses
+from drivesplat.trajectories.camera_path import displaced, recorded_frames, smooth_path
 
 EgoPoses = Callable[[np.ndarray], np.ndarray]
 """Ego to world (n, 4, 4) at seconds (n,) since the scene's first image."""
@@ -30,7 +30,8 @@ def recorded_ego(scene: Scene, camera: str | None) -> EgoPoses:
         frames = recorded_frames(scene, camera)
         seconds = np.array([scene.seconds(frame.timestamp) for frame in frames])
         poses = np.stack([frame.ego_to_world for frame in frames])
-    return lambda times: smooth_poses(seconds * 1e6, poses, times * 1e6)
+    path = smooth_path(seconds * 1e6, poses)
+    return lambda times: path(times * 1e6)
 
 
 def _ego_of_sweeps(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

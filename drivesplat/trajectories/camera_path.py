@@ -16,6 +16,7 @@ from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.render import TrajectorySettings
+from drivesplat.trajectories.lateral_offset import PosesAt
 
 
 @dataclass(frozen=True)
@@ -88,16 +89,28 @@ def film_timestamps(first: int, last: int, fps: int) -> np.ndarray:
 
 
 def smooth_poses(timestamps: np.ndarray, poses: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Poses (n, 4, 4) at the times `wanted` (n,) of a motion through `poses` (m, 4, 4) at increasing `timestamps` (m,).
+    """Poses (n, 4, 4) at the times `wanted` (n,) of a motion through `poses` (m, 4, 4): see `smooth_path`."""
+    return smooth_path(timestamps, poses)(wanted)
+
+
+def smooth_path(timestamps: np.ndarray, poses: np.ndarray) -> PosesAt:
+    """The motion through `poses` (m, 4, 4) at increasing `timestamps` (m,) in microseconds: a function that gives its
+    poses (n, 4, 4) at times (n,), also in microseconds.
 
     Position and rotation are twice continuously differentiable, so that speed and turn rate are continuous.
     """
-    # seconds since the first pose: polynomials in microseconds since 1970 lose all precision
-    known, at = (timestamps - timestamps[0]) * 1e-6, (wanted - timestamps[0]) * 1e-6
     rotations = Rotation.from_matrix(poses[:, :3, :3])
     if len(poses) == 1:
-        return np.tile(rigid(rotations.as_matrix(), poses[:, :3, 3]), (len(wanted), 1, 1))
-    return rigid(RotationSpline(known, rotations)(at).as_matrix(), CubicSpline(known, poses[:, :3, 3])(at))
+        return lambda wanted: np.tile(rigid(rotations.as_matrix(), poses[:, :3, 3]), (len(wanted), 1, 1))
+    # seconds since the first pose: polynomials in microseconds since 1970 lose all precision
+    known = (timestamps - timestamps[0]) * 1e-6
+    turning, moving = RotationSpline(known, rotations), CubicSpline(known, poses[:, :3, 3])
+
+    def at(wanted: np.ndarray) -> np.ndarray:
+        seconds = (wanted - timestamps[0]) * 1e-6
+        return rigid(turning(seconds).as_matrix(), moving(seconds))
+
+    return at
 
 
 def displaced(camera_to_world: np.ndarray, ego_to_world: np.ndarray, offset: TrajectorySettings) -> np.ndarray:
