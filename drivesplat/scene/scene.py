@@ -7,6 +7,7 @@ Ego: x forward, y left, z up, on the ground under the rear axle. Timestamps: mic
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +129,12 @@ class Scene:
     def seconds(self, timestamp: int | np.integer) -> float:
         """A timestamp (microseconds) as seconds since the first image (the first sweep, without images), the time unit
         of models."""
-        return float(timestamp - min(recording.timestamp for recording in self.frames or self.sweeps)) * 1e-6
+        return float(timestamp - self._start) * 1e-6
+
+    @cached_property
+    def _start(self) -> int:
+        """The timestamp of the first image, or else of the first sweep."""
+        return min(recording.timestamp for recording in self.frames or self.sweeps)
 
     def track(self, track_id: str) -> Track | None:
         """The track with this id; None if there is none."""
