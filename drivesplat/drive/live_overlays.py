@@ -9,11 +9,11 @@ import numpy as np
 from drivesplat.drive.live_view import LiveView, describe, wxyz_of
 from drivesplat.drive.pictures import name_colors, with_rest
 from drivesplat.drive.world_actor import WorldActor
+from drivesplat.scene.tracks import UNIT_CORNERS
 
 FRUSTUM_EVERY = 5
 """Every this many-th key frame is drawn as a camera."""
-_CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-EDGES = np.array([(a, b) for a, b in itertools.combinations(_CORNERS, 2) if np.abs(a - b).sum() == 1.0])
+EDGES = np.array([(a, b) for a, b in itertools.combinations(UNIT_CORNERS, 2) if np.abs(a - b).sum() == 1.0])
 """The edges (12, 2, 3) of a box with edges of length 1."""
 MAX_POINTS = 100_000
 """LiDAR returns that are sent at once."""

@@ -265,11 +265,10 @@ class LiveView:
         window."""
         width, height = (int(np.clip(edge, MIN_SIZE, MAX_SIZE)) for edge in (width, height))
         followed = self.followed()
-        if followed is None or self.follow is None or not (self.recorded or self.shows == ERROR):
+        index = self.nearest_image() if self.recorded or self.shows == ERROR else None
+        if followed is None or self.follow is None or index is None:
             return self._compared(free.sized(width, height), free.camera_to_world, None)
-        camera, index = self.drive.camera(self.follow, exposure=self.shows == ERROR), self.nearest_image()
-        if index is None:
-            return self._compared(free.sized(width, height), free.camera_to_world, None)
+        camera = self.drive.camera(self.follow, exposure=self.shows == ERROR)
         camera = camera.resized(max(MIN_SIZE, round(camera.width * height / camera.height)))
         frame = self.session.drive.scene.frames[index]
         at = replace(self, time=self.session.drive.scene.seconds(frame.timestamp))

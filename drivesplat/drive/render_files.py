@@ -12,7 +12,7 @@ from drivesplat.drive.pose_files import read_poses
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
 from drivesplat.io.storage import write_json
-from drivesplat.rendering.labels import depth_units, numbered
+from drivesplat.readers.truth import depth_units, numbered
 from drivesplat.scene.images import write_png
 
 WRITTEN = ("rgb", "depth", "instance")

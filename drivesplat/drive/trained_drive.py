@@ -102,6 +102,8 @@ class TrainedDrive(Sensors):
     device: torch.device
     beam_spread: tuple[float, float]
     edit: Edit | None = None
+    before: "TrainedDrive | None" = None
+    """The drive as recorded, of an edited one."""
 
     def __repr__(self) -> str:
         sensors = ", ".join((*self.cameras, *self.lidars)) or "none"
@@ -145,18 +147,24 @@ class TrainedDrive(Sensors):
     @cached_property
     def edited_actors(self) -> list[EditedActor]:
         """The objects of which the model has Gaussians, after the edit."""
-        if self.edit is None:
-            return trained_actors(self.model, self.scene, self.where)
-        if all(step.kind == "ego" for step in self.edit.steps):
-            return trained_actors(self.model, self.scene, self.where)
+        if self.edit is None or all(step.kind == "ego" for step in self.edit.steps):
+            return self._recorded_actors
         return recorded_and_edited(self.model, self.scene, self._reference, self.edit, self.where)[1]
 
     @cached_property
+    def _recorded_actors(self) -> list[EditedActor]:
+        """The objects of which the model has Gaussians, as recorded."""
+        if self.before is not None:
+            return self.before._recorded_actors
+        return trained_actors(self.model, self.scene, self.where)
+
+    @cached_property
     def _static(self) -> ShownObjects:
-        """The annotated objects that the model shows in its static part, if at all."""
+        """The annotated objects that the model shows in its static part, if at all. No edit changes them."""
+        if self.before is not None:
+            return self.before._static
         dynamic = {track.id for track in self.scene.tracks if track.object_class.is_dynamic}
-        trained = trained_actors(self.model, self.scene, self.where)
-        others = [item for item in other_objects(self.scene, trained) if item.id in dynamic]
+        others = [item for item in other_objects(self.scene, self._recorded_actors) if item.id in dynamic]
         return ShownObjects.of_scene(self.scene, self.model, [], others)
 
     @property
@@ -168,7 +176,7 @@ class TrainedDrive(Sensors):
 
     @cached_property
     def _object_table(self) -> "pandas.DataFrame":
-        return object_table(self.scene, {actor.id for actor in trained_actors(self.model, self.scene, self.where)})
+        return object_table(self.scene, {actor.id for actor in self._recorded_actors})
 
     def edited(self, edit: Edit | list[dict[str, Any]]) -> "TrainedDrive":
         """The drive after an edit: its steps as in an edits file (docs/editing.md).
@@ -181,8 +189,7 @@ class TrainedDrive(Sensors):
         if self.edit is not None:
             raise RequestError("the drive is edited already: give all steps at once to the drive as recorded")
         checked = edit if isinstance(edit, Edit) else edit_of(edit, f"{self.where}, edit")
-        changed = replace(self, edit=checked)
-        vars(changed)["_static"] = self._static  # which no edit changes
+        changed = replace(self, edit=checked, before=self)
         _ = changed.edited_actors, changed._ego_edit  # an edit that does not fit is refused here
         return changed
 

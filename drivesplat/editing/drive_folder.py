@@ -22,8 +22,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import Want
 from drivesplat.readers.drive.write import write_record
 from drivesplat.readers.nuscenes.write import write_nuscenes
+from drivesplat.readers.truth import depth_units, numbered
 from drivesplat.rendering.frames import film_frames
-from drivesplat.rendering.labels import depth_units, numbered
 from drivesplat.scene.images import write_png
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import last_training_timestamp

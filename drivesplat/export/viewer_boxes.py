@@ -11,11 +11,11 @@ from jaxtyping import Float, Int
 
 from drivesplat.export.sampled_motion import sample_motion
 from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.tracks import UNIT_CORNERS
 from drivesplat.trajectories.motion import Motion
 
 TOLERANCE = 0.02
 """Metres by which the corners of an interpolated box may deviate."""
-_SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def needed_samples(
 ) -> Int[np.ndarray, " m"]:
     """The indices (m,) of the samples from which linear interpolation gives all corners of a box of `size` (3,) within
     TOLERANCE: from the first to the last, each as far from the one before as possible."""
-    corners = np.einsum("nij,kj->nki", poses[:, :3, :3], _SIGNS * size) + poses[:, None, :3, 3]  # (n, 8, 3)
+    corners = np.einsum("nij,kj->nki", poses[:, :3, :3], UNIT_CORNERS * size) + poses[:, None, :3, 3]  # (n, 8, 3)
     kept = [0]
     for last in range(2, len(seconds)):
         first = kept[-1]

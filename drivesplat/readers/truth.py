@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int16, UInt16
 
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import read_json, unreadable, write_json
@@ -172,3 +173,13 @@ def truth_arrays(path: str | Path, name: str, *arrays: str) -> list[np.ndarray]:
             return [held[array] for array in arrays]
     except Exception as error:  # zip and numpy each fail in their own ways
         raise unreadable(file, RULE, f"not an archive of {', '.join(arrays)} ({error})", delete=path) from error
+
+
+def depth_units(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    """Depths in metres in units of 1/256 m, 0 where there is none, as images of depth contain them."""
+    return np.clip(depth * DEPTH_UNITS_PER_METRE + 0.5, 0, DEPTH_LIMIT).astype(np.uint16)
+
+
+def numbered(indices: Int16[np.ndarray, "h w"], numbers: list[int]) -> UInt16[np.ndarray, "h w"]:
+    """The number of each index, 0 for -1, as images of objects contain them."""
+    return np.array([*numbers, 0], dtype=np.uint16)[indices]  # the last is what -1 finds

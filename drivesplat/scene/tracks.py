@@ -13,6 +13,10 @@ MIN_ID_LENGTH = 8
 """Minimum number of characters of a shortened id."""
 
 
+UNIT_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""The corners (8, 3) of a box with edges of length 1, in the order of `Box.corners`."""
+
+
 @dataclass(frozen=True)
 class Box:
     """A track at one time: `size` (3,) length, width, height in metres, horizontal `speed` in m/s."""
@@ -28,8 +32,7 @@ class Box:
     @property
     def corners(self) -> np.ndarray:
         """The eight corners (8, 3) in world coordinates; index bits 2, 1, 0 are the signs of x, y, z."""
-        signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-        return (signs * self.size) @ self.object_to_world[:3, :3].T + self.object_to_world[:3, 3]
+        return (UNIT_CORNERS * self.size) @ self.object_to_world[:3, :3].T + self.object_to_world[:3, 3]
 
     def contains(self, points: np.ndarray, margin: float = 0.0, floor: float = 0.0) -> np.ndarray:
         """Whether world points (n, 3) lie in the box, with its sides and roof expanded by `margin` metres and its floor

@@ -9,13 +9,12 @@ import numpy as np
 from drivesplat.io.storage import atomic_write
 from drivesplat.readers.nuscenes.tokens import token
 from drivesplat.readers.truth import (
-    DEPTH_LIMIT,
-    DEPTH_UNITS_PER_METRE,
     TRUTH_FILE,
     Truth,
     TruthFrame,
     TruthScan,
     TruthView,
+    depth_units,
     write_truth_file,
 )  # fmt: skip
 from drivesplat.scene.images import write_png
@@ -74,9 +73,8 @@ def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> 
     time_us = key_frame_time(recorder.world, index) + sensor.delay_us
     recorded = view == Viewpoint() and sensor.channel in (recorder.world.cameras or ())
     picture = (recorder.geometry if recorded else recorder.picture)(sensor, time_us, view)
-    depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNITS_PER_METRE, 0.0)
     images = {
-        "depth": np.clip(depth + 0.5, 0, DEPTH_LIMIT).astype(np.uint16),
+        "depth": depth_units(np.where(np.isfinite(picture.depth), picture.depth, 0.0)),
         "instances": _numbers_of_objects(recorder, view)[picture.objects + 1],
         "classes": np.where(picture.markings, np.uint8(SurfaceClass.MARKING), picture.classes),
     }
