@@ -66,8 +66,7 @@ def read_checkpoint(path: str | Path) -> TrainedCheckpoint:
 
 def write_training_record(folder: Path, model: SplatModel, job: TrainJob, provenance: Provenance) -> None:
     """Writes what `read_snapshot` needs beside the resume states of a training into its folder."""
-    checkpoint = TrainedCheckpoint.of(model, job, provenance)
-    write_checkpoint(folder / UNFINISHED, replace(checkpoint, model={}))
+    write_checkpoint(folder / UNFINISHED, TrainedCheckpoint({}, job, definitions(model), provenance))
 
 
 def read_snapshot(folder: Path) -> TrainedCheckpoint:
