@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import overload
 
@@ -16,14 +16,12 @@ from drivesplat.drive.drive_view import DriveScan, DriveView, ObjectBox
 from drivesplat.drive.lenses import resampled
 from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.world_actor import ActorsById, WorldActor
-from drivesplat.editing.actors import actor_placements
-from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_object
+from drivesplat.editing.placed_model import PlacedModel, actor_placements
+from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_objects
 from drivesplat.errors import RequestError
 from drivesplat.machine.device import explain_out_of_memory
-from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.scans import group_met, view_of_scan
+from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import SCAN, Want, want_of
 from drivesplat.model.view import View
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
@@ -69,7 +67,16 @@ class SampledWorld:
     static: ShownObjects
     class_of: Mapping[str, ObjectClass]
     as_recorded: bool
-    _samples: dict[tuple[Want, bool], tuple[Sequence[Gaussians], Gaussians]] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def placed(self) -> PlacedModel:
+        """The model with the actors at their places."""
+        return PlacedModel(self.model, self.time, [actor.placement for actor in self.actors])
+
+    @cached_property
+    def shown(self) -> PlacedModel:
+        """The model that images show: as recorded where nothing was changed, as films of the recorded drive do."""
+        return PlacedModel(self.model, self.time) if self.as_recorded else self.placed
 
     @property
     def device(self) -> torch.device:
@@ -112,77 +119,53 @@ class SampledWorld:
     def scan(self, sensor: RecordedScan, beam_spread: tuple[float, float]) -> DriveScan:
         """What the rays of a scan return. `beam_spread` in radians."""
         view = view_of_scan(sensor, beam_spread, self.device)
-        _, gaussians = self._sampled(SCAN, placed=True)
-        picture = self.model.scan(view, gaussians=gaussians)
+        picture = self.placed.scan(view)
         measured = torch.from_numpy(sensor.measured).to(self.device)
         returned = (picture.returned > 0.5) & (picture.range > 0.0) & measured
-        met = torch.full(sensor.blocked.shape, -1, dtype=torch.int16, device=self.device)
-        if gaussians.placement is not None:
-            met = group_met(gaussians, view, gaussians.placement).to(torch.int16)
         return DriveScan(
             self._ids, sensor, picture.range, picture.returned, returned, picture.intensity,
-            torch.where(picture.range > 0.0, met, -1),
+            torch.where(picture.range > 0.0, self.placed.objects_met(view), -1),
         )  # fmt: skip
 
     @property
     def _ids(self) -> tuple[str, ...]:
         return tuple(actor.id for actor in self.actors)
 
-    def _sampled(self, want: Want, placed: bool) -> tuple[Sequence[Gaussians], Gaussians]:
-        """The Gaussians of each part, and all as one set; with the objects `placed`, or as recorded. They are kept for
-        the next camera."""
-        if (want, placed) not in self._samples:
-            placements = tuple(actor.placement for actor in self.actors) if placed else None
-            wanted = replace(want, placements=placements)
-            sets = self.model.sample(self.model.states(self.time, wanted), wanted)
-            self._samples[want, placed] = sets, concatenate(sets)
-        return self._samples[want, placed]
-
-    def _placed(self, view: View) -> tuple[Sequence[Gaussians], Gaussians]:
-        """The Gaussians that a view shows, with the numbers of their objects."""
-        return self._sampled(want_of(self.model.seen_from(view)), placed=True)
-
     def _tensors(self, view: View, outputs: Collection[str]) -> dict[str, Tensor]:
         found: dict[str, Tensor] = {}
-        sets, whole = self._sampled(want_of(self.model.seen_from(view)), placed=not self.as_recorded)
-        gaussians = sets if self.as_recorded else whole  # as films and edits render them
         if "rgb" in outputs or "alpha" in outputs:
-            picture = self.model.render(view, gaussians=gaussians)
-            found |= {name: getattr(picture, of) for name, of in (("rgb", "image"), ("alpha", "alpha"))}
+            picture = self.shown.render(view)
+            found |= {"rgb": picture.image, "alpha": picture.alpha}
         if "depth" in outputs:
-            depth = self.model.render(view, gaussians=gaussians, with_surface_depth=True).surface_depth
-            assert depth is not None
-            found["depth"] = depth
+            found["depth"] = self.shown.surface_depth(view)
         if "instance" in outputs:
-            placed = self._placed(view)[1]
-            found["instance"] = self.model.strongest(placed, placed.placement, view)
+            found["instance"] = self.placed.objects_in(view)
         if "semantic" in outputs:
             found["semantic"] = self._classes(view)
         return {name: values for name, values in found.items() if name in outputs}
 
     def _classes(self, view: View) -> Int16[Tensor, "h w"]:
-        sets, gaussians = self._placed(view)
+        gaussians = self.placed.gaussians_in(view)
         number = {name: i for i, name in enumerate(self.classes)}
         rows = torch.cat(
             [
                 torch.full((len(own),), number.get(part.name, -1), dtype=torch.int16, device=self.device)
-                for part, own in zip(self.model.parts, sets, strict=True)
+                for part, own in zip(self.model.parts, self.placed.sets_in(view), strict=True)
             ]
         )
         if gaussians.placement is not None:
             of_actors = [number[self.class_of[actor.source].value] for actor in self.actors]
             own = torch.tensor([*of_actors, -1], dtype=torch.int16, device=self.device)[gaussians.placement]
             rows = torch.where(gaussians.placement >= 0, own, rows)
-        for item, shown in self.static.rows_of_others(self.time, sets, gaussians):
+        for item, shown in self.static.rows_of_others(view, self.placed):
             rows[shown] = number[self.class_of[item.source].value]
         return self.model.strongest(gaussians, rows, view).clamp(min=0)
 
     def _boxes(self, view: View) -> Iterator[ObjectBox]:
-        sets, gaussians = self._placed(view)
         boxes = [Box(a.id, ObjectClass.VEHICLE, a.category, a.size, a.pose, 0.0, 0) for a in self.actors]
-        seen = [seen_object(self.model, gaussians, i, box, view) for i, box in enumerate(boxes)]
+        seen = seen_objects(self.placed, boxes, view)
         known = {item.id: item for item in self.static.others}
-        others = self.static.others_in(view, sets, gaussians)
+        others = self.static.others_in(view, self.placed)
         boxes += [box_of(known[item.id], view.time) for item in others]
         for box, item in zip(boxes, [*seen, *others], strict=True):
             if item is not None:

@@ -2,19 +2,17 @@
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.camera_path import recorded_frames
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
-from drivesplat.trajectories.motion import HALF_STEP, Motion
+from drivesplat.trajectories.motion import Motion
 
 log = logging.getLogger(__name__)
 
@@ -71,26 +69,6 @@ def other_objects(scene: Scene, actors: Iterable[EditedActor]) -> list[EditedAct
     ids = {actor.id for actor in actors}
     others = (track for track in scene.tracks if track.id not in ids)
     return [EditedActor.recorded(t.id, t.category, t.size, Motion.of_track(scene, t)) for t in others]
-
-
-def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list[list[ActorPlacement]]:
-    """The actors present at each of `seconds` (n,), with their poses and distances then and HALF_STEP before and
-    after."""
-    result: list[list[ActorPlacement]] = [[] for _ in seconds]
-    for actor in actors:
-        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix, phase=actor.phase)
-        times = [seconds + step for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
-        poses, walked = [actor.poses(at) for at in times], [actor.walked(at) for at in times]
-        for number in np.flatnonzero(actor.present(seconds)):
-            placement = own
-            if times:
-                pose, *around = (of_time[number] for of_time in poses)
-                distance, *beside = (float(of_time[number]) for of_time in walked)
-                placement = replace(
-                    own, object_to_world=pose, around=tuple(around), walked=distance, walked_around=tuple(beside)
-                )
-            result[number].append(placement)
-    return result
 
 
 def warn_of_collisions(

@@ -10,16 +10,15 @@ import numpy as np
 import torch
 from PIL import Image
 
-from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
+from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.render_plan import ImageRenderPlan, image_render_plan
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.storage import Provenance, atomic_write, write_json
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import Want
 from drivesplat.readers.drive.write import write_record
 from drivesplat.readers.nuscenes.write import write_nuscenes
 from drivesplat.readers.truth import depth_units, numbered
@@ -59,7 +58,7 @@ def write_rendered_drive(
         with explain_out_of_memory(lambda: len(model)):
             views = drive.views(device)
             if drive.edited:
-                pictures = edited_frames(model, views, actor_placements(drive.objects.actors, drive.seconds))
+                pictures = edited_frames(model, views, drive.objects.actors, drive.seconds)
             else:
                 model.precompute(drive.seconds.tolist())
                 pictures = film_frames(model, ((view, None) for view in views))
@@ -99,20 +98,17 @@ def _write_label_images(
     numbers = {actor.id: number for number, actor in enumerate(actors, start=1)}
     if not labels:
         return numbers
-    placed = actor_placements(actors, drive.seconds)
-    for frame, view, own in zip(drive.scene.frames, drive.views(device), placed, strict=True):
-        gaussians = model.at(view.time, Want(placements=tuple(own)))
+    placed_at = placed_models(model, actors, drive.seconds)
+    for frame, view, placed in zip(drive.scene.frames, drive.views(device), placed_at, strict=True):
         image = Path(frame.image_path)
         named = {label: folder / label / image.parent.name / f"{image.stem}.png" for label in labels}
         for path in named.values():
             path.parent.mkdir(parents=True, exist_ok=True)
         if "depth" in named:
-            depth = model.render(view, gaussians=gaussians, with_surface_depth=True).surface_depth
-            assert depth is not None
-            write_png(named["depth"], depth_units(depth.cpu().numpy()))
+            write_png(named["depth"], depth_units(placed.surface_depth(view).cpu().numpy()))
         if "instances" in named:
             present = [actor for actor in actors if actor.present(np.array([view.time]))[0]]
-            shown = model.strongest(gaussians, gaussians.placement, view).cpu().numpy()
+            shown = placed.objects_in(view).cpu().numpy()
             write_png(named["instances"], numbered(shown, [numbers[actor.id] for actor in present]))
     return numbers
 

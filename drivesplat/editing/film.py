@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.editing.actors import actor_placements, other_objects, recorded_and_edited, warn_of_collisions
+from drivesplat.editing.actors import other_objects, recorded_and_edited, warn_of_collisions
 from drivesplat.editing.ego import edited_camera_path
+from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.editing.unseen_sides import UNSEEN, unseen_sides
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import Want
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, recorded_shot, shot_of, write_film
 from drivesplat.rendering.frames import film_frames
@@ -68,7 +67,7 @@ def render_edit(
     panels = Panels(("recorded", files.film.stem), after.size)
     still = Still(panels, avoided=colliding | (seconds > after.trained_until))
     shown = recorded_shot(model, drive.before, device)
-    changed = edited_frames(model, after.views(device), actor_placements(drive.actors, seconds))
+    changed = edited_frames(model, after.views(device), drive.actors, seconds)
     for file in files.frames.glob("[0-9]" * 6 + ".png"):  # of an earlier run
         file.unlink()
     if files.frames.is_dir() and not any(files.frames.iterdir()):
@@ -133,11 +132,11 @@ def warn_of_late_steps(edit: Edit, end: float, where: str) -> None:
 
 
 def edited_frames(
-    model: SplatModel, views: Iterable[View], placed: Iterable[Sequence[ActorPlacement]]
+    model: SplatModel, views: Iterable[View], actors: Sequence[EditedActor], seconds: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """The rendering of each view with the actors placed in it and no others, (h, w, 3) uint8 each."""
-    pairs = zip(views, placed, strict=True)
-    return film_frames(model, ((view, model.at(view.time, Want(placements=tuple(own)))) for view, own in pairs))
+    """The rendering of each view, of `seconds` (n,), with the actors as they then are, (h, w, 3) uint8 each."""
+    pairs = zip(views, placed_models(model, actors, seconds), strict=True)
+    return film_frames(model, ((view, placed.sets_in(view)) for view, placed in pairs))
 
 
 class Still:

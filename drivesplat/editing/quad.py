@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import torch
 
-from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.view import View
@@ -47,12 +46,11 @@ def render_quad(
         for frame, pose in zip(taken, poses, strict=True)
     )
     model.precompute([*smooth.seconds, *(scene.seconds(frame.timestamp) for frame in taken)])
-    placed = actor_placements(drive.actors, np.array(after.seconds))
     columns = (
         repeated(last, (recorded_picture(frame, smooth) for frame in taken)),
         repeated(last, film_frames(model, ((view, None) for view in views))),
         film_frames(model, ((view, None) for view in smooth.views(device))),
-        edited_frames(model, after.views(device), placed),
+        edited_frames(model, after.views(device), drive.actors, np.array(after.seconds)),
     )
     rate = f"{1e6 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0:.2g} Hz"
     labels = (f"recorded, {rate}", f"reconstructed, {rate}", f"smooth, {job.fps} fps", f"edited: {path.stem}")

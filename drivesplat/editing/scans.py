@@ -2,23 +2,23 @@
 now is."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int16
 
-from drivesplat.editing.actors import actor_placements, recorded_and_edited, trained_actors, warn_of_collisions
+from drivesplat.editing.actors import recorded_and_edited, trained_actors, warn_of_collisions
 from drivesplat.editing.ego import EgoEdit
+from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.sensor_path import beside, carried, recorded_ego
 from drivesplat.editing.shown_objects import parts_that_may_show
 from drivesplat.errors import ConfigError
 from drivesplat.lidar.moved_sensor import places_of_returns
 from drivesplat.lidar.objects_met import TrackedBoxes
-from drivesplat.model.scans import group_met, view_of_scan
+from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import SCAN
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.scene import Scene, Track
@@ -79,18 +79,16 @@ class ScanRenderPlan:
         """The scans in order. `beam_spread` in radians."""
         of_boxes = np.full(max([*self.boxes.indices, -1]) + 2, NO_OBJECT)  # the last is what NO_OBJECT finds
         of_boxes[self.boxes.indices] = len(self.actors) + np.arange(len(self.others))
-        for sensor in self.sensors:
-            view, time = view_of_scan(sensor, beam_spread, device), np.array([sensor.seconds])
-            present = [i for i, actor in enumerate(self.actors) if actor.present(time)[0]]
-            (placed,) = actor_placements([self.actors[i] for i in present], time)
-            gaussians = model.at(sensor.seconds, replace(SCAN, placements=tuple(placed)))
-            rendered = model.scan(view, gaussians=gaussians).rendered()
+        times = np.array([sensor.seconds for sensor in self.sensors])
+        for sensor, placed in zip(self.sensors, placed_models(model, self.actors, times), strict=True):
+            view, now = view_of_scan(sensor, beam_spread, device), np.array([sensor.seconds])
+            rendered = placed.scan(view).rendered()
             objects = np.full(rendered.ranges.shape, NO_OBJECT, dtype=np.int16)
             found = SimulatedScan(sensor, rendered, objects)
             returned = found.returned
-            if placed:
-                of_groups = np.array([*present, NO_OBJECT], dtype=np.int16)  # the last is what -1 finds
-                objects[returned] = of_groups[group_met(gaussians, view, gaussians.placement).cpu().numpy()[returned]]
+            present = [i for i, actor in enumerate(self.actors) if actor.present(now)[0]]
+            of_placements = np.array([*present, NO_OBJECT], dtype=np.int16)  # the last is what -1 finds
+            objects[returned] = of_placements[placed.objects_met(view).cpu().numpy()[returned]]
             # the static part shows what is in the boxes of the others
             seconds = sensor.seconds + sensor.scan.rays.offsets_s[returned].astype(np.float64)
             static = of_boxes[self.boxes.met(*found.places(), seconds)]

@@ -8,10 +8,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from drivesplat.editing.actors import actor_placements
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.editing.placed_model import PlacedModel, placed_models
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import Want
 from drivesplat.model.view import View
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import fill, hull_of
@@ -81,35 +80,27 @@ class ShownObjects:
     def seen_in(self, view: View, with_actors: bool = True) -> list[SeenObject]:
         """The objects that a view shows."""
         now = np.array([view.time])
-        present = [actor for actor in self.actors if actor.present(now)[0]]
-        (placements,) = actor_placements(present, now)
-        want = Want(placements=tuple(placements))
-        sets = self.model.sample(self.model.states(view.time, want), want)
-        gaussians = concatenate(sets)
-        found = self.others_in(view, sets, gaussians)
+        (placed,) = placed_models(self.model, self.actors, now)
+        found = self.others_in(view, placed)
         if with_actors:
-            boxes = [box_of(actor, view.time) for actor in present]
-            own = (seen_object(self.model, gaussians, i, box, view) for i, box in enumerate(boxes))
-            found = [*(item for item in own if item is not None), *found]
+            boxes = [box_of(actor, view.time) for actor in self.actors if actor.present(now)[0]]
+            found = [*(item for item in seen_objects(placed, boxes, view) if item is not None), *found]
         return found
 
     @torch.no_grad()
-    def others_in(self, view: View, sets: Sequence[Gaussians], gaussians: Gaussians) -> list[SeenObject]:
-        """Those of the others that a view shows, by the `sets` of Gaussians of the model's parts, as one
-        `gaussians`."""
+    def others_in(self, view: View, placed: PlacedModel) -> list[SeenObject]:
+        """Those of the others that a view shows."""
         found = (
-            _seen_object(self.model, gaussians, rows, box_of(item, view.time), view)
-            for item, rows in self.rows_of_others(view.time, sets, gaussians)
+            _seen_object(self.model, placed.gaussians_in(view), rows, box_of(item, view.time), view)
+            for item, rows in self.rows_of_others(view, placed)
         )
         return [item for item in found if item is not None]
 
-    def rows_of_others(
-        self, time: float, sets: Sequence[Gaussians], gaussians: Gaussians
-    ) -> Iterator[tuple[EditedActor, Bool[Tensor, " n"]]]:
-        """Those of the others that are present at a time and may be shown, each with the Gaussians that show it: of the
-        parts that may show it those whose centres lie in its box. `sets` as in `others_in`."""
-        now = np.array([time])
-        means, names = gaussians.means, [part.name for part in self.model.parts]
+    def rows_of_others(self, view: View, placed: PlacedModel) -> Iterator[tuple[EditedActor, Bool[Tensor, " n"]]]:
+        """Those of the others that are present at the time of a view and may be shown, each with the Gaussians that
+        show it: of the parts that may show it those whose centres lie in its box."""
+        now, sets = np.array([view.time]), placed.sets_in(view)
+        means, names = placed.gaussians_in(view).means, [part.name for part in self.model.parts]
         part_of_row = torch.cat([torch.full((len(own),), i, device=means.device) for i, own in enumerate(sets)])
         for item, parts in zip(self.others, self.parts, strict=True):
             if not parts or not item.present(now)[0]:
@@ -136,9 +127,10 @@ def box_of(item: EditedActor, time: float) -> Box:
     return Box(item.id, ObjectClass.VEHICLE, item.category, item.size, item.poses(np.array([time]))[0], 0.0, 0)
 
 
-def seen_object(model: SplatModel, gaussians: Gaussians, placement: int, box: Box, view: View) -> SeenObject | None:
-    """The object in a view that the Gaussians of a placement show; None where the image does not show it."""
-    return _seen_object(model, gaussians, gaussians.placement == placement, box, view)
+def seen_objects(placed: PlacedModel, boxes: Sequence[Box], view: View) -> list[SeenObject | None]:
+    """The object of each placement in a view, by its box; None where the image does not show it."""
+    gaussians = placed.gaussians_in(view)
+    return [_seen_object(placed.model, gaussians, gaussians.placement == i, box, view) for i, box in enumerate(boxes)]
 
 
 def _seen_object(

@@ -21,7 +21,7 @@ from drivesplat.model.states import ModelStates, copied, tensors_of
 from drivesplat.model.view import View
 from drivesplat.rendering.color_bytes import to_uint8
 
-FrameInput = tuple[View, Gaussians | None]
+FrameInput = tuple[View, Gaussians | Sequence[Gaussians] | None]
 """A view, and the Gaussians to render in place of the model's own at its time (None: the model's own)."""
 
 

@@ -10,7 +10,6 @@ from helpers.hand_made_street import AHEAD, TURNING, street_model, street_scene
 
 from drivesplat.drive.live_view import EditSession, ObjectChange
 from drivesplat.drive.trained_drive import TrainedDrive
-from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.errors import ConfigError, RequestError
 from drivesplat.settings.render import EditJob
@@ -74,8 +73,8 @@ def test_the_edits_file_gives_the_picture_that_was_seen(session, tmp_path):
     drive = session.drive
     found = edited_shots(drive.scene, drive.model, job, "a test")
     shot, number = found.after, 5
-    placed = actor_placements(found.actors, np.array(shot.seconds))
-    frames = list(edited_frames(drive.model, shot.views(torch.device("cpu")), placed))
+    views = shot.views(torch.device("cpu"))
+    frames = list(edited_frames(drive.model, views, found.actors, np.array(shot.seconds)))
     import drivesplat
 
     camera = drivesplat.Camera(64, 36, shot.K)

@@ -17,7 +17,6 @@ from helpers.shared_runs import CAR
 import drivesplat
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.drive.world_state import WorldState
-from drivesplat.editing.actors import actor_placements
 from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.errors import ConfigError, DriveSplatError, RequestError, ResultError
 from drivesplat.model.checkpoint import read_checkpoint, write_checkpoint
@@ -108,8 +107,7 @@ def test_images_after_an_edit_are_those_of_its_film_byte_for_byte(drive):
     steps = [*STOP, {"ego": {"speed": 0.5}}]
     found = shots(drive, steps)
     shot, cpu = found.after, torch.device("cpu")
-    placed = actor_placements(found.actors, np.array(shot.seconds))
-    frames = list(edited_frames(drive.model, shot.views(cpu), placed))
+    frames = list(edited_frames(drive.model, shot.views(cpu), found.actors, np.array(shot.seconds)))
     edited, last = drive.edited(steps), len(frames) - 1
     pose = shot.cameras.camera_to_world[last]
     assert np.linalg.norm(pose[:3, 3] - drive.camera_to_world(CAMERA, shot.seconds[last])[:3, 3]) > 0.5

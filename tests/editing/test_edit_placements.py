@@ -18,7 +18,8 @@ from helpers.hand_made_street import (
 from helpers.hand_made_traffic import placed
 from helpers.samples import sampled_with
 
-from drivesplat.editing.actors import actor_placements, editable_actors
+from drivesplat.editing.actors import editable_actors
+from drivesplat.editing.placed_model import actor_placements
 from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel

@@ -9,7 +9,7 @@ from helpers.hand_made import about_z, actors_of, motion_through, round_gaussian
 from helpers.samples import EVERYTHING, sampled_with
 from torch import nn
 
-from drivesplat.editing.actors import actor_placements
+from drivesplat.editing.placed_model import actor_placements
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanPicture, ScanView
 from drivesplat.model.splat_model import SplatModel
