@@ -4,6 +4,7 @@
 #   snakemake --cores 4                               all scenes: metrics, films, panels, exports, and the report
 #   snakemake --cores 4 metrics                       the figures alone; `films`, `edits`, `looks`, `exports` likewise
 #   snakemake --cores 4 drives                        rendered drives as datasets, of every edit and trajectory
+#   snakemake --cores 4 assets                        the actors of every method as assets, to insert into other drives
 #   snakemake --cores 1 report                        results/gap_report.html of what has been measured
 #   snakemake --cores 1 results/0061/ablation.csv     the contribution of each component of `street`, with three seeds
 #   snakemake --cores 4 estimate                      what all of it would take in time and disk, and how that is known
@@ -69,6 +70,11 @@ rule edits:
 rule drives:
     input:
         plan.drives,
+
+
+rule assets:
+    input:
+        plan.assets,
 
 
 rule looks:

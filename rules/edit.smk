@@ -1,11 +1,13 @@
 # Edited drives: vehicles removed, moved, slowed or scaled, and the ego vehicle on another path.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz of a method with actors, scene.json; the scene's edits file,
-# named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not.
+# named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not. The
+# assets that the edit inserts: <results>/{scene}/{method}/assets/assets.json, or asset.json of folders elsewhere.
 # OUTPUTS: <results>/{scene}/{method}/edits/{edit}.mp4, {edit}.png and {edit}.json; {edit}/ with frames, where wanted;
 # <results>/{scene}/{method}/quad/{edit}.mp4 and {edit}.json, on request; likewise
 # <results>/{scene}/{method}/edits/{edit}/drive/ and trajectories/{trajectory}/drive/, with drive.json; and scans/ beside
-# drive/, with scans.json, of methods that render LiDAR.
+# drive/, with scans.json, of methods that render LiDAR. <results>/{scene}/{method}/assets/ with assets.json, and a folder
+# for each actor: asset.ply, asset.json and turntable.webp.
 
 
 rule edit:
@@ -16,6 +18,7 @@ rule edit:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
+        assets=plan.inserted_assets,
     output:
         film=report(
             "<results>/{scene}/{method}/edits/{edit}.mp4",
@@ -61,6 +64,7 @@ rule quad:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
+        assets=plan.inserted_assets,
     output:
         film=report(
             "<results>/{scene}/{method}/quad/{edit}.mp4",
@@ -99,6 +103,7 @@ rule drive_folder:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
+        assets=plan.inserted_assets,
     output:
         drive="<results>/{scene}/{method}/{kind}/{drive}/drive/drive.json",
     log:
@@ -132,6 +137,7 @@ rule scan_folder:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         scans="<results>/{scene}/scans.npz",
+        assets=plan.inserted_assets,
     output:
         scans="<results>/{scene}/{method}/{kind}/{drive}/scans/scans.json",
     log:
@@ -154,3 +160,33 @@ rule scan_folder:
         code=plan.code("scan_folder"),
     script:
         "../workflow_scripts/scan_folder.py"
+
+
+rule actor_assets:
+    """
+    Writes the actors of a trained model as assets: files of their Gaussians that edits of any drive insert and that
+    other programs read, with a turntable of each.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+        objects="<results>/{scene}/{method}/eval_objects.json",
+    output:
+        index="<results>/{scene}/{method}/assets/assets.json",
+    log:
+        "<logs>/{scene}/{method}/actor_assets.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/actor_assets.tsv"
+    wildcard_constraints:
+        method=plan.known(plan.methods_with_actors),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 2
+    resources:
+        mem_mb=8000,
+        runtime=30,
+    params:
+        settings=plan.settings("actor_assets"),
+        code=plan.code("actor_assets"),
+    script:
+        "../workflow_scripts/actor_assets.py"

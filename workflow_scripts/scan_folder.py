@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
+from drivesplat.editing.assets.library import digests_of, read_assets
 from drivesplat.editing.scan_folder import write_scan_folder
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scan_record import read_scans
@@ -12,9 +13,11 @@ from drivesplat.settings.export import ScanFolderJob
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)
     checkpoint, records = read_checkpoint(current.input.checkpoint), read_scans(current.input.scans)
-    provenance = current.provenance(scene.provenance, checkpoint.provenance, records.provenance)
-    wildcards = current.wildcards
+    wildcards, settings = current.wildcards, current.settings(ScanFolderJob)
+    assets = read_assets(settings.edit, Path(current.input.checkpoint).parents[2], wildcards.method)
+    upstream = scene.provenance, checkpoint.provenance, records.provenance
+    provenance = current.provenance(*upstream, inputs=digests_of(assets))
     kind = {"edits": "edit", "trajectories": "trajectory"}[wildcards.kind]
     source = {"scene": wildcards.scene, "method": wildcards.method, kind: wildcards.drive}
-    settings, path = current.settings(ScanFolderJob), Path(current.output.scans)
-    write_scan_folder(scene, checkpoint, records, settings, current.device(), path, source, provenance)
+    path = Path(current.output.scans)
+    write_scan_folder(scene, checkpoint, records, settings, current.device(), path, source, provenance, assets)

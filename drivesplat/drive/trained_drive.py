@@ -23,7 +23,8 @@ from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.recorded_drive import RecordedDrive, object_table
 from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
-from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
+from drivesplat.editing.actors import EditedModel, edited_model, other_objects, trained_actors
+from drivesplat.editing.assets.library import read_assets
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.sensor_path import EgoPoses
 from drivesplat.editing.shown_objects import ShownObjects
@@ -147,9 +148,15 @@ class TrainedDrive(Sensors):
     @cached_property
     def edited_actors(self) -> list[EditedActor]:
         """The objects of which the model has Gaussians, after the edit."""
+        return self._recorded_actors if self._edited is None else self._edited.actors
+
+    @cached_property
+    def _edited(self) -> EditedModel | None:
+        """The model after the edit; None where it leaves the objects as recorded."""
         if self.edit is None or all(step.kind == "ego" for step in self.edit.steps):
-            return self._recorded_actors
-        return recorded_and_edited(self.model, self.scene, self._reference, self.edit, self.where)[1]
+            return None
+        assets = read_assets(self.edit, self.folder.parent.parent, self.folder.name)
+        return edited_model(self.model, self.scene, self._reference, self.edit, self.where, assets)
 
     @cached_property
     def _recorded_actors(self) -> list[EditedActor]:
@@ -299,9 +306,9 @@ class TrainedDrive(Sensors):
         if outside == "refuse" and not 0.0 <= time <= self.duration:
             raise RequestError(f"{self.recording.outside(time)}; outside='clamp' renders its start or its end")
         inside = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else time
-        classes = {track.id: track.object_class for track in self.scene.tracks}
+        model = self.model if self._edited is None else self._edited.model
         now = float(self.recording.checked(inside))
-        return WorldState(self.model, self.edited_actors, self._static, classes, self, now, self.edit is None)
+        return WorldState(model, self.edited_actors, self._static, self, now, self.edit is None)
 
     @overload
     def render(

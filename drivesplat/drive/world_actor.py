@@ -16,10 +16,10 @@ from drivesplat.trajectories.motion import HALF_STEP
 
 
 class WorldActor:
-    """An object of a world: `id` and `category` of the dataset."""
+    """An object of a world: its `id`, its `object_class`, and the `category` of the dataset."""
 
     def __init__(self, actor: EditedActor, placement: ActorPlacement, time: float):
-        self.id, self.category = actor.id, actor.category
+        self.id, self.object_class, self.category = actor.id, actor.object_class, actor.category
         self._actor, self._placement, self._time = actor, placement, time
         self.changed = False
 
@@ -62,7 +62,7 @@ class WorldActor:
 
     @property
     def source(self) -> str:
-        """The id of the track whose Gaussians it has."""
+        """The id of the track, or the name of the asset, whose Gaussians it has."""
         return self._actor.source
 
     def copied(self, name: str) -> "WorldActor":

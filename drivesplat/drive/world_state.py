@@ -1,7 +1,7 @@
 """A drive at one time, whose objects can be moved one by one, as cameras and LiDARs see it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import overload
@@ -58,14 +58,13 @@ class Sensors(ABC):
 
 @dataclass(frozen=True, eq=False)
 class SampledWorld:
-    """A drive at a `time`: the `actors` of the model with their places, the objects that it shows in its `static` part,
-    and the class of each track. `as_recorded`: no object was moved, added or removed."""
+    """A drive at a `time`: the `actors` of the model with their places, and the objects that it shows in its `static`
+    part. `as_recorded`: no object was moved, added or removed."""
 
     model: SplatModel
     time: float
     actors: tuple[WorldActor, ...]
     static: ShownObjects
-    class_of: Mapping[str, ObjectClass]
     as_recorded: bool
 
     @cached_property
@@ -86,7 +85,7 @@ class SampledWorld:
     @cached_property
     def classes(self) -> tuple[str, ...]:
         """The names of classes: the sky, the parts without objects, and the classes of objects."""
-        known = {self.class_of[item.source].value for item in (*self.actors, *self.static.others)}
+        known = {item.object_class.value for item in (*self.actors, *self.static.others)}
         return (SKY, *(part.name for part in self.model.parts if not part.has_objects), *sorted(known))
 
     def image(self, placed: PlacedCamera, outputs: Collection[str]) -> DriveView:
@@ -154,11 +153,11 @@ class SampledWorld:
             ]
         )
         if gaussians.placement is not None:
-            of_actors = [number[self.class_of[actor.source].value] for actor in self.actors]
+            of_actors = [number[actor.object_class.value] for actor in self.actors]
             own = torch.tensor([*of_actors, -1], dtype=torch.int16, device=self.device)[gaussians.placement]
             rows = torch.where(gaussians.placement >= 0, own, rows)
         for item, shown in self.static.rows_of_others(view, self.placed):
-            rows[shown] = number[self.class_of[item.source].value]
+            rows[shown] = number[item.object_class.value]
         return self.model.strongest(gaussians, rows, view).clamp(min=0)
 
     def _boxes(self, view: View) -> Iterator[ObjectBox]:
@@ -190,15 +189,13 @@ class WorldState:
         model: SplatModel,
         actors: Sequence[EditedActor],
         static: ShownObjects,
-        class_of: Mapping[str, ObjectClass],
         sensors: Sensors,
         time: float,
         as_recorded: bool,
     ):
-        """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of; `class_of`
-        are the classes of tracks by id."""
+        """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of."""
         self.time, now = time, np.array([time])
-        self._model, self._static, self._class_of = model, static, class_of
+        self._model, self._static = model, static
         self._sensors, self._as_recorded = sensors, as_recorded
         self._taken = {item.id for item in (*actors, *static.others)}
         absent = {item.id: "is not there at this time" for item in actors}
@@ -313,4 +310,4 @@ class WorldState:
     def _sampled(self) -> SampledWorld:
         actors = tuple(self.actors.values())
         as_recorded = self._as_recorded and not any(actor.changed for actor in actors)
-        return SampledWorld(self._model, self.time, actors, self._static, self._class_of, as_recorded)
+        return SampledWorld(self._model, self.time, actors, self._static, as_recorded)

@@ -2,37 +2,59 @@
 
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.inserted import with_assets
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.camera_path import recorded_frames
-from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.trajectories.edited_actors import EditedActor, Insertable, edited_actors
 from drivesplat.trajectories.motion import Motion
 
 log = logging.getLogger(__name__)
 
+ALL_AROUND = np.radians(np.arange(0.0, 360.0, 10.0))
+"""The directions from which an asset of unknown origin was seen."""
 COLLISION_MARGIN = 0.5
 """Metres around a box within which a camera sees little but the inside of the object."""
 
 
-def recorded_and_edited(
-    model: SplatModel, scene: Scene, camera: str, edit: Edit, where: str
-) -> tuple[list[EditedActor], list[EditedActor]]:
-    """The actors of the model, and these after an edit. Steps that place a copy count from the ego poses at the images
-    of `camera`.
+@dataclass(frozen=True, eq=False)
+class EditedModel:
+    """A model after an edit: the `model` with the assets that the edit inserts, its actors as `recorded`, and the
+    `actors` after the edit."""
+
+    model: SplatModel
+    recorded: list[EditedActor]
+    actors: list[EditedActor]
+
+
+def edited_model(
+    model: SplatModel, scene: Scene, camera: str, edit: Edit, where: str, assets: Assets = NO_ASSETS
+) -> EditedModel:
+    """A model after an edit, whose steps insert `assets` by name. Steps that place an object count from the ego poses
+    at the images of `camera`.
 
     Raises ConfigError, starting with `where`, if the edit does not fit the scene or the model has no actors;
     DatasetError if the scene lacks the camera; ResultError as `editable_actors`.
     """
-    recorded = editable_actors(model, scene, where)
+    inserts = any(step.insert is not None for step in edit.steps)
+    recorded = (trained_actors if inserts else editable_actors)(model, scene, where)
     others = {track.id for track in scene.tracks} - {actor.id for actor in recorded}
     ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, camera)])
-    return recorded, edited_actors(recorded, edit, where, others, ego_to_world)
+    insertable = {
+        name: Insertable(asset.object_class, asset.category, asset.size, asset.seen if len(asset.seen) else ALL_AROUND)
+        for name, asset in assets.items()
+    }
+    actors = edited_actors(recorded, edit, where, others, ego_to_world, insertable)
+    used = {actor.source for actor in actors}
+    return EditedModel(with_assets(model, {n: a for n, a in assets.items() if n in used}), recorded, actors)
 
 
 def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[EditedActor]:
@@ -60,7 +82,7 @@ def trained_actors(model: SplatModel, scene: Scene, where: str) -> list[EditedAc
             raise ResultError(
                 f"{where}: scene.json has no track {name}, which checkpoint.npz contains; delete that file and rerun"
             )
-        actors.append(EditedActor.recorded(track.id, track.category, track.size, group.motion))
+        actors.append(EditedActor.recorded(track.id, track.object_class, track.category, track.size, group.motion))
     return actors
 
 
@@ -68,7 +90,7 @@ def other_objects(scene: Scene, actors: Iterable[EditedActor]) -> list[EditedAct
     """The annotated objects that are none of `actors`, as recorded: the model has them in its static part."""
     ids = {actor.id for actor in actors}
     others = (track for track in scene.tracks if track.id not in ids)
-    return [EditedActor.recorded(t.id, t.category, t.size, Motion.of_track(scene, t)) for t in others]
+    return [EditedActor.recorded(t.id, t.object_class, t.category, t.size, Motion.of_track(scene, t)) for t in others]
 
 
 def warn_of_collisions(

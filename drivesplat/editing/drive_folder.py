@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from drivesplat.editing.assets.asset import NO_ASSETS, Assets
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
 from drivesplat.editing.placed_model import placed_models
@@ -18,7 +19,6 @@ from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.storage import Provenance, atomic_write, write_json
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
-from drivesplat.model.splat_model import SplatModel
 from drivesplat.readers.drive.write import write_record
 from drivesplat.readers.nuscenes.write import write_nuscenes
 from drivesplat.readers.truth import depth_units, numbered
@@ -43,29 +43,30 @@ def write_rendered_drive(
     path: Path,
     source: dict[str, str],
     provenance: Provenance,
+    assets: Assets = NO_ASSETS,
 ) -> None:
     """Writes the drive folder of `path`, its drive.json: images/, and the same drive as nuScenes tables in nuscenes/.
 
     `source` names the `scene`, the `method`, and the `edit` or the `trajectory` in the record that marks the drive as
-    rendered; the scene of the tables is called by scene and edit or trajectory. Raises what `image_render_plan` raises;
-    DeviceError; ResultError where a rendering contains NaN or Inf, or the disk is full.
-    """
+    rendered; the scene of the tables is called by scene and edit or trajectory. The edit inserts `assets` by name.
+    Raises what `image_render_plan` raises; DeviceError; ResultError where a rendering contains NaN or Inf, or the disk
+    is full."""
     folder, what = path.parent, " ".join(f"{key} {value}" for key, value in source.items())
     _remove(folder)
     model, device = open_model(checkpoint, device_settings)
-    drive = image_render_plan(scene, model, job, folder, what)
+    drive = image_render_plan(scene, model, job, folder, what, assets)
     try:
         with explain_out_of_memory(lambda: len(model)):
             views = drive.views(device)
             if drive.edited:
-                pictures = edited_frames(model, views, drive.objects.actors, drive.seconds)
+                pictures = edited_frames(drive.objects.model, views, drive.objects.actors, drive.seconds)
             else:
                 model.precompute(drive.seconds.tolist())
                 pictures = film_frames(model, ((view, None) for view in views))
             for frame, pixels in zip(drive.scene.frames, prefetch_items(pictures), strict=True):
                 with atomic_write(Path(frame.image_path)) as file:
                     Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)
-            instances = _write_label_images(folder, model, drive, job.labels, device)
+            instances = _write_label_images(folder, drive, job.labels, device)
             trained_until = last_training_timestamp(scene, job.eval_camera, job.holdout)
             drive, labels = labelled(scene, drive, trained_until, device, what)
         marked = replace(
@@ -90,7 +91,7 @@ def write_rendered_drive(
 
 @torch.no_grad()
 def _write_label_images(
-    folder: Path, model: SplatModel, drive: ImageRenderPlan, labels: Sequence[DriveLabel], device: torch.device
+    folder: Path, drive: ImageRenderPlan, labels: Sequence[DriveLabel], device: torch.device
 ) -> dict[str, int]:
     """Writes the depth and the objects of every image as 16-bit images, as `labels` say; returns the numbers of objects
     in these by id."""
@@ -98,7 +99,7 @@ def _write_label_images(
     numbers = {actor.id: number for number, actor in enumerate(actors, start=1)}
     if not labels:
         return numbers
-    placed_at = placed_models(model, actors, drive.seconds)
+    placed_at = placed_models(drive.objects.model, actors, drive.seconds)
     for frame, view, placed in zip(drive.scene.frames, drive.views(device), placed_at, strict=True):
         image = Path(frame.image_path)
         named = {label: folder / label / image.parent.name / f"{image.stem}.png" for label in labels}

@@ -62,7 +62,7 @@ def labelled(
     points = _lidar_points(scene, {sources[track.id] for track in tracks})
     counts = {}
     for track in tracks:  # a key frame without a count has that of the nearest one
-        own = points[sources[track.id]]
+        own = points[sources[track.id]] or {0: 0}  # an inserted object was not measured
         known = np.array(sorted(own))
         counts[track.id] = [own[int(known[np.abs(known - index).argmin()])] for index in track.sample_indices.tolist()]
     labels = Labels(shown_by, counts, boxes, trained_until)

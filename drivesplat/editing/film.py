@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.editing.actors import other_objects, recorded_and_edited, warn_of_collisions
+from drivesplat.editing.actors import edited_model, other_objects, warn_of_collisions
+from drivesplat.editing.assets.asset import NO_ASSETS, Assets
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.shown_objects import ShownObjects
@@ -49,10 +50,15 @@ class EditFiles:
 
 
 def render_edit(
-    scene: Scene, checkpoint: TrainedCheckpoint, job: EditJob, device_settings: DeviceSettings, files: EditFiles
+    scene: Scene,
+    checkpoint: TrainedCheckpoint,
+    job: EditJob,
+    device_settings: DeviceSettings,
+    files: EditFiles,
+    assets: Assets = NO_ASSETS,
 ) -> dict[str, Any]:
     """Writes the film and the still, both with the recorded and the edited drive in panels, and, if `job.frames`, the
-    frames of the edited one.
+    frames of the edited one. `assets` are those that the edit inserts, by their names there.
 
     Returns the content of the edit's JSON without provenance: the cameras of the edited drive at the size of a frame,
     which is that of a panel, the places of the panels in the `film`, and the poses of all objects. Raises ConfigError
@@ -61,13 +67,13 @@ def render_edit(
     """
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {scene.name}, edit {files.film.stem!r}"
-    drive = edited_shots(scene, model, job, where)
+    drive = edited_shots(scene, model, job, where, assets)
     after, seconds = drive.after, np.array(drive.after.seconds)
     colliding = warn_of_collisions(drive.actors, after.cameras.camera_to_world, seconds, where)
     panels = Panels(("recorded", files.film.stem), after.size)
     still = Still(panels, avoided=colliding | (seconds > after.trained_until))
     shown = recorded_shot(model, drive.before, device)
-    changed = edited_frames(model, after.views(device), drive.actors, seconds)
+    changed = edited_frames(drive.model, after.views(device), drive.actors, seconds)
     for file in files.frames.glob("[0-9]" * 6 + ".png"):  # of an earlier run
         file.unlink()
     if files.frames.is_dir() and not any(files.frames.iterdir()):
@@ -79,7 +85,7 @@ def render_edit(
     write_png(files.still, still.picture)
     dynamic = {track.id for track in scene.tracks if track.object_class.is_dynamic}
     others = [item for item in other_objects(scene, drive.recorded) if item.id in dynamic]
-    objects = ShownObjects.of_scene(scene, model, drive.actors, others)
+    objects = ShownObjects.of_scene(scene, drive.model, drive.actors, others)
     apart = max(1, round(SHOWN_EVERY_S * job.fps))
     images = [frame_name(files.frames, number) for number in range(len(after.cameras))] if job.frames else []
     return {
@@ -94,9 +100,10 @@ def render_edit(
 
 @dataclass(frozen=True)
 class EditedShots:
-    """A drive with an edit: the actors of the model as `recorded` and as edited (`actors`), and shots of the same times
-    `before` the edit and `after` it."""
+    """A drive with an edit: the `model` with the assets that the edit inserts, its actors as `recorded` and as edited
+    (`actors`), and shots of the same times `before` the edit and `after` it."""
 
+    model: SplatModel
     recorded: Sequence[EditedActor]
     actors: Sequence[EditedActor]
     before: Shot
@@ -108,16 +115,17 @@ class EditedShots:
         return [UNSEEN if unseen else "" for unseen in unseen_sides(self.recorded, self.actors, self.after)]
 
 
-def edited_shots(scene: Scene, model: SplatModel, job: EditJob, where: str) -> EditedShots:
-    """The drive with the edit of `job`. Raises ConfigError, starting with `where` (the scene and the edit), if the edit
-    does not fit the scene or the model has no actors, DatasetError if the scene lacks the camera."""
-    recorded, actors = recorded_and_edited(model, scene, job.camera, job.edit, where)
+def edited_shots(scene: Scene, model: SplatModel, job: EditJob, where: str, assets: Assets = NO_ASSETS) -> EditedShots:
+    """The drive with the edit of `job`, which inserts `assets` by name. Raises ConfigError, starting with `where` (the
+    scene and the edit), if the edit does not fit the scene or the model has no actors, DatasetError if the scene lacks
+    the camera."""
+    edited = edited_model(model, scene, job.camera, job.edit, where, assets)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     before, after = (shot_of(scene, cameras, job) for cameras in (unedited, path))
     if len(after.cameras) < len(path):
         warn_of_late_steps(job.edit, after.seconds[-1], where)
-    return EditedShots(recorded, actors, before, after)
+    return EditedShots(edited.model, edited.recorded, edited.actors, before, after)
 
 
 def warn_of_late_steps(edit: Edit, end: float, where: str) -> None:
@@ -177,11 +185,10 @@ def frame_name(folder: Path, number: int) -> str:
 def track_labels(objects: ShownObjects, seconds: np.ndarray, views: Iterable[View]) -> list[dict[str, Any]]:
     """A record for every object of an edited drive, first the actors; `seconds` (n,) of frames.
 
-    `source` is the track whose Gaussians it has (None: it has none of its own); `shown_by` says what shows it in any of
-    `views` (see `ShownObjects.shown_by`); `size` is length, width, height in metres, `scale` included; `color_matrix`
-    (3, 3) maps its RGB colours in [0, 1] (None: unchanged); `object_to_world` (n times (4, 4)) is at the box centre,
-    rounded to 1e-6, None in frames where the object is absent.
-    """
+    `source` is the track, or the asset, whose Gaussians it has (None: it has none of its own); `shown_by` says what
+    shows it in any of `views` (see `ShownObjects.shown_by`); `size` is length, width, height in metres, `scale`
+    included; `color_matrix` (3, 3) maps its RGB colours in [0, 1] (None: unchanged); `object_to_world` (n times (4, 4))
+    is at the box centre, rounded to 1e-6, None in frames where the object is absent."""
     shown_by, labels = objects.shown_by(objects.seen_in_any(views)), []
     for i, item in enumerate((*objects.actors, *objects.others)):
         present, poses = item.present(seconds), item.poses(seconds).round(DECIMALS)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 
+from drivesplat.editing.assets.asset import NO_ASSETS, Assets
 from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.view import View
@@ -25,15 +26,21 @@ T = TypeVar("T")
 
 
 def render_quad(
-    scene: Scene, checkpoint: TrainedCheckpoint, job: EditJob, device_settings: DeviceSettings, path: Path
+    scene: Scene,
+    checkpoint: TrainedCheckpoint,
+    job: EditJob,
+    device_settings: DeviceSettings,
+    path: Path,
+    assets: Assets = NO_ASSETS,
 ) -> dict[str, Any]:
-    """Writes the MP4 `path`, named like the edit; returns the content of its JSON without provenance.
+    """Writes the MP4 `path`, named like the edit, which inserts `assets` by name; returns the content of its JSON
+    without provenance.
 
     The first two panels show the last image of the camera until the next: as recorded, and rendered from its pose at
     its time. Raises what `render_edit` raises.
     """
     model, device = open_model(checkpoint, device_settings)
-    drive = edited_shots(scene, model, job, f"scene {scene.name}, edit {path.stem!r}")
+    drive = edited_shots(scene, model, job, f"scene {scene.name}, edit {path.stem!r}", assets)
     smooth, after = drive.before, drive.after
     frames = recorded_frames(scene, job.camera)
     times = np.array([frame.timestamp for frame in frames])
@@ -50,7 +57,7 @@ def render_quad(
         repeated(last, (recorded_picture(frame, smooth) for frame in taken)),
         repeated(last, film_frames(model, ((view, None) for view in views))),
         film_frames(model, ((view, None) for view in smooth.views(device))),
-        edited_frames(model, after.views(device), drive.actors, np.array(after.seconds)),
+        edited_frames(drive.model, after.views(device), drive.actors, np.array(after.seconds)),
     )
     rate = f"{1e6 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0:.2g} Hz"
     labels = (f"recorded, {rate}", f"reconstructed, {rate}", f"smooth, {job.fps} fps", f"edited: {path.stem}")

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 
 from drivesplat.editing.actors import (
+    edited_model,
     other_objects,
-    recorded_and_edited,
     trained_actors,
     warn_of_collisions,
 )
+from drivesplat.editing.assets.asset import NO_ASSETS, Assets
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.model.splat_model import SplatModel
@@ -59,8 +60,10 @@ class ImageRenderPlan:
             )
 
 
-def image_render_plan(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> ImageRenderPlan:
-    """The drive of `job`; its images are to lie in `folder`/images.
+def image_render_plan(
+    scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str, assets: Assets = NO_ASSETS
+) -> ImageRenderPlan:
+    """The drive of `job`, whose edit inserts `assets` by name; its images are to lie in `folder`/images.
 
     All images of the cameras at their own times, as long as the ego vehicle is on its recorded path. Warns where a
     camera is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the scene
@@ -70,7 +73,8 @@ def image_render_plan(scene: Scene, model: SplatModel, job: DriveJob, folder: Pa
         ego, trained = None, trained_actors(model, scene, where)
         actors = trained
     else:
-        trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
+        edited = edited_model(model, scene, job.eval_camera, job.edit, where, assets)
+        model, trained, actors = edited.model, edited.recorded, edited.actors
         ego = EgoEdit.of(scene, job.eval_camera, job.edit, where)
     frames = [frame for camera in job.cameras for frame in _rendered_frames(scene, camera, ego, job, folder)]
     last = max((frame.sample_index for frame in frames if frame.is_key_frame), default=0)
@@ -142,13 +146,12 @@ def _tracks(scene: Scene, objects: Sequence[EditedActor], times: np.ndarray) -> 
     seconds, tracks = np.array([scene.seconds(time) for time in times]), []
     for item in objects:
         present = item.present(seconds)
-        source = scene.track(item.source)
-        if source is None or not present.any():
+        if not present.any():
             continue
         tracks.append(
             Track(
                 id=item.id,
-                object_class=source.object_class,
+                object_class=item.object_class,
                 category=item.category,
                 size=item.size,
                 timestamps=times[present],

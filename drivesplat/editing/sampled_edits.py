@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drivesplat.editing.actors import recorded_and_edited
+from drivesplat.editing.actors import edited_model
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
@@ -31,7 +31,7 @@ def sampled_edits(
     for name, edit in edits.items():
         where, moved = f"scene {scene.name}, edit {name!r}", None
         try:
-            _, edited = recorded_and_edited(model, scene, camera, edit, where)
+            edited = edited_model(model, scene, camera, edit, where).actors
             if any(step.kind == "ego" for step in edit.steps):
                 path = edited_camera_path(scene, camera, rate, edit, where)
                 times = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])

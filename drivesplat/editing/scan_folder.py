@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.editing.assets.asset import NO_ASSETS, Assets
 from drivesplat.editing.scans import SimulatedScan, scan_render_plan
 from drivesplat.errors import ResultError
 from drivesplat.io.point_cloud import write_vertices
@@ -29,22 +30,24 @@ def write_scan_folder(
     path: Path,
     source: dict[str, str],
     provenance: Provenance,
+    assets: Assets = NO_ASSETS,
 ) -> None:
     """Writes the scans of `records` after the edit of `job` or along its trajectory into the folder of `path`, and last
     `path`, scans.json, which lists them.
 
-    `source` names the `scene`, the `method`, and the `edit` or the `trajectory`. Raises what `scan_render_plan` raises;
+    `source` names the `scene`, the `method`, and the `edit` or the `trajectory`; the edit inserts `assets` by name.
+    Raises what `scan_render_plan` raises;
     DeviceError; ResultError for a model that was trained without LiDAR, where a rendering contains NaN or Inf, or where
     the disk is full.
     """
     what = " ".join(f"{key} {value}" for key, value in source.items())
     model, device = open_model(checkpoint, device_settings)
-    drive = scan_render_plan(scene, model, records.scans, job, what)
-    objects, folder, listed = drive.objects(scene), path.parent, []
+    drive = scan_render_plan(scene, model, records.scans, job, what, assets)
+    objects, folder, listed = drive.objects(), path.parent, []
     _remove_scans(folder)
     try:
         with explain_out_of_memory(lambda: len(model)):
-            for found in drive.simulated(model, checkpoint.job.train.scans.beam_spread_rad, device):
+            for found in drive.simulated(checkpoint.job.train.scans.beam_spread_rad, device):
                 values = (found.rendered.ranges, found.rendered.drops, found.rendered.intensities)
                 if not all(np.isfinite(array).all() for array in values):
                     raise ResultError(

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int16
 
-from drivesplat.editing.actors import recorded_and_edited, trained_actors, warn_of_collisions
+from drivesplat.editing.actors import edited_model, trained_actors, warn_of_collisions
+from drivesplat.editing.assets.asset import NO_ASSETS, Assets
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.sensor_path import beside, carried, recorded_ego
@@ -49,38 +50,34 @@ class SimulatedScan:
 
 @dataclass(frozen=True)
 class ScanRenderPlan:
-    """Scans to render: the rays of `sensors`, each with the pose and the velocities that the sensor then has; the
-    `actors` of the model as they then are; and the annotated objects (`others`) that the model shows in its static
-    part, with their `boxes`."""
+    """Scans to render: the `model` with the assets that an edit inserts; the rays of `sensors`, each with the pose and
+    the velocities that the sensor then has; the `actors` of the model as they then are; and the annotated objects
+    (`others`) that the model shows in its static part, with their `boxes`."""
 
+    model: SplatModel
     sensors: Sequence[RecordedScan]
     actors: Sequence[EditedActor]
     others: Sequence[Track]
     boxes: TrackedBoxes
 
-    def objects(self, scene: Scene) -> list[dict[str, Any]]:
-        """What returns may belong to, as plain data: id, track whose Gaussians it has, category, class, and length,
-        width, height in metres. First the actors, then the other objects."""
-        sources = {track.id: track for track in scene.tracks}
-        found = [(actor.id, sources[actor.source], actor.size) for actor in self.actors]
-        found += [(track.id, track, track.size) for track in self.others]
+    def objects(self) -> list[dict[str, Any]]:
+        """What returns may belong to, as plain data: id, track or asset whose Gaussians it has, category, class, and
+        length, width, height in metres. First the actors, then the other objects."""
         return [
             {
-                "id": name, "track": source.id, "category": source.category, "class": source.object_class.value,
-                "size": [round(float(value), 4) for value in size],
+                "id": item.id, "track": source, "category": item.category, "class": item.object_class.value,
+                "size": [round(float(value), 4) for value in item.size],
             }
-            for name, source, size in found
+            for item, source in [*((own, own.source) for own in self.actors), *((own, own.id) for own in self.others)]
         ]  # fmt: skip
 
     @torch.no_grad()
-    def simulated(
-        self, model: SplatModel, beam_spread: tuple[float, float], device: torch.device
-    ) -> Iterator[SimulatedScan]:
+    def simulated(self, beam_spread: tuple[float, float], device: torch.device) -> Iterator[SimulatedScan]:
         """The scans in order. `beam_spread` in radians."""
         of_boxes = np.full(max([*self.boxes.indices, -1]) + 2, NO_OBJECT)  # the last is what NO_OBJECT finds
         of_boxes[self.boxes.indices] = len(self.actors) + np.arange(len(self.others))
         times = np.array([sensor.seconds for sensor in self.sensors])
-        for sensor, placed in zip(self.sensors, placed_models(model, self.actors, times), strict=True):
+        for sensor, placed in zip(self.sensors, placed_models(self.model, self.actors, times), strict=True):
             view, now = view_of_scan(sensor, beam_spread, device), np.array([sensor.seconds])
             rendered = placed.scan(view).rendered()
             objects = np.full(rendered.ranges.shape, NO_OBJECT, dtype=np.int16)
@@ -97,9 +94,11 @@ class ScanRenderPlan:
 
 
 def scan_render_plan(
-    scene: Scene, model: SplatModel, scans: Sequence[RecordedScan], job: ScanFolderJob, where: str
-) -> ScanRenderPlan:
-    """The drive of `job`: the rays of `scans`, as long as the ego vehicle is on its recorded path.
+    scene: Scene, model: SplatModel, scans: Sequence[RecordedScan], job: ScanFolderJob, where: str,
+    assets: Assets = NO_ASSETS,
+) -> ScanRenderPlan:  # fmt: skip
+    """The drive of `job`, whose edit inserts `assets` by name: the rays of `scans`, as long as the ego vehicle is on
+    its recorded path.
 
     Warns where a sensor is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the
     scene, there is no camera or the model has no actors; DatasetError as `recorded_ego`; ResultError as
@@ -114,7 +113,8 @@ def scan_render_plan(
     else:
         if job.eval_camera is None:
             raise ConfigError(f"{where}: scans of edits need images, and the scene has no camera")
-        trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
+        edited = edited_model(model, scene, job.eval_camera, job.edit, where, assets)
+        model, trained, actors = edited.model, edited.recorded, edited.actors
         sensors, change = list(scans), EgoEdit.of(scene, job.eval_camera, job.edit, where)
         if change is not None and scans:
             frames, recorded = recorded_frames(scene, job.eval_camera), recorded_ego(scene, job.eval_camera)
@@ -127,4 +127,4 @@ def scan_render_plan(
     if sensors:
         poses, seconds = np.stack([s.sensor_to_world for s in sensors]), np.array([s.seconds for s in sensors])
         warn_of_collisions(actors, poses, seconds, where, "LiDAR")
-    return ScanRenderPlan(sensors, actors, [scene.tracks[i] for i in boxes.indices], boxes)
+    return ScanRenderPlan(model, sensors, actors, [scene.tracks[i] for i in boxes.indices], boxes)

@@ -100,7 +100,7 @@ class ShownObjects:
         """Those of the others that are present at the time of a view and may be shown, each with the Gaussians that
         show it: of the parts that may show it those whose centres lie in its box."""
         now, sets = np.array([view.time]), placed.sets_in(view)
-        means, names = placed.gaussians_in(view).means, [part.name for part in self.model.parts]
+        means, names = placed.gaussians_in(view).means, [part.name for part in placed.model.parts]
         part_of_row = torch.cat([torch.full((len(own),), i, device=means.device) for i, own in enumerate(sets)])
         for item, parts in zip(self.others, self.parts, strict=True):
             if not parts or not item.present(now)[0]:

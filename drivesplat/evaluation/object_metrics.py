@@ -5,11 +5,13 @@ The figure of moving vehicles is often that of one or two of them, and varies be
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivesplat.evaluation.metrics import MIN_FRAME_PIXELS, channel_mean, psnr
+from drivesplat.io.storage import Provenance, read_record
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.regions import LABELS, labelled_hulls
 from drivesplat.scene.tracks import Box
@@ -37,6 +39,17 @@ def object_errors(
     sums = np.bincount(owned[owned >= 0], weights=errors[owned >= 0], minlength=len(hulls))
     counted = [i for i, name in enumerate(names) if name != "left_out" and pixels[i]]
     return [ObjectErrors(hulls[i].box, int(pixels[i]), float(sums[i])) for i in counted]
+
+
+def object_figures(path: str | Path) -> tuple[dict[str, dict[str, Any]], Provenance]:
+    """The PSNR and the number of images of each track in every group of held-out images, by track and group, from
+    eval_objects.json; and the provenance of that file. Raises ResultError where it is not one."""
+    content, found = read_record(path, "evaluate", "groups", "provenance"), {}
+    for group, objects in content["groups"].items():
+        for item in objects:
+            figures = {"psnr": item["psnr"], "images": item["images"]}
+            found.setdefault(item["id"], {})[group] = figures
+    return found, content["provenance"]
 
 
 def by_object(errors: Iterable[ObjectErrors]) -> list[dict[str, Any]]:

@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.export.splat_ply import ALMOST_ONE, TINY, read_splat_ply
 from drivesplat.io.storage import atomic_path
+from drivesplat.model.splat_ply import ALMOST_ONE, TINY, read_splat_ply
 
 log = logging.getLogger(__name__)
 

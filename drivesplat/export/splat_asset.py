@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from drivesplat.export.camera_files import transforms_record
-from drivesplat.export.splat_ply import note_of, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, digests, shown_timestamp, trained_gaussians, trained_groups
-from drivesplat.export.unique_names import unique_names
 from drivesplat.io.storage import Provenance, write_json
+from drivesplat.io.unique_names import unique_names
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.gaussians import with_sh_degree
+from drivesplat.model.splat_ply import note_of, write_splat_ply
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.export import SplatJob

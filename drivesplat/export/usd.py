@@ -24,9 +24,9 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from drivesplat.export.thinning import thinned_groups
 from drivesplat.export.trained_parts import SampledGroup, digests, trained_groups
-from drivesplat.export.unique_names import unique_names
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_group, usd_matrix
 from drivesplat.io.storage import Provenance, atomic_path, unwritable
+from drivesplat.io.unique_names import unique_names
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Scene

@@ -74,7 +74,7 @@ class Actors(Part):
         self.shared = make_parameters(corrections).requires_grad_(settings.tracks.corrected)
         self.extent = float(np.median([np.linalg.norm(track.size) for track in tracks]))
         self.cap_max = settings.cap_max
-        self._settings = settings
+        self.settings = settings
         self._gaussians = gaussians
         self._known_owners: tuple[Tensor | None, int, Tensor | None] = (None, 0, None)
         sizes = torch.from_numpy(np.stack([track.size for track in tracks])).float()
@@ -198,7 +198,7 @@ class Actors(Part):
         return matrix
 
     def learning_rates(self) -> dict[str, float]:
-        tracks = self._settings.tracks
+        tracks = self.settings.tracks
         own = learning_rates(self._gaussians, self.extent)
         return {**own, "translation": tracks.lr_translation, "yaw": tracks.lr_yaw}
 
@@ -206,7 +206,7 @@ class Actors(Part):
         return PartDefinition(self.name, self.extent, self.timeline.tracks)
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
-        tracks = self._settings.tracks
+        tracks = self.settings.tracks
         if not tracks.corrected:
             return {}
         corrections = self.shared["translation"], self.shared["yaw"]

@@ -4,6 +4,7 @@ Units: metres, degrees, m/s. Times are seconds since the scene's first image, wh
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_serializer, model_validator
@@ -135,6 +136,13 @@ Waypoint = tuple[
 """Seconds; metres ahead and metres to the left of the ego vehicle at the scene's first image."""
 
 
+def _require_increasing(path: tuple[Waypoint, ...]) -> None:
+    if not path:
+        raise ValueError("give at least one point in 'path'")
+    if any(later[0] <= earlier[0] for earlier, later in pairwise(path)):
+        raise ValueError("the seconds of 'path' must increase from point to point")
+
+
 class Place(Settings):
     """Places a copy of the track on a given path. Later steps may name the copy."""
 
@@ -152,11 +160,59 @@ class Place(Settings):
 
     @model_validator(mode="after")
     def _times_increase(self) -> "Place":
-        if not self.path:
-            raise ValueError("give at least one point in 'path'")
-        if any(later[0] <= earlier[0] for earlier, later in zip(self.path[:-1], self.path[1:], strict=True)):
-            raise ValueError("the seconds of 'path' must increase from point to point")
+        _require_increasing(self.path)
         return self
+
+
+Offset = tuple[Annotated[float, Field(ge=-500, le=500)], Annotated[float, Field(ge=-100, le=100)]]
+"""Metres ahead and metres to the left of the ego vehicle at the scene's first image."""
+
+
+class Insert(Settings):
+    """Inserts an asset: an object of another drive, or a copy of one of this drive. Later steps may name it."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
+
+    asset: str = Field(min_length=1)
+    """`{scene}/{track}` or `{scene}/{method}/{track}`, whose asset a method of the config has; or an asset's folder:
+    a path that starts with `/`, `./`, `../` or `~`."""
+    name: Id = Field(alias="as")
+    """The object's id: letters, digits, '_', '-' and '.'."""
+    path: tuple[Waypoint, ...] | None = None
+    """Points of its path, in time order."""
+    at: Offset | None = None
+    """The place where it stands, facing as the ego vehicle did."""
+    follow: Id | None = None
+    """The track whose path it takes."""
+    start: float | None = Field(None, ge=-60, le=600)
+    """The second at which it appears where it stands, or where the followed track begins. null = as that track does."""
+    speed: float | None = Field(None, gt=0, le=100)
+    """Its speed (m/s) on the path of the followed track. null = that of the track."""
+    longitudinal: float = Field(0.0, ge=-200, le=200)
+    """Metres that it is further along the path of the followed track."""
+    lateral: float = Field(0.0, ge=-50, le=50)
+    """Metres to the left of the path of the followed track."""
+    yaw: float = Field(0.0, ge=-360, le=360)
+    """Rotation to its left about its vertical axis (degrees)."""
+    phase: float = Field(0.0, ge=-1, le=1)
+    """Cycles by which its gait is ahead."""
+
+    @model_validator(mode="after")
+    def _has_one_path(self) -> "Insert":
+        if sum(given is not None for given in (self.path, self.at, self.follow)) != 1:
+            raise ValueError("give one of 'path', 'at' and 'follow'")
+        _require_increasing(self.path if self.path is not None else ((0.0, 0.0, 0.0),))
+        along = {"speed": self.speed is not None, "longitudinal": self.longitudinal, "lateral": self.lateral}
+        if self.follow is None and any(along.values()):
+            raise ValueError(f"{next(key for key, given in along.items() if given)!r} is for an object with 'follow'")
+        if self.path is not None and self.start is not None:
+            raise ValueError("'path' has the seconds of its points: leave out 'start'")
+        return self
+
+    @property
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """The points of its path; none with `follow`."""
+        return self.path or (() if self.at is None else ((self.start or 0.0, *self.at),))
 
 
 class Rescale(Settings):
@@ -238,7 +294,7 @@ class Ego(Gradual):
         return self
 
 
-Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | Rescale | Recolour | Ego
+Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | Insert | Rescale | Recolour | Ego
 
 
 def _short(value: Any) -> str:
@@ -261,6 +317,7 @@ class Step(Settings):
     swap: Swap | None = None
     duplicate: Duplicate | None = None
     place: Place | None = None
+    insert: Insert | None = None
     rescale: Rescale | None = None
     recolour: Recolour | None = None
     ego: Ego | None = None
@@ -300,8 +357,9 @@ class Step(Settings):
     def begins(self) -> float:
         """The second from which on the step changes something: 0 where it does so from the beginning."""
         change: Any = self.change
-        if isinstance(change, Place):
-            return max(0.0, change.path[0][0])
+        if isinstance(change, Place | Insert):
+            points = change.path if isinstance(change, Place) else change.waypoints
+            return max(0.0, points[0][0] if points else change.start or 0.0)
         return getattr(change, "start", getattr(change, "at", None)) or 0.0
 
 

@@ -40,6 +40,9 @@ class ExportSettings(Settings):
     """:printed: Width in pixels of the images in rendered drive folders. null: that of the training images."""
     drive_labels: tuple[DriveLabel, ...] = ()
     """Label images in rendered drive folders, beside each image: 'depth' and 'instances' (docs/editing.md)."""
+    complete_assets: bool = True
+    """Whether assets of actors get the sides that no camera saw from their other side, mirrored and marked
+    (docs/assets.md)."""
     viewer_images: int = Field(640, ge=0, le=3840)
     """Width in pixels of the recorded images in viewer.html, one JPEG per key frame, about 30 KB each at 640. 0 = none.
     """
@@ -97,6 +100,13 @@ class DriveJob(Settings):
     labels: tuple[DriveLabel, ...] = ()
     edit: Edit | None = None
     trajectory: TrajectorySettings | None = None
+
+
+class AssetsJob(Settings):
+    """All settings that determine the assets of a method."""
+
+    holdout: HoldoutSettings
+    complete: bool = True
 
 
 class ScanFolderJob(Settings):

@@ -1,15 +1,30 @@
 """The actors of an edited drive: the recorded actors after every step of an edit."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import ConfigError
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.track_references import why_fixed
 from drivesplat.scene.tracks import matching_ids, short_ids
-from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
+from drivesplat.settings.edit import (
+    Duplicate,
+    Edit,
+    Insert,
+    Place,
+    Recolour,
+    Rescale,
+    Reverse,
+    Shift,
+    Speed,
+    Step,
+    Stop,
+    Swap,
+)  # fmt: skip
 from drivesplat.trajectories.actor_path import ActorPath, recorded_path
 from drivesplat.trajectories.motion import Motion
 from drivesplat.trajectories.steps import (
@@ -33,27 +48,59 @@ TO_GREY = np.full((3, 3), 1.0 / 3.0)
 """Maps a colour to the grey of its mean."""
 
 
+SPEED_STEP = 0.1
+"""Seconds over which the speed on a path is measured."""
+MAX_SPEED = {
+    ObjectClass.PEDESTRIAN: 8.0,
+    ObjectClass.ANIMAL: 20.0,
+    ObjectClass.BICYCLE: 20.0,
+    ObjectClass.RIDER: 20.0,
+}
+"""The speed in m/s that an inserted object of a class may have."""
+MAX_SPEED_OF_VEHICLES = 90.0
+"""That of other classes."""
+
+
+@dataclass(frozen=True)
+class Insertable:
+    """What a step that inserts an asset needs of it: its class and the dataset's own category, `size` (3,) in metres,
+    and the directions from which it was `seen`, radians to the left of its front."""
+
+    object_class: ObjectClass
+    category: str
+    size: np.ndarray
+    seen: np.ndarray
+
+
+NOTHING: Mapping[str, Insertable] = MappingProxyType({})
+
+
 @dataclass(frozen=True)
 class EditedActor:
     """An actor of an edited drive: `id` is a track's or the name of a duplicate. It has the Gaussians of the track
     `source`, scaled by `scale` about the box centre to `size` (3,): length, width, height in metres, their
     RGB colours mapped by `color_matrix` (3, 3; None: as trained), and a gait that is ahead by `phase` cycles. Unless
-    `edited` it is as recorded."""
+    `edited` it is as recorded. An inserted asset has its own name as its source, and `seen`: the directions from which
+    its Gaussians were seen, radians to the left of its front (None: as the track `source` was)."""
 
     id: str
     source: str
     scale: float
+    object_class: ObjectClass
     category: str
     size: np.ndarray
     edited: bool
     path: ActorPath = field(repr=False)
     color_matrix: np.ndarray | None = None
     phase: float = 0.0
+    seen: np.ndarray | None = None
 
     @classmethod
-    def recorded(cls, id: str, category: str, size: np.ndarray, motion: Motion) -> "EditedActor":
+    def recorded(
+        cls, id: str, object_class: ObjectClass, category: str, size: np.ndarray, motion: Motion
+    ) -> "EditedActor":
         """An actor before any edit."""
-        return cls(id, id, 1.0, category, size, False, recorded_path(motion, float(size[2])))
+        return cls(id, id, 1.0, object_class, category, size, False, recorded_path(motion, float(size[2])))
 
     def present(self, times: np.ndarray) -> np.ndarray:
         """Whether the actor is present at `times` (n,) in film seconds: (n,) bool."""
@@ -73,16 +120,18 @@ class EditedActor:
 
 def edited_actors(
     actors: Sequence[EditedActor], edit: Edit, where: str, other_ids: Collection[str] = (),
-    ego_to_world: np.ndarray = ORIGIN,
+    ego_to_world: np.ndarray = ORIGIN, insertable: Mapping[str, Insertable] = NOTHING,
 ) -> list[EditedActor]:  # fmt: skip
-    """The recorded `actors` after all steps of an edit: in their order without the removed ones, then the duplicates.
+    """The recorded `actors` after all steps of an edit: in their order without the removed ones, then the duplicates
+    and the inserted ones.
 
     `other_ids` are those of tracks that cannot be edited; no duplicate may have one. `ego_to_world` (n, 4, 4) are the
-    ego poses of the drive, for steps that place a copy. Raises ConfigError, one line that
+    ego poses of the drive, for steps that place an object; `insertable` has the assets of steps that insert one, by
+    their names there. Raises ConfigError, one line that
     starts with `where` (the scene and the edit), if a step names an unknown track, changes nothing or contradicts an
     earlier step.
     """
-    state = _EditState({actor.id: actor for actor in actors}, {}, frozenset(other_ids), ego_to_world)
+    state = _EditState({actor.id: actor for actor in actors}, {}, frozenset(other_ids), ego_to_world, insertable)
     for number, step in enumerate(edit.steps, start=1):
         try:
             state = _after_step(state, step, number)
@@ -98,12 +147,13 @@ class _StepError(Exception):
 @dataclass(frozen=True)
 class _EditState:
     """The actors after some steps by id; the removed ones by id, with the number of the step that removed them; ids of
-    other tracks; the ego poses (n, 4, 4)."""
+    other tracks; the ego poses (n, 4, 4); what can be inserted."""
 
     actors: dict[str, EditedActor]
     removed: dict[str, tuple[int, EditedActor]]
     other_ids: frozenset[str]
     ego_to_world: np.ndarray
+    insertable: Mapping[str, Insertable]
 
     def find(self, name: str, also_removed: bool = False) -> EditedActor:
         """The actor with that id, or the only one whose id starts with it; perhaps `also_removed` ones."""
@@ -138,6 +188,8 @@ def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
     change = step.change
     if step.kind == "ego":
         return state
+    if isinstance(change, Insert):
+        return state.with_actors(_inserted(state, change))
     actor = state.find(change.track, also_removed=step.kind == "place")
     match change:
         case Swap():
@@ -150,7 +202,7 @@ def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
             return _copied(state, actor, change, apply_duplicate(actor.path, change))
         case Place():
             height = float(actor.size[2])
-            path = recorded_path(placed_motion(change, state.ego_to_world, height), height)
+            path = recorded_path(placed_motion(change.path, state.ego_to_world, height, change.yaw), height)
             return _copied(state, actor, change, path)
         case Rescale():
             scale, size = actor.scale * change.factor, actor.size * change.factor
@@ -197,13 +249,61 @@ def _require_present(path: ActorPath, second: float | None, key: str, may_preced
     )
 
 
-def _copied(state: _EditState, actor: EditedActor, copy: Duplicate | Place, path: ActorPath) -> _EditState:
+def _inserted(state: _EditState, change: Insert) -> EditedActor:
+    """The object that a step inserts."""
+    _require_free(state, change.name)
+    asset = state.insertable.get(change.asset)
+    if asset is None:
+        raise _StepError(f"the asset {change.asset!r} was not read; here are: {', '.join(state.insertable) or 'none'}")
+    height = float(asset.size[2])
+    if change.follow is None:
+        path = recorded_path(placed_motion(change.waypoints, state.ego_to_world, height, change.yaw), height)
+    else:
+        path = _followed(state.find(change.follow, also_removed=True), change)
+    _require_possible_speed(path, asset)
+    category, seen = asset.category, asset.seen
+    return EditedActor(
+        change.name, change.asset, 1.0, asset.object_class, category, asset.size, True, path, None, change.phase, seen
+    )
+
+
+def _followed(actor: EditedActor, change: Insert) -> ActorPath:
+    """The path of an object that follows an actor."""
+    path = actor.path
+    delay = 0.0 if change.start is None else change.start - path.begin
+    beside = {"longitudinal": change.longitudinal, "lateral": change.lateral, "delay": delay}
+    path = apply_duplicate(path, Duplicate.model_construct(track=change.name, name=change.name, phase=0.0, **beside))
+    if change.speed is not None:
+        path = apply_speed(path, Speed(track=change.name, to=change.speed))
+    if change.yaw:
+        path = apply_shift(path, Shift(track=change.name, yaw=change.yaw))
+    return path
+
+
+def _require_possible_speed(path: ActorPath, asset: Insertable) -> None:
+    times = np.arange(path.begin, min(path.end, path.begin + LOOKAHEAD) + SPEED_STEP, SPEED_STEP)
+    places = path.poses(times, float(asset.size[2]))[:, :2, 3]
+    fastest = float((np.linalg.norm(np.diff(places, axis=0), axis=1) / SPEED_STEP).max(initial=0.0))
+    limit = MAX_SPEED.get(asset.object_class, MAX_SPEED_OF_VEHICLES)
+    if fastest > limit:
+        raise _StepError(
+            f"its path is driven at up to {fastest:.1f} m/s, and a {asset.object_class.value} moves at most at "
+            f"{limit:g} m/s: give its points more time, or another 'speed'"
+        )
+
+
+def _require_free(state: _EditState, name: str) -> None:
+    """Raises _StepError for the name of a copy that another object has."""
     taken = [*state.actors, *state.removed]
-    if copy.name in taken:
+    if name in taken:
         used = ", ".join(short_ids(taken).values())
-        raise _StepError(f"the name {copy.name!r} in 'as' is already used; names in use: {used}")
-    if copy.name in state.other_ids:
-        raise _StepError(f"the name {copy.name!r} in 'as' is the id of another track; choose another name")
+        raise _StepError(f"the name {name!r} in 'as' is already used; names in use: {used}")
+    if name in state.other_ids:
+        raise _StepError(f"the name {name!r} in 'as' is the id of another track; choose another name")
+
+
+def _copied(state: _EditState, actor: EditedActor, copy: Duplicate | Place, path: ActorPath) -> _EditState:
+    _require_free(state, copy.name)
     return state.with_actors(replace(actor, id=copy.name, path=path, edited=True, phase=actor.phase + copy.phase))
 
 

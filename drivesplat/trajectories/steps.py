@@ -5,13 +5,13 @@ position and offsets, so that a stopped actor does not slide. `place` has a path
 the ground beside the ego vehicle's path.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from drivesplat.settings.edit import Duplicate, Place, Reverse, Shift, Speed, Stop
+from drivesplat.settings.edit import Duplicate, Reverse, Shift, Speed, Stop, Waypoint
 from drivesplat.trajectories.actor_path import ActorPath, PathOffsets, PathPosition
 from drivesplat.trajectories.motion import Motion
 from drivesplat.trajectories.transition import Transition
@@ -116,13 +116,13 @@ def apply_duplicate(path: ActorPath, duplicate: Duplicate) -> ActorPath:
     return apply_shift(delayed, Shift(track=duplicate.name, **offset))
 
 
-def placed_motion(place: Place, ego_to_world: np.ndarray, height: float) -> Motion:
-    """The motion of a box `height` metres high along the path of `place`, a spline through its points.
+def placed_motion(path: Sequence[Waypoint], ego_to_world: np.ndarray, height: float, yaw: float = 0.0) -> Motion:
+    """The motion of a box `height` metres high along a spline through points, turned to the left by `yaw` degrees.
 
     `ego_to_world` (n, 4, 4) are the ego poses of the drive: its first is the frame of the points, and the nearest to
     each place has the ground's height and slope there. The box faces the direction of its path.
     """
-    points = np.array(place.path)
+    points = np.array(path)
     if len(points) == 1:
         times = points[0, :1] + np.array([0.0, STANDS_S])
         positions = np.repeat(points[:, 1:], 2, axis=0)
@@ -135,7 +135,7 @@ def placed_motion(place: Place, ego_to_world: np.ndarray, height: float) -> Moti
         known = moving[np.maximum(np.searchsorted(moving, np.arange(len(positions)), side="right") - 1, 0)]
         headings = np.arctan2(steps[known, 1], steps[known, 0])
     start, poses = ego_to_world[0], np.tile(np.eye(4), (len(positions), 1, 1))
-    for pose, position, heading in zip(poses, positions, headings + np.radians(place.yaw), strict=True):
+    for pose, position, heading in zip(poses, positions, headings + np.radians(yaw), strict=True):
         at = start[:3, 3] + start[:3, :3] @ np.array([*position, 0.0])
         nearest = ego_to_world[np.argmin(np.linalg.norm(ego_to_world[:, :2, 3] - at[:2], axis=1))]
         up = nearest[:3, 2]

@@ -56,7 +56,7 @@ def _step(step: Any, where: str) -> Step:
         raise ConfigError(f"{where}: there is no step {kind!r}; there are: {kinds}")
     where = f"{where} ({kind})"
     if not isinstance(fields, dict):
-        example = "lateral: 2.0" if kind == "ego" else "track: 6e5c, ..."
+        example = {"ego": "lateral: 2.0", "insert": "asset: ..."}.get(kind, "track: 6e5c, ...")
         raise ConfigError(f"{where} is {quoted(fields)}; it is a mapping: {kind}: {{{example}}}")
     for key in fields:
         if not isinstance(key, str):
@@ -64,7 +64,7 @@ def _step(step: Any, where: str) -> Step:
     record = Step.model_fields[kind].annotation.__args__[0]
     keys = [field.alias or name for name, field in record.model_fields.items()]
     checked = Step(**{kind: validated(record, fields, f"{where}: ", keys=keys)})
-    copy = checked.duplicate or checked.place
+    copy = checked.duplicate or checked.place or checked.insert
     if copy is not None:
         require_edit_name(copy.name, f"{where}: 'as'")
         if copy.name in RESERVED:

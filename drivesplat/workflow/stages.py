@@ -17,7 +17,7 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.discover import DiscoverJob
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
-from drivesplat.settings.export import DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
+from drivesplat.settings.export import AssetsJob, DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -234,7 +234,8 @@ def _world(at: JobScope) -> dict[str, Any]:
     """Raises ConfigError where an edit whose truth is asked for does not exist."""
     world, edits = at.dataset.world, scene_edits(at.config, at.scene)
     assert world is not None
-    of_labels = fitting_edits(at.config, at.scene, "annotated")
+    fitting = fitting_edits(at.config, at.scene, "annotated")
+    of_labels = [name for name, edit in fitting.items() if not any(step.insert for step in edit.steps)]
     wanted = of_labels if world.truth.edits is None else world.truth.edits
     for name in wanted:
         if name not in edits:
@@ -341,6 +342,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     ),
     "export_viewer": (ViewerJob, _viewer),
     "export_colmap": (Settings, _nothing),
+    "actor_assets": (AssetsJob, lambda at: {"complete": at.config.export.complete_assets}),
     "export_spz": (Settings, _nothing),
     "export_sog": (Settings, _nothing),
 }

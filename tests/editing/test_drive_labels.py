@@ -26,6 +26,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.readers.drive.format import read_drive
 from drivesplat.rendering.frames import film_frame
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.device import DeviceSettings
@@ -157,7 +158,7 @@ def test_visibility_is_a_level_of_nuscenes_and_follows_what_hides_an_object():
     side = np.arange(-0.9, 0.95, 0.15)
     its = [[20.0 + x, y, z] for x in side for y in side for z in (-0.8, 0.0, 0.8)]
     motion = motion_through([0.0, 1.0], [[20.0, 0.0, 0.0]] * 2)
-    block = EditedActor.recorded("block", "vehicle.car", np.array([2.0, 2.0, 2.0]), motion)
+    block = EditedActor.recorded("block", ObjectClass.CAR, "vehicle.car", np.array([2.0, 2.0, 2.0]), motion)
     wall = [[10.0, y, z] for y in np.arange(-3.0, 0.0, 0.1) for z in np.arange(-2.0, 2.0, 0.1)]
 
     def visible(places: Any, view: View) -> list[float]:

@@ -30,6 +30,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.panels import Panels
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
@@ -296,6 +297,6 @@ def test_a_camera_collides_inside_the_box_of_a_present_actor():
     seconds = np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
     across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
-    car = EditedActor.recorded("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
+    car = EditedActor.recorded("a", ObjectClass.CAR, "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
     found = warn_of_collisions(edited_actors([car], BESIDE, ""), cameras, seconds, "")
     assert found.tolist() == [False, True, True, False, True, False]

@@ -14,6 +14,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanPicture, ScanView
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rasterization.scans import RayGrid
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
 
@@ -70,7 +71,7 @@ def view(left: float = 0.0, azimuths: Any = AHEAD, offset_s: float = 0.0) -> Sca
 def edited(model: SplatModel, *steps: dict[str, Any], time: float = TIME) -> Gaussians:
     """The Gaussians of the model after these steps, as a LiDAR needs them."""
     (group,) = (group for group in model.rigid_groups(0.0).values() if group.motion is not None)
-    recorded = [EditedActor.recorded(CAR, "vehicle.car", SIZE, group.motion)]
+    recorded = [EditedActor.recorded(CAR, ObjectClass.CAR, "vehicle.car", SIZE, group.motion)]
     actors = edited_actors(recorded, Edit.model_validate({"steps": steps}), "here")
     (there,) = actor_placements(actors, np.array([time]))
     return sampled_with(model, time, there, EVERYTHING)

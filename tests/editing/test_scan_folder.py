@@ -64,8 +64,8 @@ def simulated(
 ) -> tuple[SimulatedScan, list[str]]:
     """One scan, and the ids of the objects that it may meet."""
     drive = driven(scene, model, replace(records, scans=records.scans[number : number + 1]), job)
-    (found,) = drive.simulated(model, SPREAD, CPU)
-    return found, [item["id"] for item in drive.objects(scene)]
+    (found,) = drive.simulated(SPREAD, CPU)
+    return found, [item["id"] for item in drive.objects()]
 
 
 def met(found: SimulatedScan, names: list[str], name: str) -> np.ndarray:

@@ -13,8 +13,8 @@ from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import DriveSplatError, ResultError
 from drivesplat.export.compressed import SOG_PROGRAM, export_sog, export_spz
-from drivesplat.export.splat_ply import read_splat_ply, write_splat_ply
 from drivesplat.model.gaussians import Gaussians, with_sh_degree
+from drivesplat.model.splat_ply import read_splat_ply, write_splat_ply
 
 COUNT = 200
 

@@ -187,7 +187,7 @@ def test_thinned_or_dropped_gaussians_leave_the_others_their_own_shapes(people, 
     np.testing.assert_array_equal(kept.shapes.means, whole.shapes.means[:, rows])
     np.testing.assert_array_equal(kept.shapes.quats, whole.shapes.quats[:, rows])
     params = {name: value.detach().clone() for name, value in people.params.items()}
-    broken = Deformable(params, people.timeline.tracks, people._settings, GaussianSettings())
+    broken = Deformable(params, people.timeline.tracks, people.settings, GaussianSettings())
     with torch.no_grad():
         broken.params["opacities"][4] = torch.nan
     finite = trained_groups(SplatModel([broken], None), scene, NO_TIMES)[TURNING]

@@ -12,11 +12,11 @@ from helpers.records import EMPTY_CHECKPOINT
 
 from drivesplat.export import splat_asset
 from drivesplat.export.splat_asset import SplatFiles, export_splat
-from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.export.trained_parts import trained_gaussians, trained_groups
-from drivesplat.export.unique_names import unique_names
+from drivesplat.io.unique_names import unique_names
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.splat_ply import read_splat_ply
 from drivesplat.settings.export import SplatJob
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}

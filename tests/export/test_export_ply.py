@@ -11,12 +11,12 @@ from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import ResultError
 from drivesplat.export.splat_asset import SplatFiles, export_splat
-from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.settings.export import SplatJob
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 

@@ -13,13 +13,13 @@ from pxr import Usd, UsdGeom
 from drivesplat.errors import ResultError
 from drivesplat.export.far_gaussians import MAX_CHANGE, find_far, read_far, within_reach
 from drivesplat.export.splat_asset import SplatFiles, export_splat
-from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.export.usd import export_usd
 from drivesplat.io.array_file import write_arrays
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.reach import reach_of
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.splat_ply import read_splat_ply
 from drivesplat.model.view import View
 from drivesplat.settings.export import ExportJob, SplatJob
 from drivesplat.settings.train import TrainSettings

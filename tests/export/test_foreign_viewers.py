@@ -21,11 +21,11 @@ from helpers.loopback import served
 from drivesplat.export.compressed import export_spz
 from drivesplat.export.far_gaussians import find_far, within_reach
 from drivesplat.export.splat_asset import SplatFiles, export_splat
-from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.splat_ply import read_splat_ply
 from drivesplat.settings.export import MAX_DISTANCE, SplatJob
 from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.settings.train_objects import ActorSettings

@@ -16,12 +16,12 @@ from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.lpips_map import load_alexnet
 from drivesplat.evaluation.scene_metrics import read_baselines, read_evaluations
 from drivesplat.export.far_gaussians import read_far
-from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.point_cloud import read_ply
 from drivesplat.io.storage import read_json
 from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.objects.record import read_discovered
 from drivesplat.model.checkpoint import read_checkpoint
+from drivesplat.model.splat_ply import read_splat_ply
 from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.provenance.file_digests import checked_digest, record_output
 from drivesplat.readers.truth import read_truth

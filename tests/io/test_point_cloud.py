@@ -5,8 +5,8 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import ResultError
-from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.point_cloud import PointCloud, read_ply, read_positions, write_ply
+from drivesplat.model.splat_ply import read_splat_ply
 from drivesplat.readers.drive.sweep_file import read_file
 
 

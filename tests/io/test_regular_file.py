@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from drivesplat.errors import DriveSplatError, ResultError
-from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.array_file import read_arrays
 from drivesplat.io.point_cloud import read_ply, read_positions
 from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import read_json
 from drivesplat.io.yaml_file import read_yaml
+from drivesplat.model.splat_ply import read_splat_ply
 from drivesplat.readers.drive.format import structure_of
 from drivesplat.readers.drive.nerfstudio_file import content_of
 from drivesplat.readers.drive.sweep_file import read_file

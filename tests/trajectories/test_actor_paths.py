@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import ConfigError
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
@@ -24,7 +25,9 @@ def driver(pose_at, key_frames=range(21), name="car", size=SIZE, category="vehic
     ends = np.flatnonzero(np.diff(indices) != 1)
     runs = zip([0, *(ends + 1).tolist()], [*ends.tolist(), len(indices) - 1], strict=True)
     poses = np.stack([pose_at(0.5 * i) for i in key_frames])
-    return EditedActor.recorded(name, category, size, Motion(0.5 * indices, poses, tuple(runs), 0.25))
+    return EditedActor.recorded(
+        name, ObjectClass.VEHICLE, category, size, Motion(0.5 * indices, poses, tuple(runs), 0.25)
+    )
 
 
 def facing(yaw: float, place, pitch: float = 0.0) -> np.ndarray:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from drivesplat.errors import ConfigError
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.settings.edit import Edit, Recolour
 from drivesplat.trajectories.edited_actors import EditedActor, color_matrix, edited_actors
 from drivesplat.trajectories.motion import Motion
@@ -17,7 +18,11 @@ def recorded(name: str, first: int = 4, last: int = 12) -> EditedActor:
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, 0, 3] = 10.0 * times
     return EditedActor.recorded(
-        name, "vehicle.car", np.array([4.0, 2.0, 1.5]), Motion(times, poses, ((0, len(times) - 1),), 0.25)
+        name,
+        ObjectClass.CAR,
+        "vehicle.car",
+        np.array([4.0, 2.0, 1.5]),
+        Motion(times, poses, ((0, len(times) - 1),), 0.25),
     )
 
 

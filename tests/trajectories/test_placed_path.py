@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from drivesplat.errors import ConfigError
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.edit import Edit, Place
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
@@ -34,7 +35,7 @@ def heading(poses: np.ndarray) -> np.ndarray:
 
 def test_a_copy_drives_through_its_points_in_the_first_ego_frame():
     ego = ego_poses(yaw=90.0)
-    motion = placed_motion(place([[1.0, 30.0, 3.5], [3.0, 10.0, 3.5], [4.0, 0.0, 3.5]]), ego, 1.5)
+    motion = placed_motion(place([[1.0, 30.0, 3.5], [3.0, 10.0, 3.5], [4.0, 0.0, 3.5]]).path, ego, 1.5)
     poses = motion.poses(np.array([1.0, 2.0, 3.0, 4.0]))
     # the ego vehicle drives along y: ahead is y, to its left is -x
     np.testing.assert_allclose(poses[:, :2, 3], [[96.5, 80.0], [96.5, 70.0], [96.5, 60.0], [96.5, 50.0]], atol=0.01)
@@ -46,7 +47,7 @@ def test_a_bent_path_turns_the_copy_into_its_direction():
     """Three points of a circle of radius 20 m about the left: its spline turns by about the circle's angle."""
     angles = np.radians([0.0, 45.0, 90.0])
     points = [[float(t), 20.0 * np.sin(a), 20.0 - 20.0 * np.cos(a)] for t, a in zip((0, 2, 4), angles, strict=True)]
-    poses = placed_motion(place(points), ego_poses(), 1.5).poses(np.linspace(0.0, 4.0, 41))
+    poses = placed_motion(place(points).path, ego_poses(), 1.5).poses(np.linspace(0.0, 4.0, 41))
     assert heading(poses)[20] == pytest.approx(45.0, abs=2.0)
     assert (np.diff(heading(poses)) > -1e-6).all()
     step = np.diff(poses[:, :2, 3], axis=0)
@@ -55,7 +56,7 @@ def test_a_bent_path_turns_the_copy_into_its_direction():
 
 
 def test_yaw_turns_the_copy_beside_its_direction():
-    poses = placed_motion(place([[0.0, 0.0, 0.0], [4.0, 20.0, 0.0]], yaw=30.0), ego_poses(), 1.5).poses(np.array([2.0]))
+    poses = placed_motion([(0.0, 0.0, 0.0), (4.0, 20.0, 0.0)], ego_poses(), 1.5, yaw=30.0).poses(np.array([2.0]))
     np.testing.assert_allclose(heading(poses), 30.0, atol=1e-6)
 
 
@@ -63,7 +64,7 @@ def test_yaw_turns_the_copy_beside_its_direction():
 @pytest.mark.parametrize("yaw", [0.0, 120.0])
 def test_on_a_slope_a_copy_stands_on_the_ground_and_tilts_with_it(yaw, slope):
     ego = ego_poses(yaw, slope)
-    motion = placed_motion(place([[0.0, 40.0, 3.5], [4.0, 10.0, 3.5]]), ego, 1.5)
+    motion = placed_motion(place([[0.0, 40.0, 3.5], [4.0, 10.0, 3.5]]).path, ego, 1.5)
     poses = motion.poses(np.linspace(0.0, 4.0, 9))
     up = np.array([0.0, 0.0, 1.0]) - slope * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw)), 0.0])
     up /= np.linalg.norm(up)
@@ -75,7 +76,7 @@ def test_on_a_slope_a_copy_stands_on_the_ground_and_tilts_with_it(yaw, slope):
 
 
 def test_a_copy_with_one_point_stands_as_the_ego_vehicle_did():
-    motion = placed_motion(place([[2.0, 25.0, -3.5]]), ego_poses(yaw=30.0), 1.5)
+    motion = placed_motion(place([[2.0, 25.0, -3.5]]).path, ego_poses(yaw=30.0), 1.5)
     poses = motion.poses(np.array([0.0, 2.0, 9.0, 500.0]))
     np.testing.assert_allclose(poses, np.tile(poses[:1], (4, 1, 1)), atol=1e-9)
     np.testing.assert_allclose(heading(poses), 30.0, atol=1e-6)
@@ -88,7 +89,9 @@ def recorded(name: str, annotations: int = 9) -> EditedActor:
     times = 0.5 * np.arange(annotations)
     poses = np.tile(np.eye(4), (annotations, 1, 1))
     poses[:, :3, 3] = np.stack([10.0 * times, np.zeros(annotations), np.full(annotations, 0.75)], axis=-1)
-    return EditedActor.recorded(name, "vehicle.car", SIZE, Motion(times, poses, ((0, annotations - 1),), 0.25))
+    return EditedActor.recorded(
+        name, ObjectClass.CAR, "vehicle.car", SIZE, Motion(times, poses, ((0, annotations - 1),), 0.25)
+    )
 
 
 def edited(*steps: dict, others: tuple[str, ...] = ()) -> list[EditedActor]:

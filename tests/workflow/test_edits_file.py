@@ -9,6 +9,7 @@ from helpers import REPOSITORY
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit, Step
 from drivesplat.settings.world import WorldSettings
@@ -31,6 +32,7 @@ edits:
     - swap: {track: 7a, with: 8b}
     - duplicate: {track: 7a, as: twin, longitudinal: -12}
     - place: {track: 7a, as: placed, path: [[0, 10, 3.5], [4.5, -20, 3.5]], yaw: 5}
+    - insert: {asset: demo_b/7a, as: stranger, follow: 7a, start: 2, speed: 5, lateral: 1.5, yaw: 5, phase: 0.5}
     - rescale: {track: twin, factor: 1.3}
     - recolour: {track: twin, colour: firebrick, value: 1.5}
     - ego: {lateral: 2.0, speed: 0.5}
@@ -103,7 +105,7 @@ def test_a_file_of_another_form_is_refused(tmp_path, text, expected):
     assert refusal(text, tmp_path).startswith(expected)
 
 
-KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, place, rescale, recolour, ego"
+KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, place, insert, rescale, recolour, ego"
 COLOURS = "at least one of 'hue', 'saturation', 'value' and 'colour'"
 NAME = "cannot name a file: use letters, digits, '_', '-' and '.'"
 
@@ -181,7 +183,7 @@ def demo_actors() -> list[EditedActor]:
     recorder, times = Recorder(WorldSettings()), 0.5 * np.arange(20)
     return [
         EditedActor.recorded(
-            instance_token("demo", thing.name), thing.category, thing.size,
+            instance_token("demo", thing.name), ObjectClass.CAR, thing.category, thing.size,
             Motion(times, np.stack([recorder.box_to_global(thing, t) for t in times]), ((0, 19),), 0.25),
         )
         for thing in recorder.objects

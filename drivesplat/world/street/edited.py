@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
 from drivesplat.trajectories.ego_path import edited_poses
@@ -54,7 +55,10 @@ def edited(street: Street, scene: str, edit: Edit, name: str, seconds: float, fi
         id: Motion(times - film_start, item.box_poses(times), ((0, len(times) - 1),), 0.5 / MOTION_HZ)
         for id, item in editable.items()
     }
-    actors = [EditedActor.recorded(id, item.category or "", item.size, motions[id]) for id, item in editable.items()]
+    actors = [
+        EditedActor.recorded(id, object_class(item.category or ""), item.category or "", item.size, motions[id])
+        for id, item in editable.items()
+    ]
     ego = street.ego.poses(np.arange(0.0, seconds, 0.1) + film_start)
     where, others = f"scene {scene}, edit {name!r}", by_id.keys() - editable.keys()
     changed = edited_actors(actors, edit, where, others, ego)

@@ -8,8 +8,10 @@ of three floats, supports no note, and drops every Gaussian if a single opacity 
 
 import json
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,9 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from drivesplat.errors import ResultError
-from drivesplat.export.compressed_ply import unpacked
 from drivesplat.io.point_cloud import read_ply_data
 from drivesplat.io.storage import atomic_write, canonical_json, unreadable
+from drivesplat.model.compressed_ply import unpacked
 from drivesplat.model.gaussians import Gaussians
 
 _NOTE = "drivesplat "
@@ -27,10 +29,14 @@ _MAX_HEADER_BYTES = 10_000
 TINY = torch.finfo(torch.float32).tiny
 ALMOST_ONE = 1.0 - 2.0**-24
 """The float32 before 1: the largest opacity with a finite logit."""
+NO_EXTRA: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
-def write_splat_ply(path: str | Path, gaussians: Gaussians, note: dict[str, Any]) -> None:
-    """Writes all of `gaussians`, with `note` as JSON in a comment of the header.
+def write_splat_ply(
+    path: str | Path, gaussians: Gaussians, note: dict[str, Any], extra: Mapping[str, np.ndarray] = NO_EXTRA
+) -> None:
+    """Writes all of `gaussians`, with `note` as JSON in a comment of the header, and `extra` properties (n,) after the
+    others.
 
     Opacities are clamped to values with a finite logit, quaternions are normalised. The note should not exceed 8 kB:
     antimatter15's viewer searches for the end of the header in the first 10 kB. Raises ResultError naming `path`.
@@ -47,6 +53,11 @@ def write_splat_ply(path: str | Path, gaussians: Gaussians, note: dict[str, Any]
     ]
     values = torch.cat([column.detach().cpu().float() for column in columns], dim=1)
     vertices = values.numpy().view([(name, "<f4") for name in _property_names(coefficients)])[:, 0]
+    if extra:
+        plain, more = vertices, [(name, values.dtype.str) for name, values in extra.items()]
+        vertices = np.empty(count, dtype=[*plain.dtype.descr, *more])
+        for name, values in (*((name, plain[name]) for name in plain.dtype.names), *extra.items()):
+            vertices[name] = values
     # SIBR expects "element vertex" in the header's third line: the comment stands after it, as the element's own.
     element = PlyElement.describe(vertices, "vertex", comments=[_NOTE + canonical_json(note)])
     with atomic_write(path) as file:
