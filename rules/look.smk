@@ -346,3 +346,40 @@ rule lidar_film:
         code=plan.code("lidar_film"),
     script:
         "../workflow_scripts/lidar_film.py"
+
+
+rule edit_truth:
+    """
+    Compares an edited drive with the truth of a synthetic world in which the edit happened: what the objects that it
+    inserts are worth, their shadows, and all else.
+    """
+    input:
+        scene=plan.annotated_scene,
+        truth=plan.truth,
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        parser=plan.of_tracks("parser.npz"),
+        masks="<results>/{scene}/masks/masks.json",
+        assets=plan.inserted_assets,
+    output:
+        figures="<results>/{scene}/{method}/edit_truth/{edit}.json",
+        picture="<results>/{scene}/{method}/edit_truth/{edit}.png",
+    log:
+        "<logs>/{scene}/{method}/edit_truth_{edit}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/edit_truth_{edit}.tsv"
+    wildcard_constraints:
+        scene=plan.known(plan.worlds.values()),
+        method=plan.known(plan.methods_with_actors),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=4)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=30,
+    params:
+        settings=plan.settings("edit_truth"),
+        code=plan.code("edit_truth"),
+    script:
+        "../workflow_scripts/edit_truth.py"

@@ -26,6 +26,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
+from drivesplat.readers.nuscenes.tokens import token
 from drivesplat.readers.truth import (
     DEPTH_LIMIT,
     DEPTH_UNITS_PER_METRE,
@@ -97,6 +98,15 @@ class DriveTruth:
         """The names of the true class images of a camera's recorded key frames, by the indices of its images."""
         recorded = self.truth.recorded(camera)
         return {index: truth.classes for index, truth in self.frames(recorded)} if recorded else {}
+
+    def number_of(self, name: str) -> int:
+        """The number in instance images of an object that an edit adds under this name; -1 without any."""
+        own = token(self.truth.scene, "instance", name)
+        return next((int(number) for number, known in self.truth.instances.items() if known == own), -1)
+
+    def instances(self, name: str, size: tuple[int, int]) -> np.ndarray:
+        """The true instance image (h, w) at `size` (width, height) by nearest neighbour: keys of `Truth.instances`."""
+        return self._values(name, np.uint8, "L", "an instance image", size)
 
     def surfaces(self, name: str, static: np.ndarray) -> dict[str, np.ndarray]:
         """The masks (h, w) bool of SURFACES among the `static` pixels (h, w) bool, by the class image `name`."""

@@ -110,6 +110,10 @@ class Truth:
         """The view of a camera without the vehicle ahead."""
         return next((view for view in self._of(camera) if view.without is not None), None)
 
+    def edited(self, camera: str, edit: str) -> list[TruthView]:
+        """The views of a camera after an edit."""
+        return [view for view in self.views if view.camera == camera and view.edit == edit]
+
     def scans_of(self, left_m: float = 0.0, without: str | None = None) -> dict[str, TruthScan]:
         """The scans of the drive as it was, from so far to the left and without that instance, by the token of their
         sample_data."""

@@ -142,11 +142,20 @@ class WorldSettings(Settings):
         return (self.key_frames - 1) / self.key_frame_hz
 
 
+class WorldDonor(Settings):
+    """An object of a synthetic world: that of the drive `scene` whose track begins with `track`."""
+
+    scene: str
+    track: str
+    world: WorldSettings
+
+
 class WorldJob(Settings):
-    """Settings of the rule `demo_world`: name of the scene, name of the folder of tables, the street, and the edits
-    whose truth is written."""
+    """Settings of the rule `demo_world`: name of the scene, name of the folder of tables, the street, the edits
+    whose truth is written, and the objects that they insert, by the names of their assets."""
 
     scene: str
     version: str
     world: WorldSettings
     edits: dict[str, Edit] = Field(default_factory=dict)
+    donors: dict[str, WorldDonor] = Field(default_factory=dict)

@@ -8,6 +8,8 @@ from drivesplat.settings.edit import Edit
 from drivesplat.workflow.edits_file import read_edits
 
 EDITS, TRAJECTORIES = "edits", "trajectories"
+EDIT_TRUTH = "edit_truth"
+"""The folder of comparisons of edits with the truth of a synthetic world."""
 """Kinds of folders of drives and of scans, and the folders of a method in which they lie."""
 QUAD = "quad"
 """The folder of a method with its films of four panels."""

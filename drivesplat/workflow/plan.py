@@ -21,7 +21,15 @@ from drivesplat.readers.nuscenes.download.destination import download_job, requi
 from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.tracks import OTHER_TRACKS
-from drivesplat.workflow.film_names import EDITS, TRAJECTORIES, no_such_edit, no_such_film, scene_edits
+from drivesplat.workflow.film_names import (
+    EDIT_TRUTH,
+    EDITS,
+    QUAD,
+    TRAJECTORIES,
+    no_such_edit,
+    no_such_film,
+    scene_edits,
+)
 from drivesplat.workflow.film_pages import FilmPages
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
@@ -147,7 +155,7 @@ class Plan(JobResources):
             if scene not in self.worlds.values():
                 raise ConfigError(f"{path[0]} needs the truth of a synthetic world, and scene {scene} is none")
             return
-        edit = Path(path[-1]).stem if len(path) == 2 and path[0] in ("edits", "quad") else None
+        edit = Path(path[-1]).stem if len(path) == 2 and path[0] in (EDITS, QUAD, EDIT_TRUTH) else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
         of_parts = film == PARTS_FILM or (trajectory is not None and trajectory.parts != "all")

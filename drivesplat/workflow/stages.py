@@ -13,9 +13,11 @@ from drivesplat.readers.datasets import reads_unposed
 from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.asset_references import asset_names, asset_of_results
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.discover import DiscoverJob
+from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import AssetsJob, DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
@@ -29,7 +31,7 @@ from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.visuals import PanelJob, RemovalJob, SubjectSettings, TracksJob
-from drivesplat.settings.world import WorldJob
+from drivesplat.settings.world import WorldDonor, WorldJob
 from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.named_tracks import fitting_edits, shows_subject
 from drivesplat.workflow.without_cameras import (
@@ -49,7 +51,7 @@ METHOD_STAGES = (TRAIN, "evaluate")
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
-    WORLD, "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
+    WORLD, "extract", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
     "scan_folder",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
@@ -235,17 +237,37 @@ def _world(at: JobScope) -> dict[str, Any]:
     world, edits = at.dataset.world, scene_edits(at.config, at.scene)
     assert world is not None
     fitting = fitting_edits(at.config, at.scene, "annotated")
-    of_labels = [name for name, edit in fitting.items() if not any(step.insert for step in edit.steps)]
+    of_labels = [name for name, edit in fitting.items() if _donors(at, edit) is not None]
     wanted = of_labels if world.truth.edits is None else world.truth.edits
     for name in wanted:
         if name not in edits:
             raise ConfigError(no_such_edit(at.scene, name, edits))
+        if _donors(at, edits[name]) is None:
+            raise ConfigError(
+                f"scene {at.scene}, edit {name!r}: its truth is not known, since it inserts what is in no synthetic "
+                "world of the config; leave it out of world.truth.edits"
+            )
+    donors = {asset: donor for name in wanted for asset, donor in (_donors(at, edits[name]) or {}).items()}
     return {
+        "donors": donors,
         "scene": at.scene,
         "version": at.dataset.version,
         "world": world.with_sensors(at.config.cameras, at.config.sweeps, at.config.lidar_seed.sweeps),
         "edits": {name: edits[name] for name in wanted},
     }
+
+
+def _donors(at: JobScope, edit: Edit) -> dict[str, WorldDonor] | None:
+    """The objects of synthetic worlds that an edit inserts, by the names of their assets; None where one is of no such
+    world."""
+    found = {}
+    for name in asset_names(edit):
+        asset = asset_of_results(name, "any")
+        world = asset and asset[0] in at.config.scenes and at.config.datasets[at.config.dataset_of(asset[0])].world
+        if not (asset and world):
+            return None
+        found[name] = WorldDonor(scene=asset[0], track=asset[2], world=world)
+    return found
 
 
 def _film_format(at: JobScope) -> dict[str, Any]:
@@ -330,6 +352,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "truth_film": (TruthFilmJob, _encoding),
     "edit": (EditJob, lambda at: {**_quad(at), "frames": at.config.render.edited_frames}),
     "quad": (EditJob, _quad),
+    "edit_truth": (EditJob, _quad),
     "drive_folder": (DriveJob, _drive_folder),
     "scan_folder": (ScanFolderJob, _scan_folder),
     "ghost_panel": (PanelJob, _subject),

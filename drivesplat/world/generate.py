@@ -70,9 +70,9 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
     bytes for any number of processes (`workers`). Raises ConfigError where `root` holds other files or an edit does not
     fit the street, ResultError where the disk is full or has no space for the world.
     """
-    recorder = Recorder(job.world, job.scene, job.edits)
+    recorder = Recorder(job.world, job.scene, job.edits, job.donors)
     context = multiprocessing.get_context("fork")
-    if any(step.place for edit in job.edits.values() for step in edit.steps):
+    if any(step.place or step.insert for edit in job.edits.values() for step in edit.steps):
         with ProcessPoolExecutor(1, context) as pool:
             pool.submit(_check_places, job).result()
     prepare_folder(root, provenance)
@@ -130,15 +130,16 @@ def _annotate(
 
 
 def require_free_places(recorder: Recorder) -> None:
-    """Raises ConfigError, one line, where a placed vehicle meets an object during the drive."""
+    """Raises ConfigError, one line, where a placed or inserted object meets another during the drive."""
     for name, edit in recorder.edits.items():
         for number, step in enumerate(edit.steps, start=1):
-            if step.place is None:
+            placed = step.place or step.insert
+            if placed is None:
                 continue
-            met = first_contact(recorder, name, step.place.name)
+            met = first_contact(recorder, name, placed.name)
             if met is not None:
                 raise ConfigError(
-                    f"scene {recorder.scene}, edit {name!r}, step {number} (place): {step.place.name!r} is inside "
+                    f"scene {recorder.scene}, edit {name!r}, step {number} ({step.kind}): {placed.name!r} is inside "
                     f"{met[1]} at {met[0]:.1f} s; choose another path"
                 )
 
@@ -176,7 +177,7 @@ _worker: tuple[Path, Recorder]
 
 
 def _check_places(job: WorldJob) -> None:
-    require_free_places(Recorder(job.world, job.scene, job.edits))
+    require_free_places(Recorder(job.world, job.scene, job.edits, job.donors))
 
 
 def _start_worker(root: Path, recorder: Recorder) -> None:

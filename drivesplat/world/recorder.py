@@ -8,10 +8,12 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from drivesplat.errors import ConfigError
 from drivesplat.scene.images import project
 from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.tracks import matching_ids
 from drivesplat.settings.edit import Edit
-from drivesplat.settings.world import WorldSettings
+from drivesplat.settings.world import WorldDonor, WorldSettings
 from drivesplat.world.optics.imaging import StreetImage, WorldCamera, geometry, render, to_bytes
 from drivesplat.world.optics.lidar import ScanPattern, StreetScan, returns, scan, scan_pattern
 from drivesplat.world.optics.lighting import Light, daylight, lamplight
@@ -62,11 +64,31 @@ class SurfacePoints:
         return cls(pieces[faces], np.asarray(places))
 
 
+def _donated(name: str, donor: WorldDonor) -> StreetObject:
+    """The object of another street that an asset is made of."""
+    objects = [item for item in build_street(donor.world).objects if item.category]
+    by_id = {instance_token(donor.scene, item.name): item for item in objects}
+    matching = matching_ids(donor.track, by_id)
+    if len(matching) != 1:
+        count = f"{len(matching)} objects have" if matching else "no object has"
+        raise ConfigError(f"asset {name!r}: {count} an id starting with {donor.track!r} in scene {donor.scene}")
+    return by_id[matching[0]]
+
+
 class Recorder:
     """Records the street of `world` as the drive `scene`. Each recording has its own random generator."""
 
-    def __init__(self, world: WorldSettings, scene: str = "demo", edits: Mapping[str, Edit] | None = None):
+    def __init__(
+        self,
+        world: WorldSettings,
+        scene: str = "demo",
+        edits: Mapping[str, Edit] | None = None,
+        donors: Mapping[str, WorldDonor] | None = None,
+    ):
+        """`donors` are the objects that the edits insert, by the names of their assets. Raises ConfigError where a
+        world lacks one."""
         self.world, self.scene, self.edits = world, scene, dict(edits or {})
+        self._inserted = {name: _donated(name, donor) for name, donor in (donors or {}).items()}
         self.street = build_street(world)
         self.objects = self.street.objects
         self._variations: dict[str | None, Variation] = {None: Variation(self.street)}
@@ -78,7 +100,7 @@ class Recorder:
             delays = [sensor.delay_us for sensor in recording_sensors(self.world) if sensor.is_camera]
             film_start = min(delays, default=0) * 1e-6
             self._variations[edit] = edited(
-                self.street, self.scene, self.edits[edit], edit, self.world.seconds, film_start
+                self.street, self.scene, self.edits[edit], edit, self.world.seconds, film_start, self._inserted
             )
         return self._variations[edit]
 

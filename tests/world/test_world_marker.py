@@ -107,7 +107,7 @@ def test_a_worlds_stage_knows_its_scene_tables_and_street_alone(tmp_path):
     assert told["scene"] == "demo" and told["version"] == "v1.0-mini"
     expected = {"cameras": ["CAM_FRONT"], "sweeps": [], "random_seed": 3, "night": True}
     assert told["world"] == {**WorldSettings().model_dump(mode="json"), **expected}
-    assert told.keys() == {"scene", "version", "world", "edits"} and told["edits"] == {}
+    assert told.keys() == {"scene", "version", "world", "edits", "donors"} and told["edits"] == told["donors"] == {}
 
 
 @pytest.mark.parametrize(

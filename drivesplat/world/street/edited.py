@@ -5,12 +5,13 @@ In the truth of an edit every object is there at all times; a recorded track end
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
 from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.settings.edit import Edit
-from drivesplat.trajectories.edited_actors import EditedActor, edited_actors
+from drivesplat.trajectories.edited_actors import EditedActor, Insertable, edited_actors
 from drivesplat.trajectories.ego_path import edited_poses
 from drivesplat.trajectories.lateral_offset import PosesAt
 from drivesplat.trajectories.motion import Motion
@@ -22,6 +23,7 @@ from drivesplat.world.tokens import instance_token
 
 MOTION_HZ = 20.0
 """Poses a second through which the splines of an edited path lead."""
+NOTHING_INSERTED: Mapping[str, StreetObject] = MappingProxyType({})
 MARGIN = 1.0
 """Seconds before and after the drive that they cover."""
 
@@ -38,8 +40,12 @@ class Variation:
         return (self.ego_poses_at or self.street.ego.poses)(seconds)
 
 
-def edited(street: Street, scene: str, edit: Edit, name: str, seconds: float, film_start: float) -> Variation:
+def edited(
+    street: Street, scene: str, edit: Edit, name: str, seconds: float, film_start: float,
+    inserted: Mapping[str, StreetObject] = NOTHING_INSERTED,
+) -> Variation:  # fmt: skip
     """The street of the drive `scene`, `seconds` long, after the edit `name`. Tracks have the ids of the tables.
+    `inserted` are objects of other streets by the names of their assets in the edit.
 
     Second 0 of edits is the first image, `film_start` seconds after the first key frame. Raises ConfigError, one line,
     if a step names an unknown track, changes nothing or contradicts an earlier one.
@@ -61,8 +67,12 @@ def edited(street: Street, scene: str, edit: Edit, name: str, seconds: float, fi
     ]
     ego = street.ego.poses(np.arange(0.0, seconds, 0.1) + film_start)
     where, others = f"scene {scene}, edit {name!r}", by_id.keys() - editable.keys()
-    changed = edited_actors(actors, edit, where, others, ego)
-    objects = [_object_of(actor, editable, film_start) for actor in changed]
+    insertable = {
+        name: Insertable(object_class(item.category or ""), item.category or "", item.size, np.zeros(0))
+        for name, item in inserted.items()
+    }
+    changed = edited_actors(actors, edit, where, others, ego, insertable)
+    objects = [_object_of(actor, {**editable, **inserted}, film_start) for actor in changed]
     steps = [step.ego for step in edit.steps if step.ego is not None]
 
     def recorded(film: np.ndarray) -> np.ndarray:
@@ -90,6 +100,8 @@ def _object_of(actor: EditedActor, originals: Mapping[str, StreetObject], film_s
         return poses
 
     name = originals[actor.id].name if actor.id in originals else actor.id
+    if not isinstance(original.body, RigidBody):  # of an inserted person or cyclist; steps do not change its looks
+        return replace(original, name=name, path=GivenPath(poses_at))
     mesh = original.body.pieces[0].scaled(actor.scale)
     body = RigidBody(mesh if actor.color_matrix is None else mesh.recolored(actor.color_matrix))
     return replace(original, name=name, body=body, path=GivenPath(poses_at))
