@@ -18,7 +18,7 @@ rule edit:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
-        assets=plan.inserted_assets,
+        inserts=plan.inserts,
     output:
         film=report(
             "<results>/{scene}/{method}/edits/{edit}.mp4",
@@ -64,7 +64,7 @@ rule quad:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
-        assets=plan.inserted_assets,
+        inserts=plan.inserts,
     output:
         film=report(
             "<results>/{scene}/{method}/quad/{edit}.mp4",
@@ -103,7 +103,7 @@ rule drive_folder:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
-        assets=plan.inserted_assets,
+        inserts=plan.inserts,
     output:
         drive="<results>/{scene}/{method}/{kind}/{drive}/drive/drive.json",
     log:
@@ -137,7 +137,7 @@ rule scan_folder:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         scans="<results>/{scene}/scans.npz",
-        assets=plan.inserted_assets,
+        inserts=plan.inserts,
     output:
         scans="<results>/{scene}/{method}/{kind}/{drive}/scans/scans.json",
     log:

@@ -359,7 +359,7 @@ rule edit_truth:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         parser=plan.of_tracks("parser.npz"),
         masks="<results>/{scene}/masks/masks.json",
-        assets=plan.inserted_assets,
+        inserts=plan.inserts,
     output:
         figures="<results>/{scene}/{method}/edit_truth/{edit}.json",
         picture="<results>/{scene}/{method}/edit_truth/{edit}.png",

@@ -3,7 +3,7 @@
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl and parser.npz, masks/masks.json (and the PNGs beside it);
 # where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
-# lidar_depth.npz and scans.npz. The scene of all rules after these (plan.scene) is the refined one where there is one.
+# lidar_depth.npz and scans.npz; light.json for edits that insert objects. The scene of all rules after these (plan.scene) is the refined one where there is one.
 # What depends on tracks is made for each kind of tracks that methods train with (tracks.smk): the wildcard {tracks} is
 # empty for annotated ones, else the folder 'discovered/' or 'unlabelled/'.
 
@@ -249,3 +249,31 @@ rule scans:
         code=plan.code("scans"),
     script:
         "../workflow_scripts/scans.py"
+
+
+rule light:
+    """
+    Estimates the light of a scene, for the shadows of inserted objects: from those that recorded vehicles cast on the
+    ground.
+    """
+    input:
+        scene=plan.annotated_scene,
+    output:
+        light="<results>/{scene}/light.json",
+    log:
+        "<logs>/{scene}/light.log",
+    benchmark:
+        "<benchmarks>/{scene}/light.tsv"
+    wildcard_constraints:
+        scene=plan.known(plan.scenes(cameras=True)),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 2
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        settings=plan.settings("light"),
+        code=plan.code("light"),
+    script:
+        "../workflow_scripts/light.py"

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.editing.assets.library import digests_of, read_assets
+from drivesplat.editing.assets.library import digests_of, read_inserts
 from drivesplat.editing.film import EditFiles, render_edit
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
@@ -14,8 +14,8 @@ with job(snakemake) as current:
     scene = read_scene(current.input.scene)
     checkpoint = read_checkpoint(current.input.checkpoint)
     settings = current.settings(EditJob)
-    assets = read_assets(settings.edit, Path(current.input.checkpoint).parents[2], current.wildcards.method)
-    provenance = current.provenance(scene.provenance, checkpoint.provenance, inputs=digests_of(assets))
+    inserts = read_inserts(settings.edit, Path(current.input.checkpoint).parent)
+    provenance = current.provenance(scene.provenance, checkpoint.provenance, inputs=digests_of(inserts))
     files = EditFiles(Path(current.output.film), Path(current.output.still))
-    record = render_edit(scene, checkpoint, settings, current.device(), files, assets)
+    record = render_edit(scene, checkpoint, settings, current.device(), files, inserts)
     write_json(current.output.labels, {**record, "provenance": provenance})

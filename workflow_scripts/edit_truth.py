@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.editing.assets.library import digests_of, read_assets
+from drivesplat.editing.assets.library import digests_of, read_inserts
 from drivesplat.evaluation.synthetic import DriveTruth
 from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.model.checkpoint import read_checkpoint
@@ -16,9 +16,9 @@ with job(snakemake, dataset=("images",)) as current:
     files, wildcards, settings = current.input, current.wildcards, current.settings(EditJob)
     recording, upstream = read_evaluation_data(files.scene, files.parser, files.masks)
     checkpoint, known = read_checkpoint(files.checkpoint), DriveTruth.read(files.truth[0], recording)
-    assets = read_assets(settings.edit, Path(files.checkpoint).parents[2], wildcards.method)
-    inputs = {"truth": sha256_file(known.path), **digests_of(assets)}
+    inserts = read_inserts(settings.edit, Path(files.checkpoint).parent)
+    inputs = {"truth": sha256_file(known.path), **digests_of(inserts)}
     provenance = current.provenance(*upstream, checkpoint.provenance, inputs=inputs)
-    record, picture = measure_edit(checkpoint, known, settings, wildcards.edit, assets, current.device())
+    record, picture = measure_edit(checkpoint, known, settings, wildcards.edit, inserts, current.device())
     write_png(current.output.picture, picture)
     write_json(current.output.figures, {**record, "provenance": provenance})

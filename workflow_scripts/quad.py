@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.editing.assets.library import digests_of, read_assets
+from drivesplat.editing.assets.library import digests_of, read_inserts
 from drivesplat.editing.quad import render_quad
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
@@ -14,7 +14,7 @@ with job(snakemake, dataset=("images",)) as current:
     scene = read_scene(current.input.scene)
     checkpoint = read_checkpoint(current.input.checkpoint)
     settings = current.settings(EditJob)
-    assets = read_assets(settings.edit, Path(current.input.checkpoint).parents[2], current.wildcards.method)
-    provenance = current.provenance(scene.provenance, checkpoint.provenance, inputs=digests_of(assets))
-    record = render_quad(scene, checkpoint, settings, current.device(), Path(current.output.film), assets)
+    inserts = read_inserts(settings.edit, Path(current.input.checkpoint).parent)
+    provenance = current.provenance(scene.provenance, checkpoint.provenance, inputs=digests_of(inserts))
+    record = render_quad(scene, checkpoint, settings, current.device(), Path(current.output.film), inserts)
     write_json(current.output.labels, {**record, "provenance": provenance})

@@ -24,7 +24,7 @@ from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.recorded_drive import RecordedDrive, object_table
 from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
 from drivesplat.editing.actors import EditedModel, edited_model, other_objects, trained_actors
-from drivesplat.editing.assets.library import read_assets
+from drivesplat.editing.assets.library import read_inserts
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.sensor_path import EgoPoses
 from drivesplat.editing.shown_objects import ShownObjects
@@ -155,8 +155,8 @@ class TrainedDrive(Sensors):
         """The model after the edit; None where it leaves the objects as recorded."""
         if self.edit is None or all(step.kind == "ego" for step in self.edit.steps):
             return None
-        assets = read_assets(self.edit, self.folder.parent.parent, self.folder.name)
-        return edited_model(self.model, self.scene, self._reference, self.edit, self.where, assets)
+        inserts = read_inserts(self.edit, self.folder)
+        return edited_model(self.model, self.scene, self._reference, self.edit, self.where, inserts)
 
     @cached_property
     def _recorded_actors(self) -> list[EditedActor]:

@@ -2,17 +2,19 @@
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
+from drivesplat.editing.assets.ground import ground_color, matching_gains
 from drivesplat.editing.assets.inserted import with_assets
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.light import Shade
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.edit import Edit
+from drivesplat.settings.edit import Edit, Insert
 from drivesplat.trajectories.camera_path import recorded_frames
 from drivesplat.trajectories.edited_actors import EditedActor, Insertable, edited_actors
 from drivesplat.trajectories.motion import Motion
@@ -36,25 +38,42 @@ class EditedModel:
 
 
 def edited_model(
-    model: SplatModel, scene: Scene, camera: str, edit: Edit, where: str, assets: Assets = NO_ASSETS
+    model: SplatModel, scene: Scene, camera: str, edit: Edit, where: str, inserts: Inserts = NO_INSERTS
 ) -> EditedModel:
-    """A model after an edit, whose steps insert `assets` by name. Steps that place an object count from the ego poses
+    """A model after an edit, whose steps insert `inserts`. Steps that place an object count from the ego poses
     at the images of `camera`.
 
     Raises ConfigError, starting with `where`, if the edit does not fit the scene or the model has no actors;
     DatasetError if the scene lacks the camera; ResultError as `editable_actors`.
     """
-    inserts = any(step.insert is not None for step in edit.steps)
-    recorded = (trained_actors if inserts else editable_actors)(model, scene, where)
+    inserting = any(step.insert is not None for step in edit.steps)
+    recorded = (trained_actors if inserting else editable_actors)(model, scene, where)
     others = {track.id for track in scene.tracks} - {actor.id for actor in recorded}
     ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, camera)])
     insertable = {
         name: Insertable(asset.object_class, asset.category, asset.size, asset.seen if len(asset.seen) else ALL_AROUND)
-        for name, asset in assets.items()
+        for name, asset in inserts.assets.items()
     }
     actors = edited_actors(recorded, edit, where, others, ego_to_world, insertable)
+    steps = {step.insert.name: step.insert for step in edit.steps if step.insert is not None}
+    actors = [_as_it_is_lit(model, actor, steps[actor.id], inserts) if actor.id in steps else actor for actor in actors]
     used = {actor.source for actor in actors}
-    return EditedModel(with_assets(model, {n: a for n, a in assets.items() if n in used}), recorded, actors)
+    whole = with_assets(model, {name: asset for name, asset in inserts.assets.items() if name in used})
+    return EditedModel(whole, recorded, actors)
+
+
+def _as_it_is_lit(model: SplatModel, actor: EditedActor, step: Insert, inserts: Inserts) -> EditedActor:
+    """An inserted actor with its shadow, and with colours as bright as its place in the middle of its presence."""
+    if step.shadow:
+        actor = replace(actor, shade=Shade(actor.size, inserts.light))
+    if step.match_exposure:
+        middle = max(0.0, 0.5 * (max(actor.path.begin, 0.0) + min(actor.path.end, max(actor.path.begin, 0.0) + 20.0)))
+        here = ground_color(model, middle, actor.poses(np.array([middle]))[0], float(actor.size[2]))
+        gains = matching_gains(inserts.assets[step.asset].ground, here)
+        if gains is not None:
+            own = np.eye(3) if actor.color_matrix is None else actor.color_matrix
+            actor = replace(actor, color_matrix=own @ np.diag(gains))
+    return actor
 
 
 def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[EditedActor]:

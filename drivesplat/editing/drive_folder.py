@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
 from drivesplat.editing.placed_model import placed_models
@@ -43,18 +43,18 @@ def write_rendered_drive(
     path: Path,
     source: dict[str, str],
     provenance: Provenance,
-    assets: Assets = NO_ASSETS,
+    inserts: Inserts = NO_INSERTS,
 ) -> None:
     """Writes the drive folder of `path`, its drive.json: images/, and the same drive as nuScenes tables in nuscenes/.
 
     `source` names the `scene`, the `method`, and the `edit` or the `trajectory` in the record that marks the drive as
-    rendered; the scene of the tables is called by scene and edit or trajectory. The edit inserts `assets` by name.
+    rendered; the scene of the tables is called by scene and edit or trajectory. The edit inserts `inserts`.
     Raises what `image_render_plan` raises; DeviceError; ResultError where a rendering contains NaN or Inf, or the disk
     is full."""
     folder, what = path.parent, " ".join(f"{key} {value}" for key, value in source.items())
     _remove(folder)
     model, device = open_model(checkpoint, device_settings)
-    drive = image_render_plan(scene, model, job, folder, what, assets)
+    drive = image_render_plan(scene, model, job, folder, what, inserts)
     try:
         with explain_out_of_memory(lambda: len(model)):
             views = drive.views(device)

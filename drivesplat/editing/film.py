@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.editing.actors import edited_model, other_objects, warn_of_collisions
-from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.shown_objects import ShownObjects
@@ -55,10 +55,10 @@ def render_edit(
     job: EditJob,
     device_settings: DeviceSettings,
     files: EditFiles,
-    assets: Assets = NO_ASSETS,
+    inserts: Inserts = NO_INSERTS,
 ) -> dict[str, Any]:
     """Writes the film and the still, both with the recorded and the edited drive in panels, and, if `job.frames`, the
-    frames of the edited one. `assets` are those that the edit inserts, by their names there.
+    frames of the edited one. `inserts` is what the edit inserts.
 
     Returns the content of the edit's JSON without provenance: the cameras of the edited drive at the size of a frame,
     which is that of a panel, the places of the panels in the `film`, and the poses of all objects. Raises ConfigError
@@ -67,7 +67,7 @@ def render_edit(
     """
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {scene.name}, edit {files.film.stem!r}"
-    drive = edited_shots(scene, model, job, where, assets)
+    drive = edited_shots(scene, model, job, where, inserts)
     after, seconds = drive.after, np.array(drive.after.seconds)
     colliding = warn_of_collisions(drive.actors, after.cameras.camera_to_world, seconds, where)
     panels = Panels(("recorded", files.film.stem), after.size)
@@ -115,11 +115,13 @@ class EditedShots:
         return [UNSEEN if unseen else "" for unseen in unseen_sides(self.recorded, self.actors, self.after)]
 
 
-def edited_shots(scene: Scene, model: SplatModel, job: EditJob, where: str, assets: Assets = NO_ASSETS) -> EditedShots:
-    """The drive with the edit of `job`, which inserts `assets` by name. Raises ConfigError, starting with `where` (the
+def edited_shots(
+    scene: Scene, model: SplatModel, job: EditJob, where: str, inserts: Inserts = NO_INSERTS
+) -> EditedShots:
+    """The drive with the edit of `job`, which inserts `inserts`. Raises ConfigError, starting with `where` (the
     scene and the edit), if the edit does not fit the scene or the model has no actors, DatasetError if the scene lacks
     the camera."""
-    edited = edited_model(model, scene, job.camera, job.edit, where, assets)
+    edited = edited_model(model, scene, job.camera, job.edit, where, inserts)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     before, after = (shot_of(scene, cameras, job) for cameras in (unedited, path))

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int16
 from torch import Tensor
 
+from drivesplat.editing.shading import shaded
 from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.picture import Picture
@@ -43,7 +44,8 @@ class PlacedModel:
         want = self._wanted(view)
         if want not in self._sets:
             wanted = want if self.placements is None else replace(want, placements=tuple(self.placements))
-            self._sets[want] = self.model.sample(self.model.states(self.time, wanted), wanted)
+            sets = self.model.sample(self.model.states(self.time, wanted), wanted)
+            self._sets[want] = self._in_shadow(sets) if want.colors else sets
         return self._sets[want]
 
     def gaussians_in(self, view: View | ScanView) -> Gaussians:
@@ -79,6 +81,15 @@ class PlacedModel:
             return torch.full(view.rays.azimuths.shape, -1, dtype=torch.int16, device=gaussians.means.device)
         return group_met(gaussians, view, gaussians.placement).to(torch.int16)
 
+    def _in_shadow(self, sets: Sequence[Gaussians]) -> Sequence[Gaussians]:
+        """The sets of the parts, those of static ones in the shadows of inserted objects."""
+        shades = [(p.object_to_world, p.shade) for p in self.placements or () if p.shade is not None]
+        known = [(pose, shade) for pose, shade in shades if pose is not None]
+        if not known:
+            return sets
+        pairs = zip(self.model.parts, sets, strict=True)
+        return [own if part.has_objects or part.moves else shaded(own, known) for part, own in pairs]
+
     def _wanted(self, view: View | ScanView) -> Want:
         return SCAN if isinstance(view, ScanView) else want_of(self.model.seen_from(view))
 
@@ -88,7 +99,7 @@ def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list
     after."""
     result: list[list[ActorPlacement]] = [[] for _ in seconds]
     for actor in actors:
-        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix, phase=actor.phase)
+        own = ActorPlacement(actor.source, None, actor.scale, actor.color_matrix, phase=actor.phase, shade=actor.shade)
         times = [seconds + step for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
         poses, walked = [actor.poses(at) for at in times], [actor.walked(at) for at in times]
         for number in np.flatnonzero(actor.present(seconds)):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.view import View
@@ -31,16 +31,16 @@ def render_quad(
     job: EditJob,
     device_settings: DeviceSettings,
     path: Path,
-    assets: Assets = NO_ASSETS,
+    inserts: Inserts = NO_INSERTS,
 ) -> dict[str, Any]:
-    """Writes the MP4 `path`, named like the edit, which inserts `assets` by name; returns the content of its JSON
+    """Writes the MP4 `path`, named like the edit, which inserts `inserts`; returns the content of its JSON
     without provenance.
 
     The first two panels show the last image of the camera until the next: as recorded, and rendered from its pose at
     its time. Raises what `render_edit` raises.
     """
     model, device = open_model(checkpoint, device_settings)
-    drive = edited_shots(scene, model, job, f"scene {scene.name}, edit {path.stem!r}", assets)
+    drive = edited_shots(scene, model, job, f"scene {scene.name}, edit {path.stem!r}", inserts)
     smooth, after = drive.before, drive.after
     frames = recorded_frames(scene, job.camera)
     times = np.array([frame.timestamp for frame in frames])

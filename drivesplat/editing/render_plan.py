@@ -13,7 +13,7 @@ from drivesplat.editing.actors import (
     trained_actors,
     warn_of_collisions,
 )
-from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.model.splat_model import SplatModel
@@ -61,9 +61,9 @@ class ImageRenderPlan:
 
 
 def image_render_plan(
-    scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str, assets: Assets = NO_ASSETS
+    scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str, inserts: Inserts = NO_INSERTS
 ) -> ImageRenderPlan:
-    """The drive of `job`, whose edit inserts `assets` by name; its images are to lie in `folder`/images.
+    """The drive of `job`, whose edit inserts `inserts`; its images are to lie in `folder`/images.
 
     All images of the cameras at their own times, as long as the ego vehicle is on its recorded path. Warns where a
     camera is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the scene
@@ -73,7 +73,7 @@ def image_render_plan(
         ego, trained = None, trained_actors(model, scene, where)
         actors = trained
     else:
-        edited = edited_model(model, scene, job.eval_camera, job.edit, where, assets)
+        edited = edited_model(model, scene, job.eval_camera, job.edit, where, inserts)
         model, trained, actors = edited.model, edited.recorded, edited.actors
         ego = EgoEdit.of(scene, job.eval_camera, job.edit, where)
     frames = [frame for camera in job.cameras for frame in _rendered_frames(scene, camera, ego, job, folder)]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.scans import SimulatedScan, scan_render_plan
 from drivesplat.errors import ResultError
 from drivesplat.io.point_cloud import write_vertices
@@ -30,19 +30,19 @@ def write_scan_folder(
     path: Path,
     source: dict[str, str],
     provenance: Provenance,
-    assets: Assets = NO_ASSETS,
+    inserts: Inserts = NO_INSERTS,
 ) -> None:
     """Writes the scans of `records` after the edit of `job` or along its trajectory into the folder of `path`, and last
     `path`, scans.json, which lists them.
 
-    `source` names the `scene`, the `method`, and the `edit` or the `trajectory`; the edit inserts `assets` by name.
+    `source` names the `scene`, the `method`, and the `edit` or the `trajectory`; the edit inserts `inserts`.
     Raises what `scan_render_plan` raises;
     DeviceError; ResultError for a model that was trained without LiDAR, where a rendering contains NaN or Inf, or where
     the disk is full.
     """
     what = " ".join(f"{key} {value}" for key, value in source.items())
     model, device = open_model(checkpoint, device_settings)
-    drive = scan_render_plan(scene, model, records.scans, job, what, assets)
+    drive = scan_render_plan(scene, model, records.scans, job, what, inserts)
     objects, folder, listed = drive.objects(), path.parent, []
     _remove_scans(folder)
     try:

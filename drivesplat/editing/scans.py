@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64, Int16
 
 from drivesplat.editing.actors import edited_model, trained_actors, warn_of_collisions
-from drivesplat.editing.assets.asset import NO_ASSETS, Assets
+from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.sensor_path import beside, carried, recorded_ego
@@ -95,9 +95,9 @@ class ScanRenderPlan:
 
 def scan_render_plan(
     scene: Scene, model: SplatModel, scans: Sequence[RecordedScan], job: ScanFolderJob, where: str,
-    assets: Assets = NO_ASSETS,
+    inserts: Inserts = NO_INSERTS,
 ) -> ScanRenderPlan:  # fmt: skip
-    """The drive of `job`, whose edit inserts `assets` by name: the rays of `scans`, as long as the ego vehicle is on
+    """The drive of `job`, whose edit inserts `inserts`: the rays of `scans`, as long as the ego vehicle is on
     its recorded path.
 
     Warns where a sensor is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the
@@ -113,7 +113,7 @@ def scan_render_plan(
     else:
         if job.eval_camera is None:
             raise ConfigError(f"{where}: scans of edits need images, and the scene has no camera")
-        edited = edited_model(model, scene, job.eval_camera, job.edit, where, assets)
+        edited = edited_model(model, scene, job.eval_camera, job.edit, where, inserts)
         model, trained, actors = edited.model, edited.recorded, edited.actors
         sensors, change = list(scans), EgoEdit.of(scene, job.eval_camera, job.edit, where)
         if change is not None and scans:

@@ -13,6 +13,7 @@ from torch import Tensor
 from drivesplat.kernels.placement import ObjectPoses
 from drivesplat.model.gaussians import Gaussians, recolored
 from drivesplat.model.timeline import TimeState
+from drivesplat.scene.light import Shade
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class ActorPlacement:
     `color_matrix` (3, 3) (None: as trained). `around` are the poses HALF_STEP seconds before and after an edited one,
     which give velocities; None: the object stands. `walked` is the length (metres) of the object's path until then,
     which the limbs of deformable objects follow, and `walked_around` HALF_STEP seconds before and after; None: as
-    recorded at the time. Their gait is ahead by `phase` cycles."""
+    recorded at the time. Their gait is ahead by `phase` cycles. With a `shade`, the object darkens the ground."""
 
     source: str
     object_to_world: np.ndarray | None = None
@@ -32,6 +33,7 @@ class ActorPlacement:
     walked: float | None = None
     walked_around: tuple[float, float] | None = None
     phase: float = 0.0
+    shade: Shade | None = None
 
     def beside(self, number: int) -> "ActorPlacement":
         """The placement HALF_STEP seconds before (0) or after (1)."""

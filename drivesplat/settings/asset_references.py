@@ -11,6 +11,8 @@ from drivesplat.settings.edit import Edit
 
 FOLDER, INDEX = "assets", "assets.json"
 """The folder of a method's assets, and the file there that lists them."""
+LIGHT = "light.json"
+"""The file of the light of a scene."""
 RECORD, PLY = "asset.json", "asset.ply"
 """The files of an asset."""
 OF_A_PATH = ("/", "./", "../", "~")

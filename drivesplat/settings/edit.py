@@ -196,6 +196,10 @@ class Insert(Settings):
     """Rotation to its left about its vertical axis (degrees)."""
     phase: float = Field(0.0, ge=-1, le=1)
     """Cycles by which its gait is ahead."""
+    shadow: bool = True
+    """Whether it darkens the ground."""
+    match_exposure: bool = True
+    """Whether its colours are scaled by the brightness of the ground here and where it was recorded."""
 
     @model_validator(mode="after")
     def _has_one_path(self) -> "Insert":

@@ -49,3 +49,7 @@ class ParserJob(Settings):
 
     holdout: HoldoutSettings
     images: ImageSettings
+
+
+class LightJob(ParserJob):
+    """All settings that determine the light of one scene."""

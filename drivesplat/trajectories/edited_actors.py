@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import ConfigError
+from drivesplat.scene.light import Shade
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.track_references import why_fixed
 from drivesplat.scene.tracks import matching_ids, short_ids
@@ -81,7 +82,8 @@ class EditedActor:
     `source`, scaled by `scale` about the box centre to `size` (3,): length, width, height in metres, their
     RGB colours mapped by `color_matrix` (3, 3; None: as trained), and a gait that is ahead by `phase` cycles. Unless
     `edited` it is as recorded. An inserted asset has its own name as its source, and `seen`: the directions from which
-    its Gaussians were seen, radians to the left of its front (None: as the track `source` was)."""
+    its Gaussians were seen, radians to the left of its front (None: as the track `source` was). With a `shade` it
+    darkens the ground."""
 
     id: str
     source: str
@@ -94,6 +96,7 @@ class EditedActor:
     color_matrix: np.ndarray | None = None
     phase: float = 0.0
     seen: np.ndarray | None = None
+    shade: Shade | None = None
 
     @classmethod
     def recorded(

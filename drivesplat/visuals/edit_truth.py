@@ -14,7 +14,7 @@ import torch
 from scipy.ndimage import binary_dilation, binary_opening
 
 from drivesplat.editing.actors import EditedModel, edited_model
-from drivesplat.editing.assets.asset import Assets
+from drivesplat.editing.assets.asset import Inserts
 from drivesplat.editing.placed_model import PlacedModel, placed_models
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import RegionMetrics, depth_summary, relative_depth_errors
@@ -34,8 +34,10 @@ SHADOW_STEP = 0.06
 or their reflection."""
 BORDER = 2
 """Pixels around an object that count neither as its shadow nor as outside: its true edge mixes both."""
-ANGLES = {"0-30": (0.0, 30.0), "30-90": (30.0, 90.0), "90-180": (90.0, 180.0)}
+ANGLES = {"0-30": (0.0, 30.0), "30-90": (30.0, 90.0), "90-180": (90.0, 181.0)}
 """Degrees between the direction from which an object is shown and the nearest one from which its asset was seen."""
+CHANGED = 2.0 / 255.0
+"""The change of a colour from which a pixel outside of objects and shadows counts as changed."""
 SHOWN = 4
 """Rows of the picture."""
 
@@ -70,7 +72,7 @@ def measure_edit(
     known: DriveTruth,
     job: EditJob,
     name: str,
-    assets: Assets,
+    inserts: Inserts,
     device_settings: DeviceSettings,
 ) -> tuple[dict[str, Any], np.ndarray]:
     """The figures of the objects that the edit `name` inserts, over the key frames of the world's truth of this edit,
@@ -85,7 +87,7 @@ def measure_edit(
         raise DatasetError(f"edit {name!r} inserts no object whose truth could be compared")
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {known.recording.scene.name}, edit {name!r}"
-    edited = edited_model(model, known.recording.scene, job.camera, job.edit, where, assets)
+    edited = edited_model(model, known.recording.scene, job.camera, job.edit, where, inserts)
     metrics = {kind: RegionMetrics(None, ("object", "shadow", "outside")) for kind in ("inserted", "not_inserted")}
     by_angle = {key: RegionMetrics(None, ("object",)) for key in ANGLES}
     overlaps, depths, unchanged, frames = [], [], [], []
@@ -96,7 +98,7 @@ def measure_edit(
             metrics["not_inserted"].add(metrics["not_inserted"].measure(frame.without, frame.truth, masks))
             for id, pixels in frame.objects.items():
                 for key, (low, high) in ANGLES.items():
-                    if pixels.any() and low <= frame.angles[id] < high:
+                    if pixels.any() and low <= frame.angles.get(id, 180.0) < high:
                         own = by_angle[key]
                         own.add(own.measure(frame.rendered, frame.truth, {"object": pixels}))
                 shown = frame.shown[id]
@@ -119,7 +121,7 @@ def measure_edit(
         "not_inserted": metrics["not_inserted"].summary(),
         "by_angle_deg": {key: own.summary()["object"] for key, own in by_angle.items()},
         "mask_iou": float(both / either) if either else None,
-        "largest_change_elsewhere": float(changed.max()) if len(changed) else None,
+        "changed_elsewhere": float((changed > CHANGED).mean()) if len(changed) else None,
     }
     return record, picture(frames)
 

@@ -8,7 +8,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json, sha256_text
 from drivesplat.provenance.code_digest import code_digest
-from drivesplat.settings.asset_references import FOLDER, INDEX, asset_names, asset_of_results, files_of_asset
+from drivesplat.settings.asset_references import FOLDER, INDEX, LIGHT, asset_names, asset_of_results, files_of_asset
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
 from drivesplat.settings.tracks import TRACK_FOLDERS
@@ -141,12 +141,14 @@ class Outputs(Inputs):
         """The indices of the assets of the batch's scenes, of every method that can be edited."""
         return self.of_methods(lambda _, method: [f"{FOLDER}/{INDEX}"] if method in self.methods_with_actors else [])
 
-    def inserted_assets(self, wildcards: Any) -> list[str]:
-        """The files of the assets that the edit of a job inserts. Raises ConfigError for one of an unknown scene or of
-        a method that has none."""
+    def inserts(self, wildcards: Any) -> list[str]:
+        """The files of the assets that the edit of a job inserts, and of the light of its scene. Raises ConfigError for
+        an asset of an unknown scene or of a method that has none."""
         kind, name = getattr(wildcards, "kind", EDITS), getattr(wildcards, "edit", None) or wildcards.drive
         edit = scene_edits(self.config, wildcards.scene).get(name) if kind == EDITS else None
-        names = [] if edit is None else asset_names(edit)
+        if edit is None:
+            return []
+        names = asset_names(edit)
         for one in names:
             found = asset_of_results(one, wildcards.method)
             if found is not None and found[0] not in self.config.scenes:
@@ -155,7 +157,9 @@ class Outputs(Inputs):
                 able = ", ".join(self.methods_with_actors) or "none"
                 raise ConfigError(f"edit {name!r} inserts asset {one!r}; methods with assets are: {able}")
         results = Path(self.config.results_dir)
-        return [str(file) for one in names for file in files_of_asset(one, results, wildcards.method)]
+        light = [results / wildcards.scene / LIGHT] if any(step.insert for step in edit.steps) else []
+        assets = [file for one in names for file in files_of_asset(one, results, wildcards.method)]
+        return [str(file) for file in (*assets, *light)]
 
     def looks(self, _: Any = None) -> list[str]:
         """The pictures of the batch's scenes and methods, and of the tracks of any method."""

@@ -21,7 +21,7 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import AssetsJob, DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.images import ParserJob
+from drivesplat.settings.images import LightJob, ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, RegionJob
@@ -325,6 +325,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "lidar_seed": (SeedJob, _nothing),
     "parser": (ParserJob, _nothing),
     "masks": (MaskJob, _nothing),
+    "light": (LightJob, _nothing),
     "relabel": (Settings, _nothing),
     "regions": (RegionJob, _nothing),
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),

@@ -24,6 +24,7 @@ from drivesplat.io.storage import Provenance, read_json, sha256_file, write_json
 from drivesplat.kernels.spherical_harmonics import SH_C0
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_ply import read_splat_ply, write_splat_ply
+from drivesplat.scene.light import OVERCAST, SceneLight
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.settings.asset_references import PLY, RECORD
 from drivesplat.settings.deformable import GaitSettings, LatticeSettings
@@ -59,7 +60,9 @@ class Asset:
     `gaussians` are in the frame of its box (x forward, y left, z up, metres, the origin at its centre), with the
     colours of one time; the mask `invented` (n,) has those of sides that no camera saw. `size` is length, width and
     height in metres. `seen` are the directions, radians to the left of its front, from which training images show it
-    (none: unknown). `source` says where it comes from: dataset, scene, method and track, as far as they are known.
+    (none: unknown). `source` says where it comes from: dataset, scene, method and track, as far as they are known;
+    `quality`, the figures of its pixels in held-out images; `ground`, the colour of the ground about it there, RGB in
+    [0, 1] (None: unknown).
     """
 
     name: str
@@ -72,6 +75,7 @@ class Asset:
     seen: Float[np.ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     source: Mapping[str, str] = field(default_factory=dict)
     quality: Mapping[str, Any] = field(default_factory=dict)
+    ground: Float[np.ndarray, "3"] | None = None
     provenance: Provenance = field(default_factory=dict)
     digest: str = ""
     """The SHA-256 of the file of its Gaussians, where it was read from one."""
@@ -98,12 +102,20 @@ class Asset:
             "gait": None if gait is None else _gait_record(gait),
             "quality": dict(self.quality),
             "source": dict(self.source),
+            "ground_color": None if self.ground is None else np.asarray(self.ground).round(4).tolist(),
         }
 
 
-Assets = Mapping[str, Asset]
-"""Assets by the names that steps of an edit have for them."""
-NO_ASSETS: Assets = MappingProxyType({})
+@dataclass(frozen=True, eq=False)
+class Inserts:
+    """What an edit inserts: the `assets` by the names that its steps have for them, and the `light` of the scene, which
+    their shadows follow."""
+
+    assets: Mapping[str, Asset]
+    light: SceneLight = OVERCAST
+
+
+NO_INSERTS = Inserts(MappingProxyType({}))
 
 
 def write_asset(folder: Path, asset: Asset) -> dict[str, Any]:
@@ -140,12 +152,15 @@ def read_asset(folder: Path) -> Asset:
         gait = None if record["gait"] is None else _read_gait(record["gait"])
         about = {key: dict(record[key]) for key in ("quality", "source", "provenance")}
         seen = np.array(record["seen"], dtype=np.float64).reshape(-1)
+        ground = None if record["ground_color"] is None else np.array(record["ground_color"], dtype=np.float64)
+        if ground is not None and (ground.shape != (3,) or not np.isfinite(ground).all()):
+            raise ValueError("its ground_color is not three numbers")
         named = str(record["name"]), object_class, str(record["category"]), size
     except (KeyError, TypeError, ValueError, ValidationError, json.JSONDecodeError) as error:
         why = f"it lacks {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
         raise ResultError(f"{path}: not an asset: {why}") from error
     gaussians, invented = read_gaussians(folder / PLY)
-    return Asset(*named, gaussians, invented, gait, seen, **about, digest=sha256_file(folder / PLY))
+    return Asset(*named, gaussians, invented, gait, seen, **about, ground=ground, digest=sha256_file(folder / PLY))
 
 
 def read_gaussians(path: Path) -> tuple[Gaussians, Bool[Tensor, " n"]]:

@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from drivesplat.editing.assets.asset import Asset, AssetGait
+from drivesplat.editing.assets.ground import ground_color
 from drivesplat.io.storage import Provenance
 from drivesplat.model.actors import Actors
 from drivesplat.model.deformable import Deformable
@@ -45,9 +46,11 @@ def assets_of(
             shares, azimuths = cameras.shares(actor), cameras.azimuths(actor)
             if not (shares >= MIN_SHARE_TRAINED).any():
                 continue
-            gaussians = _gaussians(part, number, float(cameras.seconds[shares.argmax()]))
+            best = float(cameras.seconds[shares.argmax()])
+            gaussians = _gaussians(part, number, best)
             if not len(gaussians):
                 continue
+            pose = actor.poses(np.array([best]))[0]
             yield Asset(
                 name=f"{scene.name}/{method}/{track.id}",
                 object_class=track.object_class,
@@ -59,6 +62,7 @@ def assets_of(
                 seen=np.unique(azimuths[~np.isnan(azimuths)].round(4)),
                 source={"dataset": scene.dataset, "scene": scene.name, "method": method, "track": track.id},
                 quality=quality.get(track.id, {}),
+                ground=ground_color(model, best, pose, float(track.size[2])),
                 provenance=provenance,
             )
 

@@ -1,10 +1,12 @@
 """Assets as parts of a model, which show nothing until an edit places them."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from drivesplat.editing.assets.asset import Asset, Assets
+from drivesplat.editing.assets.asset import Asset
 from drivesplat.model.actors import Actors
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.splat_model import SplatModel
@@ -17,7 +19,7 @@ NEVER = -1e6
 """The second at which an asset's own track is: before every drive."""
 
 
-def with_assets(model: SplatModel, assets: Assets) -> SplatModel:
+def with_assets(model: SplatModel, assets: Mapping[str, Asset]) -> SplatModel:
     """The model with a part for each asset, whose object has the asset's key as its track id. The parts of the model
     are shared. Where the model renders LiDAR, an asset without echoes gets the mean ones of the model's objects, or
     else of all its Gaussians."""

@@ -2,28 +2,35 @@
 
 from pathlib import Path
 
-from drivesplat.editing.assets.asset import Asset, Assets, read_asset
+from drivesplat.editing.assets.asset import NO_INSERTS, Asset, Inserts, read_asset
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import read_record
+from drivesplat.io.storage import read_record, sha256_text
+from drivesplat.scene.light import OVERCAST, read_light
 from drivesplat.scene.tracks import matching_ids
-from drivesplat.settings.asset_references import asset_names, asset_of_results, files_of_asset
+from drivesplat.settings.asset_references import LIGHT, asset_names, asset_of_results, files_of_asset
 from drivesplat.settings.edit import Edit
 
 RULE = "actor_assets"
 
 
-def read_assets(edit: Edit | None, results: Path, method: str) -> Assets:
-    """The assets that an edit of `method` inserts (None: none), by their names there; `results` is the folder of all
-    results.
+def read_inserts(edit: Edit | None, folder: Path) -> Inserts:
+    """What an edit inserts, for the method with the result folder `folder`. Without light.json the light of the scene
+    is OVERCAST.
 
     Raises ConfigError for a name that is no asset's, ResultError for files that are missing or none of an asset.
     """
-    return {} if edit is None else {name: _read(name, results, method) for name in asset_names(edit)}
+    names = [] if edit is None else asset_names(edit)
+    if not names:
+        return NO_INSERTS
+    light = folder.parent / LIGHT
+    assets = {name: _read(name, folder.parent.parent, folder.name) for name in names}
+    return Inserts(assets, read_light(light) if light.is_file() else OVERCAST)
 
 
-def digests_of(assets: Assets) -> dict[str, str]:
-    """The digests of assets that were read, for the provenance of what is made with them."""
-    return {f"asset {name}": asset.digest for name, asset in assets.items()}
+def digests_of(inserts: Inserts) -> dict[str, str]:
+    """The digests of the files that were read, for the provenance of what is made with them."""
+    found = {f"asset {name}": asset.digest for name, asset in inserts.assets.items()}
+    return {**found, "light": sha256_text(repr(inserts.light))} if found else {}
 
 
 def _read(name: str, results: Path, method: str) -> Asset:

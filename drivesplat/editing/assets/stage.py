@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.editing.assets.asset import TURNTABLE, write_asset
-from drivesplat.editing.assets.completion import completed
+from drivesplat.editing.assets.completion import completed, filled
 from drivesplat.editing.assets.extraction import assets_of
 from drivesplat.editing.assets.turntable import write_turntable
 from drivesplat.io.storage import Provenance, write_json
@@ -43,7 +43,7 @@ def write_assets(
     records = []
     for asset in found:
         track = asset.source["track"]
-        whole = completed(asset) if job.complete else asset
+        whole = filled(completed(asset)) if job.complete else asset
         folder = path.parent / folders[track]
         record = write_asset(folder, whole)
         write_turntable(folder / TURNTABLE, whole)
