@@ -350,8 +350,8 @@ rule lidar_film:
 
 rule edit_truth:
     """
-    Compares an edited drive with the truth of a synthetic world in which the edit happened: what the objects that it
-    inserts are worth, their shadows, and all else.
+    Compares an edited drive with the truth of a synthetic world in which the edit happened: the errors of inserted
+    objects, of their shadows, and of the rest of the image.
     """
     input:
         scene=plan.annotated_scene,

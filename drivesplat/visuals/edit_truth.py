@@ -1,7 +1,7 @@
 """The stage `edit_truth`: an edited drive against the truth of a synthetic world, in which the edit truly happened.
 
-It says what an inserted object is worth: its pixels, its shadow and all else, the directions from which it is seen,
-and what the same drive without it has there.
+It measures inserted objects: the errors of their pixels, of their shadows and of the rest of the image, by the
+direction from which they are shown, beside those of the same drive without them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

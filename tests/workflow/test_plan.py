@@ -201,6 +201,34 @@ def test_a_method_that_moves_without_objects_has_films_of_its_parts_but_no_actor
     assert not pages["drifting"]["edits"] and list(pages["mine"]["edits"]) == ["gone"]
 
 
+def test_an_edit_that_inserts_assets_waits_for_them_and_for_the_light_of_its_scene(tmp_path):
+    def inserted(*names: str, **wildcards: str | None) -> list[str]:
+        steps = ", ".join(f"insert: {{asset: {name}, as: it{i}, at: [9, 0]}}" for i, name in enumerate(names))
+        (tmp_path / "edits.yaml").write_text(f"edits: {{new: [{steps}], gone: [remove: {{track: x}}]}}")
+        dataset = {"scenes": ["a1", "b1"], "edits": {"a1": str(tmp_path / "edits.yaml")}}
+        made = plan(datasets={"a": dataset}, methods={"mine": {"parts": ACTORS}, "street": {}})
+        files = made.inserts(SimpleNamespace(**{"scene": "a1", "method": "mine", "edit": "new", **wildcards}))
+        return [file.removeprefix("elsewhere/") for file in files]
+
+    assert inserted("b1/7f") == ["b1/mine/assets/assets.json", "a1/light.json"]
+    own = ["own/asset.json", "own/asset.ply"]
+    assert inserted("b1/street/7f", "./own") == ["b1/street/assets/assets.json", *own, "a1/light.json"]
+    assert inserted("b1/7f", edit="gone") == []
+    assert inserted("b1/7f", edit=None, kind="edits", drive="new") == ["b1/mine/assets/assets.json", "a1/light.json"]
+    assert inserted("b1/7f", edit=None, kind="trajectories", drive="new") == []
+    with pytest.raises(ConfigError, match=r"edit 'new' inserts asset 'c9/7f', and the config has no scene 'c9'"):
+        inserted("c9/7f")
+    with pytest.raises(ConfigError, match=r"edit 'new' inserts asset 'b1/vanilla/7f'; methods with assets are: .*mine"):
+        inserted("b1/vanilla/7f")
+    with pytest.raises(ConfigError, match=r"asset 'alone' is neither \{scene\}/\{track\} nor"):
+        inserted("alone")
+
+
+def test_assets_are_those_of_methods_that_can_be_edited(with_edit):
+    made = plan(**with_edit)
+    assert [path for path in made.assets() if "/a1/" in path] == ["elsewhere/a1/street/assets/assets.json"]
+
+
 def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(with_edit):
     made = plan(**with_edit)
     assert {path.split("/", 1)[1] for path in made.drives() if "/a1/" in path} == {

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers.demo_worlds import FRONT, LIDAR, edit_of, named, names_of, pose_at, recorder_of
+from helpers.demo_worlds import FRONT, LIDAR, edit_of, named, names_of, pose_at, recorder_of, world_of
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.edit import Recolour
+from drivesplat.settings.world import WorldDonor
 from drivesplat.trajectories.edited_actors import color_matrix
 from drivesplat.world.generate import require_free_places
 from drivesplat.world.optics.imaging import to_bytes
@@ -176,3 +177,24 @@ def test_a_vehicle_that_drives_into_a_wall_is_refused_with_the_second_and_one_on
     clear = edit_of(placed([0.0, 60.0, 3.5]), {"remove": {"track": ONCOMING}})
     gone = edit_of(placed([0.0, 30.0, 14.0]), {"remove": {"track": "new"}})
     require_free_places(recorder_of({"clear": clear, "gone": gone}, key_frames=12))
+
+
+def test_objects_of_another_world_stand_where_they_are_inserted_and_are_told_apart():
+    donor = WorldDonor(scene="other", track=instance_token("other", "vehicle 1")[:8], world=world_of(random_seed=5))
+    edit = edit_of({"insert": {"asset": "other/car", "as": "new", "at": [30.0, 3.5], "yaw": 90.0}})
+    recorder = Recorder(world_of(), "demo", {"inserted": edit}, {"other/car": donor})
+    original = next(item for item in Recorder(donor.world, "other").objects if item.name == "vehicle 1")
+    new = named(recorder, "new", "inserted")
+    np.testing.assert_array_equal(new.size, original.size)
+    assert new.category == original.category and "new" not in names_of(recorder, None)
+    ahead = np.linalg.inv(recorder.ego_pose(0.0)) @ pose_at(new, 3.0)
+    np.testing.assert_allclose(ahead[:3, 3], [30.0, 3.5, 0.0], atol=0.3)
+    with pytest.raises(ConfigError, match=r"asset 'other/car': no object has an id starting with 'zz' in scene other"):
+        Recorder(world_of(), "demo", {}, {"other/car": donor.model_copy(update={"track": "zz"})})
+
+
+def test_an_inserted_object_inside_another_is_refused():
+    donor = WorldDonor(scene="other", track=instance_token("other", "vehicle 1"), world=world_of(random_seed=5))
+    edit = edit_of({"insert": {"asset": "other/car", "as": "new", "follow": AHEAD}})
+    with pytest.raises(ConfigError, match=r"step 1 \(insert\): 'new' is inside vehicle 0 at 0\.0 s"):
+        require_free_places(Recorder(world_of(), "demo", {"inside": edit}, {"other/car": donor}))

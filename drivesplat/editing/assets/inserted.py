@@ -25,7 +25,7 @@ def with_assets(model: SplatModel, assets: Mapping[str, Asset]) -> SplatModel:
     else of all its Gaussians."""
     if not assets:
         return model
-    device, echo = model.parts[0].params["means"].device, mean_echo(model)
+    device, echo = model.parts[0].params["means"].device, mean_lidar_logits(model)
     added = [part_of(key, asset, echo).to(device).requires_grad_(False) for key, asset in assets.items()]
     return SplatModel(
         [*model.parts, *added], model.sky, model.antialiased, model.exposure, model.rolling_shutter, model.max_scale
@@ -63,7 +63,7 @@ def part_of(key: str, asset: Asset, echo: Tensor | None) -> Actors:
     return part
 
 
-def mean_echo(model: SplatModel) -> Tensor | None:
+def mean_lidar_logits(model: SplatModel) -> Tensor | None:
     """The `lidar_logits` (4, 2), the same in all directions, of the mean of the model's objects, or without any of all
     its Gaussians; None for a model that renders no LiDAR."""
     known = [part for part in model.parts if "lidar_logits" in part.params]
