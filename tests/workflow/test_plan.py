@@ -206,13 +206,13 @@ def test_an_edit_that_inserts_assets_waits_for_them_and_for_the_light_of_its_sce
         steps = ", ".join(f"insert: {{asset: {name}, as: it{i}, at: [9, 0]}}" for i, name in enumerate(names))
         (tmp_path / "edits.yaml").write_text(f"edits: {{new: [{steps}], gone: [remove: {{track: x}}]}}")
         dataset = {"scenes": ["a1", "b1"], "edits": {"a1": str(tmp_path / "edits.yaml")}}
-        made = plan(datasets={"a": dataset}, methods={"mine": {"parts": ACTORS}, "street": {}})
+        made = plan(datasets={"a": dataset}, methods={"mine": {"parts": ACTORS}, "other": {"parts": ACTORS}})
         files = made.inserts(SimpleNamespace(**{"scene": "a1", "method": "mine", "edit": "new", **wildcards}))
         return [file.removeprefix("elsewhere/") for file in files]
 
     assert inserted("b1/7f") == ["b1/mine/assets/assets.json", "a1/light.json"]
     own = ["own/asset.json", "own/asset.ply"]
-    assert inserted("b1/street/7f", "./own") == ["b1/street/assets/assets.json", *own, "a1/light.json"]
+    assert inserted("b1/other/7f", "./own") == ["b1/other/assets/assets.json", *own, "a1/light.json"]
     assert inserted("b1/7f", edit="gone") == []
     assert inserted("b1/7f", edit=None, kind="edits", drive="new") == ["b1/mine/assets/assets.json", "a1/light.json"]
     assert inserted("b1/7f", edit=None, kind="trajectories", drive="new") == []
