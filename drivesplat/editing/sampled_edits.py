@@ -23,13 +23,16 @@ def sampled_edits(
 ) -> list[SampledEdit]:
     """The edits of a trained scene, sampled `rate` times a second and at the images of a camera.
 
-    An edit that does not fit the scene or the model is left out with a warning.
+    An edit that does not fit the scene or the model, or inserts an asset, is left out with a warning.
     """
     if not edits:
         return []
     drives, model = [], trained_model(checkpoint)
     for name, edit in edits.items():
         where, moved = f"scene {scene.name}, edit {name!r}", None
+        if any(step.insert is not None for step in edit.steps):
+            log.warning("%s: it is left out, since the page has no Gaussians of inserted assets", where)
+            continue
         try:
             edited = edited_model(model, scene, camera, edit, where).actors
             if any(step.kind == "ego" for step in edit.steps):
