@@ -55,8 +55,12 @@ def edited_model(
         for name, asset in inserts.assets.items()
     }
     actors = edited_actors(recorded, edit, where, others, ego_to_world, insertable)
-    steps = {step.insert.name: step.insert for step in edit.steps if step.insert is not None}
-    actors = [_as_it_is_lit(model, actor, steps[actor.id], inserts) if actor.id in steps else actor for actor in actors]
+    steps = [step.insert for step in edit.steps if step.insert is not None]
+    lit = {**{step.asset: step for step in steps}, **{step.name: step for step in steps}}  # copies as their asset
+    actors = [
+        actor if actor.seen is None else _as_it_is_lit(model, actor, lit.get(actor.id, lit[actor.source]), inserts)
+        for actor in actors
+    ]
     used = {actor.source for actor in actors}
     whole = with_assets(model, {name: asset for name, asset in inserts.assets.items() if name in used})
     return EditedModel(whole, recorded, actors)
