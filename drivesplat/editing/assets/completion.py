@@ -97,8 +97,9 @@ def filled(asset: Asset) -> Asset:
     facing = facing_azimuths(gaussians.means, asset.size)
     known = seen_from(facing, asset.seen) | seen_from(-facing, asset.seen)
     hull, sides = hull_of_vehicle(asset.size, asset.object_class is ObjectClass.CAR)
-    unseen = ~(seen_from(sides, asset.seen) | seen_from(-sides, asset.seen))
-    hull = hull[unseen | (sides.isnan() & bool(unseen.any()))]
+    upwards = sides.isnan()
+    unseen = ~(seen_from(sides, asset.seen) | seen_from(-sides, asset.seen) | upwards)
+    hull = hull[unseen | (upwards & unseen.any())]
     if not bool(known.any()) or not len(hull):
         return asset
     hull = hull[_hidden(hull.means, asset)]
