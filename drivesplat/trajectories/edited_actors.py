@@ -276,6 +276,8 @@ def _followed(actor: EditedActor, change: Insert) -> ActorPath:
     delay = 0.0 if change.start is None else change.start - path.begin
     beside = {"longitudinal": change.longitudinal, "lateral": change.lateral, "delay": delay}
     path = apply_duplicate(path, Duplicate.model_construct(track=change.name, name=change.name, phase=0.0, **beside))
+    begin, end = actor.path.begin + delay, actor.path.end + delay
+    path = replace(path, recorded=lambda times: actor.path.recorded(times - delay), begin=begin, end=end)
     if change.speed is not None:
         path = apply_speed(path, Speed(track=change.name, to=change.speed))
     if change.yaw:
