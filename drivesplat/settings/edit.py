@@ -302,8 +302,10 @@ Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | In
 
 
 def _short(value: Any) -> str:
-    """A value of a step's field in a line of text; colours as '#rrggbb'."""
+    """A value of a step's field in a line of text; colours as '#rrggbb', places as '[20 3]'."""
     if isinstance(value, (list, tuple)):
+        if len(value) == 2 and isinstance(value[0], float):
+            return "[" + " ".join(_short(number) for number in value) + "]"
         if value and isinstance(value[0], float):
             return "#" + "".join(f"{round(255 * channel):02x}" for channel in value)
         return ", ".join("[" + " ".join(_short(number) for number in point) + "]" for point in value)
