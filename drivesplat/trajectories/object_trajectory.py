@@ -208,6 +208,8 @@ class ObjectTrajectory:
         """The distance by recorded seconds; distances (k,) and poses (k, 4, 4) of the knots of the path by distance."""
         first, last = self.motion.times[[0, -1]]
         times = np.linspace(first, last, int((last - first) / SAMPLE_INTERVAL) + 1)
+        if not np.ptp(self.motion.object_to_world[:, :2, 3], axis=0).any():  # it stands, perhaps for an hour
+            times = self.motion.times
         poses = self.poses_at_time(times)
         distances, knots = _measured(poses[:, :2, 3])
         if distances[-1] < MIN_PATH_LENGTH:

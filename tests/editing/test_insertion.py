@@ -21,7 +21,7 @@ from torch import nn
 from drivesplat.editing.actors import EditedModel, edited_model
 from drivesplat.editing.assets.asset import NO_INSERTS, Asset, AssetGait, Inserts, write_asset
 from drivesplat.editing.assets.extraction import assets_of
-from drivesplat.editing.assets.inserted import mean_echo, part_of, with_assets
+from drivesplat.editing.assets.inserted import mean_lidar_logits, part_of, with_assets
 from drivesplat.editing.assets.library import digests_of, read_inserts
 from drivesplat.editing.placed_model import PlacedModel, placed_models
 from drivesplat.editing.render_plan import image_render_plan
@@ -141,12 +141,12 @@ def test_an_asset_without_echoes_gets_the_mean_ones_of_the_objects(scene):
     part = with_assets(model, {IT: plain}).parts[2]
     torch.testing.assert_close(part.params["lidar_logits"][:, 0], of_cars.expand(7, 2))
     assert not part.params["lidar_logits"][:, 1:].any()
-    torch.testing.assert_close(mean_echo(SplatModel([model.parts[0]], None))[0], torch.tensor([-3.0, 1.0]))
+    torch.testing.assert_close(mean_lidar_logits(SplatModel([model.parts[0]], None))[0], torch.tensor([-3.0, 1.0]))
 
 
 def test_a_model_without_lidar_stays_so(model, scene):
     asset = asset_in(car_with_echoes(scene), scene)
-    assert mean_echo(model) is None
+    assert mean_lidar_logits(model) is None
     whole = with_assets(model, {IT: asset})
     assert all("lidar_logits" not in part.params for part in whole.parts)
     with pytest.raises(ResultError, match="trained without LiDAR"):
