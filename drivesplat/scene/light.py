@@ -89,6 +89,11 @@ def read_light(path: str | Path) -> SceneLight:
     names = ("contact", "cast", "azimuth_deg", "elevation_deg")
     record = read_record(path, RULE, *names)
     try:
-        return SceneLight(*(None if record[name] is None else float(record[name]) for name in names))
+        light = SceneLight(*(None if record[name] is None else float(record[name]) for name in names))
+        if not (0.0 <= light.contact < 1.0 and 0.0 <= light.cast < 1.0):
+            raise ValueError("contact and cast are shares from 0 to 1")
+        if light.sun is not None and not 1.0 <= light.elevation_deg <= 90.0:
+            raise ValueError(f"the sun stands at {light.elevation_deg:g} degrees")
+        return light
     except (TypeError, ValueError) as error:
         raise ResultError(f"{path}: not the light of a scene ({error}); delete it and rerun") from error

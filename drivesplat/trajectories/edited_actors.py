@@ -130,9 +130,8 @@ def edited_actors(
 
     `other_ids` are those of tracks that cannot be edited; no duplicate may have one. `ego_to_world` (n, 4, 4) are the
     ego poses of the drive, for steps that place an object; `insertable` has the assets of steps that insert one, by
-    their names there. Raises ConfigError, one line that
-    starts with `where` (the scene and the edit), if a step names an unknown track, changes nothing or contradicts an
-    earlier step.
+    their names there. Raises ConfigError, one line that starts with `where` (the scene and the edit), if a step names
+    an unknown track, changes nothing or contradicts an earlier step.
     """
     state = _EditState({actor.id: actor for actor in actors}, {}, frozenset(other_ids), ego_to_world, insertable)
     for number, step in enumerate(edit.steps, start=1):
@@ -292,7 +291,7 @@ def _require_possible_speed(path: ActorPath, asset: Insertable) -> None:
     limit = MAX_SPEED.get(asset.object_class, MAX_SPEED_OF_VEHICLES)
     if fastest > limit:
         raise _StepError(
-            f"its path is driven at up to {fastest:.1f} m/s, and a {asset.object_class.value} moves at most at "
+            f"it moves at up to {fastest:.1f} m/s, and the limit of the class {asset.object_class.value!r} is "
             f"{limit:g} m/s: give its points more time, or another 'speed'"
         )
 

@@ -417,7 +417,7 @@ def test_scans_meet_the_inserted_object_and_name_it(scene):
 # ---- refusals
 
 PERSON = "0002/person"
-TOO_FAST = "its path is driven at up to 15.0 m/s, and a pedestrian moves at most at 8 m/s: give its points more time"
+TOO_FAST = "it moves at up to 15.0 m/s, and the limit of the class 'pedestrian' is 8 m/s: give its points more time"
 REFUSED = {
     "a taken name": (insert(at=[9, 0], **{"as": AHEAD}),
                      f"the name '{AHEAD}' in 'as' is already used; names in use: {AHEAD}, {TURNING}, {GONE}"),

@@ -80,6 +80,11 @@ def test_a_file_holds_the_light_and_another_is_refused(tmp_path):
     for light in (OVERCAST, SceneLight(0.05, 0.3, 120.0, 50.0)):
         write_light(path, light, no_provenance())
         assert read_light(path) == light
-    path.write_text('{"contact": "dark", "cast": 0, "azimuth_deg": null, "elevation_deg": null}')
-    with pytest.raises(ResultError, match=r"light\.json: not the light of a scene"):
-        read_light(path)
+    for values, fault in {
+        '"dark", "cast": 0, "azimuth_deg": null, "elevation_deg": null': "could not convert",
+        '7, "cast": 0, "azimuth_deg": null, "elevation_deg": null': "shares from 0 to 1",
+        '0.1, "cast": 0.3, "azimuth_deg": 10, "elevation_deg": 0': "the sun stands at 0 degrees",
+    }.items():
+        path.write_text(f'{{"contact": {values}}}')
+        with pytest.raises(ResultError, match=rf"light\.json: not the light of a scene \(.*{fault}"):
+            read_light(path)

@@ -2,7 +2,8 @@
 
 asset.ply is a splat as other programs read it (`drivesplat.model.splat_ply`), with two kinds of further properties:
 `invented`, 1 for Gaussians of sides that no camera saw, and with LiDAR `lidar_0` to `lidar_7`, the `lidar_logits` of
-`Gaussians` row by row. A file without them is an asset of which all was seen, and which no LiDAR sees as its own.
+`Gaussians` row by row. A file without them is an asset of which all was seen, and without lidar_logits, as one with a
+part of the eight.
 """
 
 import json
@@ -152,12 +153,16 @@ def read_asset(folder: Path) -> Asset:
         gait = None if record["gait"] is None else _read_gait(record["gait"])
         about = {key: dict(record[key]) for key in ("quality", "source", "provenance")}
         seen = np.array(record["seen"], dtype=np.float64).reshape(-1)
+        if not np.isfinite(seen).all():
+            raise ValueError("its directions 'seen' contain NaN or Inf")
         ground = None if record["ground_color"] is None else np.array(record["ground_color"], dtype=np.float64)
         if ground is not None and (ground.shape != (3,) or not np.isfinite(ground).all()):
             raise ValueError("its ground_color is not three numbers")
         named = str(record["name"]), object_class, str(record["category"]), size
-    except (KeyError, TypeError, ValueError, ValidationError, json.JSONDecodeError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         why = f"it lacks {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
+        if isinstance(error, ValidationError):
+            why = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
         raise ResultError(f"{path}: not an asset: {why}") from error
     gaussians, invented = read_gaussians(folder / PLY)
     return Asset(*named, gaussians, invented, gait, seen, **about, ground=ground, digest=sha256_file(folder / PLY))

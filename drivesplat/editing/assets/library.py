@@ -4,7 +4,7 @@ from pathlib import Path
 
 from drivesplat.editing.assets.asset import NO_INSERTS, Asset, Inserts, read_asset
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import read_record, sha256_text
+from drivesplat.io.storage import read_record, sha256_text, unreadable
 from drivesplat.scene.light import OVERCAST, read_light
 from drivesplat.scene.tracks import matching_ids
 from drivesplat.settings.asset_references import LIGHT, asset_names, asset_of_results, files_of_asset
@@ -38,7 +38,10 @@ def _read(name: str, results: Path, method: str) -> Asset:
     if found is None:
         return read_asset(file.parent)
     index = read_record(file, RULE, "assets")
-    folders = {str(record["track"]): str(record["folder"]) for record in index["assets"]}
+    try:
+        folders = {str(record["track"]): str(record["folder"]) for record in index["assets"]}
+    except (KeyError, TypeError) as error:
+        raise unreadable(file, RULE, f"not what the rule writes (it lacks {error})") from error
     matching = matching_ids(found[2], list(folders))
     if len(matching) != 1:
         count = f"{len(matching)} assets have" if matching else "no asset has"
