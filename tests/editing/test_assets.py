@@ -177,7 +177,9 @@ RECORDS = {
     "a cycle of 1 cm": (with_gait(cycle_m=0.01), "a cycle of its gait is 0.01 m long"),
     "a gait without cycle": (lambda r: {**r, "gait": {k: v for k, v in r["gait"].items() if k != "cycle_m"}},
                              "it lacks 'cycle_m'"),
-    "a gait of unknown settings": (with_gait(gait={"legs": 4}), "validation error"),
+    "a gait of unknown settings": (with_gait(gait={"legs": 4}), "legs: Extra inputs are not permitted"),
+    "directions that are no numbers": (lambda r: {**r, "seen": [float("nan")]}, "contain NaN or Inf"),
+    "an edge without end": (lambda r: {**r, "size": [10**400, 1, 1]}, "too large"),
 }  # fmt: skip
 
 
