@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivesplat.errors import ResultError
-from drivesplat.io.storage import Provenance, read_record, write_json
+from drivesplat.io.storage import Provenance, read_record, unreadable, write_json
 
 RULE = "light"
 SHRUNK = np.array([0.95, 0.9, 0.9])
@@ -96,4 +95,4 @@ def read_light(path: str | Path) -> SceneLight:
             raise ValueError(f"the sun stands at {light.elevation_deg:g} degrees")
         return light
     except (TypeError, ValueError) as error:
-        raise ResultError(f"{path}: not the light of a scene ({error}); delete it and rerun") from error
+        raise unreadable(path, RULE, f"not the light of a scene ({error})") from error

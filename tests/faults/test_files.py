@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers import REPOSITORY
 
+from drivesplat.editing.assets.library import read_asset_index
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.lpips_map import load_alexnet
@@ -26,6 +27,7 @@ from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.provenance.file_digests import checked_digest, record_output
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.ego_mask import read_ego_mask
+from drivesplat.scene.light import read_light
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.scan_record import read_scans
 from drivesplat.scene.scene import read_scene
@@ -65,6 +67,8 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "backbone.json": (read_backbone, "lpips_backbone"),
     "alexnet.pth": (alexnet, "lpips_backbone"),
     "far.npz": (read_far, "far_gaussians"),
+    "light.json": (read_light, "light"),
+    "assets.json": (read_asset_index, "actor_assets"),
     "metrics.json": (lambda path: read_json(path, rule="scene_metrics"), "scene_metrics"),
     "splat.ply": (partial(read_splat_ply, rule="export"), "export"),
 }
@@ -151,10 +155,10 @@ def test_a_resume_state_of_any_kind_executes_nothing(tmp_path, kind):
 
 
 def test_no_script_reads_results_but_by_a_reader_that_is_tested():
-    """The first four are made of others."""
+    """The first four, and the inserts, are made of others."""
     names = "evaluation_data inputs evaluation_inputs scan_evaluation_inputs json scene ego_mask masks_record ply "
     names += "truth training_record actors lidar_depth scans triangulated summary checkpoint evaluations baselines "
-    tested = {f"read_{name}" for name in (names + "backbone far discovered").split()}
+    tested = {f"read_{name}" for name in (names + "backbone far discovered inserts").split()}
     used = {
         name.name
         for path in (REPOSITORY / "workflow_scripts").glob("*.py")

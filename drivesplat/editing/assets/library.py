@@ -37,14 +37,19 @@ def _read(name: str, results: Path, method: str) -> Asset:
     (file, *_), found = files_of_asset(name, results, method), asset_of_results(name, method)
     if found is None:
         return read_asset(file.parent)
-    index = read_record(file, RULE, "assets")
-    try:
-        folders = {str(record["track"]): str(record["folder"]) for record in index["assets"]}
-    except (KeyError, TypeError) as error:
-        raise unreadable(file, RULE, f"not what the rule writes (it lacks {error})") from error
+    folders = read_asset_index(file)
     matching = matching_ids(found[2], list(folders))
     if len(matching) != 1:
         count = f"{len(matching)} assets have" if matching else "no asset has"
         known = ", ".join(folders) or "none"
         raise ResultError(f"{file}: {count} an id starting with {found[2]!r}; there are: {known}")
     return read_asset(file.parent / folders[matching[0]])
+
+
+def read_asset_index(file: Path) -> dict[str, str]:
+    """The folders of a method's assets by their tracks, from assets.json. Raises ResultError where it is not one."""
+    index = read_record(file, RULE, "assets")
+    try:
+        return {str(record["track"]): str(record["folder"]) for record in index["assets"]}
+    except (KeyError, TypeError) as error:
+        raise unreadable(file, RULE, f"not what the rule writes (it lacks {error})") from error
