@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 ALL_AROUND = np.radians(np.arange(0.0, 360.0, 10.0))
 """The directions from which an asset of unknown origin was seen."""
+MATCHED_S = 20.0
+"""Seconds from its first on in the middle of which the colours of an inserted object are matched."""
 COLLISION_MARGIN = 0.5
 """Metres around a box within which a camera sees little but the inside of the object."""
 
@@ -71,7 +73,8 @@ def _as_it_is_lit(model: SplatModel, actor: EditedActor, step: Insert, inserts: 
     if step.shadow:
         actor = replace(actor, shade=Shade(actor.size, inserts.light))
     if step.match_exposure:
-        middle = max(0.0, 0.5 * (max(actor.path.begin, 0.0) + min(actor.path.end, max(actor.path.begin, 0.0) + 20.0)))
+        first = max(actor.path.begin, 0.0)
+        middle = 0.5 * (first + max(first, min(actor.path.end, first + MATCHED_S)))
         here = ground_color(model, middle, actor.poses(np.array([middle]))[0], float(actor.size[2]))
         gains = matching_gains(inserts.assets[step.asset].ground, here)
         if gains is not None:

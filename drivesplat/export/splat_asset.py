@@ -7,7 +7,6 @@ place.
 """
 
 import logging
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from drivesplat.export.camera_files import transforms_record
 from drivesplat.export.trained_parts import SampledGroup, digests, shown_timestamp, trained_gaussians, trained_groups
 from drivesplat.io.storage import Provenance, write_json
-from drivesplat.io.unique_names import unique_names
+from drivesplat.io.unique_names import file_stems
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.gaussians import with_sh_degree
 from drivesplat.model.splat_ply import note_of, write_splat_ply
@@ -137,8 +136,7 @@ def write_parts(
     PLYs of groups of earlier calls that are not written again are removed; other files stay.
     """
     folder, first_image = Path(path).parent, min(frame.timestamp for frame in scene.frames)
-    stems = unique_names(groups, lambda name: re.sub(r"[^A-Za-z0-9_-]", "_", name) or "_")  # valid on every system
-    files, parts = {name: f"{stem}.ply" for name, stem in stems.items()}, []
+    files, parts = {name: f"{stem}.ply" for name, stem in file_stems(groups).items()}, []
     for name, group in groups.items():
         motion, frame, moves = group.motion, "object" if group.motion else "world", None
         note = {"scene": scene.name, "piece": name, "frame": frame, **digests(provenance)}

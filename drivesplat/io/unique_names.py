@@ -1,5 +1,6 @@
-"""Unique names of groups in the syntax of other programs."""
+"""Unique names of groups in the syntax of other programs, and as files."""
 
+import re
 from collections.abc import Callable, Iterable
 
 
@@ -20,3 +21,8 @@ def unique_names(
         used.add(word.casefold())
         identifiers[name] = word
     return identifiers
+
+
+def file_stems(names: Iterable[str]) -> dict[str, str]:
+    """Unique names of files for `names` that are valid on every system, without suffix."""
+    return unique_names(names, lambda name: re.sub(r"[^A-Za-z0-9_-]", "_", name) or "_")

@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 from drivesplat.io.prefetch import prefetch
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.light import OVERCAST, SceneLight, contact_shadow, direction, hides_sun
-from drivesplat.scene.regions import fill, hull_of
+from drivesplat.scene.regions import labelled_hulls
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.splits import training_images
@@ -95,8 +95,7 @@ def _places(scene: Scene, frame: Frame, job: LightJob, random: np.random.Generat
     K, world_to_camera = continuous_intrinsics(frame, size), inverse(frame.camera_to_world)
     boxes = (box_at(track, frame.timestamp, scene.key_frame_interval) for track in scene.tracks)
     known = [box for box in boxes if box is not None and box.object_class.is_dynamic]
-    hulls = [hull for box in known if (hull := hull_of(box, world_to_camera, K)) is not None]
-    covered = np.any([np.zeros(size[::-1], dtype=bool), *(fill(hull, size) for hull in hulls)], axis=0)
+    covered = labelled_hulls(scene, frame, size)[1] >= 0
     for box in known:
         far = np.linalg.norm(apply(world_to_camera, box.object_to_world[None, :3, 3])[0]) > MAX_DISTANCE
         if box.object_class.is_vehicle and not far:

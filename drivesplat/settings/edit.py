@@ -205,7 +205,8 @@ class Insert(Settings):
     def _has_one_path(self) -> "Insert":
         if sum(given is not None for given in (self.path, self.at, self.follow)) != 1:
             raise ValueError("give one of 'path', 'at' and 'follow'")
-        _require_increasing(self.path if self.path is not None else ((0.0, 0.0, 0.0),))
+        if self.path is not None:
+            _require_increasing(self.path)
         along = {"speed": self.speed is not None, "longitudinal": self.longitudinal, "lateral": self.lateral}
         if self.follow is None and any(along.values()):
             raise ValueError(f"{next(key for key, given in along.items() if given)!r} is for an object with 'follow'")

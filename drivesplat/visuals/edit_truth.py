@@ -90,7 +90,7 @@ def measure_edit(
     edited = edited_model(model, known.recording.scene, job.camera, job.edit, where, inserts)
     metrics = {kind: RegionMetrics(None, ("object", "shadow", "outside")) for kind in ("inserted", "not_inserted")}
     by_angle = {key: RegionMetrics(None, ("object",)) for key in ANGLES}
-    overlaps, depths, unchanged, frames = [], [], [], []
+    overlaps, depths, untouched, count, shown = [], [], np.zeros(2, dtype=np.int64), 0, []
     with explain_out_of_memory(lambda: len(edited.model)):
         for frame in edit_frames(known, edited, job.camera, name, inserted, device):
             masks = frame.regions
@@ -101,29 +101,29 @@ def measure_edit(
                     if pixels.any() and low <= frame.angles.get(id, 180.0) < high:
                         own = by_angle[key]
                         own.add(own.measure(frame.rendered, frame.truth, {"object": pixels}))
-                shown = frame.shown[id]
                 if pixels.any():
-                    overlaps.append((int((shown & pixels).sum()), int((shown | pixels).sum())))
-            untouched = masks["outside"] & ~np.any([*frame.shown.values()], axis=0)
-            unchanged.append(np.abs(frame.rendered - frame.without).max(axis=2)[untouched])
+                    overlaps.append([int(both.sum()) for both in (frame.shown[id] & pixels, frame.shown[id] | pixels)])
+            elsewhere = masks["outside"] & ~np.any([*frame.shown.values()], axis=0)
+            changed = np.abs(frame.rendered - frame.without).max(axis=2)[elsewhere] > CHANGED
+            untouched += np.count_nonzero(changed), changed.size
             depths.append(frame.depth_errors)
-            frames.append(frame)
-    if not frames:
+            shown = sorted([*shown, (-int(masks["object"].sum()), count, frame)], key=lambda one: one[:2])[:SHOWN]
+            count += 1
+    if not count:
         raise DatasetError(f"the truth of this world has no image of {job.camera} after edit {name!r}")
     both, either = np.sum(overlaps, axis=0) if overlaps else (0, 0)
-    changed = np.concatenate(unchanged)
     record = {
         "schema": 1,
         "camera": job.camera,
         "edit": job.edit.model_dump(mode="json"),
-        "frames": len(frames),
+        "frames": count,
         "inserted": {**metrics["inserted"].summary(), **depth_summary(depths)},
         "not_inserted": metrics["not_inserted"].summary(),
         "by_angle_deg": {key: own.summary()["object"] for key, own in by_angle.items()},
         "mask_iou": float(both / either) if either else None,
-        "changed_elsewhere": float((changed > CHANGED).mean()) if len(changed) else None,
+        "changed_elsewhere": float(untouched[0] / untouched[1]) if untouched[1] else None,
     }
-    return record, picture(frames)
+    return record, picture([frame for _, _, frame in sorted(shown, key=lambda one: one[1])])
 
 
 @torch.no_grad()
@@ -171,10 +171,6 @@ def _angle(actor: EditedActor, frame: Frame, at: np.ndarray) -> float:
 
 
 def picture(frames: Sequence[EditFrame]) -> np.ndarray:
-    """A row of images (true, rendered, without the objects) of each of up to SHOWN frames in which most of the inserted
-    objects is seen."""
-    most = sorted(range(len(frames)), key=lambda i: -int(frames[i].regions["object"].sum()))
-    rows = [
-        np.concatenate([frames[i].truth, frames[i].rendered, frames[i].without], axis=1) for i in sorted(most[:SHOWN])
-    ]
+    """A row of images of each frame: true, rendered, without the objects."""
+    rows = [np.concatenate([frame.truth, frame.rendered, frame.without], axis=1) for frame in frames]
     return (np.concatenate(rows) * 255.0 + 0.5).astype(np.uint8)

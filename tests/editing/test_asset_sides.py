@@ -136,12 +136,12 @@ def whole(rear) -> Asset:
 
 def nearest(asset: Asset, azimuth: float) -> torch.Tensor:
     """The depth (h, w) of what a camera sees, 0 where it sees nothing."""
-    return seen_asset(asset, AssetView(azimuth, np.radians(3.0), 4.0))[0].surface_depth
+    return seen_asset(asset, [AssetView(azimuth, np.radians(3.0), 4.0)])[0][0].surface_depth
 
 
 def test_a_hull_is_not_seen_from_where_the_car_was_seen(rear, whole):
     camera = AssetView(np.pi, np.radians(3.0), 4.0)
-    before, after = (seen_asset(asset, camera)[0] for asset in (rear, whole))
+    before, after = (seen_asset(asset, [camera])[0][0] for asset in (rear, whole))
     assert len(whole.gaussians) > 2 * len(rear.gaussians)
     inside = before.alpha > 0.9
     difference = (after.splats - before.splats).abs().amax(dim=2)
@@ -152,7 +152,7 @@ def test_a_hull_is_not_seen_from_where_the_car_was_seen(rear, whole):
 
 def test_a_hull_closes_the_car_at_its_front_within_its_box(rear, whole):
     camera = AssetView(0.0, np.radians(3.0), 4.0)
-    picture, view = seen_asset(whole, camera)
+    ((picture, view),) = seen_asset(whole, [camera])
     assert float(picture.alpha[view.height // 2, view.width // 2]) > 0.95
     depths = [float(nearest(asset, 0.0)[view.height // 2, view.width // 2]) for asset in (whole, rear)]
     away = 4.0 * np.linalg.norm(CAR)

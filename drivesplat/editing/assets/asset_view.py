@@ -1,5 +1,6 @@
 """An asset alone, as a camera beside it sees it."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +40,9 @@ class AssetView:
 
 
 @torch.no_grad()
-def seen_asset(asset: Asset, camera: AssetView) -> tuple[Picture, View]:
-    """The picture of an asset, with the depth of its surfaces, and its view."""
+def seen_asset(asset: Asset, cameras: Iterable[AssetView]) -> list[tuple[Picture, View]]:
+    """The picture of an asset by each camera, with the depth of its surfaces, and the view."""
     model = SplatModel([part_of("asset", asset, None)], None).requires_grad_(False)
-    want, view = Want(placements=(ActorPlacement("asset", object_to_world=np.eye(4)),)), camera.of(asset.size)
-    return model.render(view, gaussians=model.at(0.0, want), with_surface_depth=True), view
+    gaussians = model.at(0.0, Want(placements=(ActorPlacement("asset", object_to_world=np.eye(4)),)))
+    views = [camera.of(asset.size) for camera in cameras]
+    return [(model.render(view, gaussians=gaussians, with_surface_depth=True), view) for view in views]

@@ -110,8 +110,9 @@ def filled(asset: Asset) -> Asset:
 def _hidden(places: Float[Tensor, "n 3"], asset: Asset) -> Bool[Tensor, " n"]:
     """Whether an asset hides places in its frame from all directions from which it was seen."""
     hidden = torch.ones(len(places), dtype=torch.bool)
-    for azimuth in np.unique(np.round(asset.seen / VIEW_STEP)) * VIEW_STEP:
-        picture, view = seen_asset(asset, AssetView(float(azimuth), SEEN_ELEVATION, SEEN_DIAGONALS))
+    azimuths = np.unique(np.round(asset.seen / VIEW_STEP)) * VIEW_STEP
+    cameras = (AssetView(azimuth, SEEN_ELEVATION, SEEN_DIAGONALS) for azimuth in azimuths.tolist())
+    for picture, view in seen_asset(asset, cameras):
         depth = picture.surface_depth
         assert depth is not None
         local = places @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]

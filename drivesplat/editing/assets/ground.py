@@ -22,9 +22,10 @@ def ground_color(
     """The median colour, RGB in [0, 1], of the ground about an object of this height (metres) at a pose and a time;
     None where it is not known."""
     pose, found = torch.from_numpy(object_to_world).float(), []
-    for part, own in zip(model.parts, model.sample(model.states(time)), strict=True):
+    for part in model.parts:
         if part.has_objects or part.moves:
             continue
+        own = part.sample(part.state(time))
         placed = pose.to(own.means)
         local = (own.means - placed[:3, 3]) @ placed[:3, :3]
         near = (local[:, :2].norm(dim=1) < REACH) & ((local[:, 2] + height / 2.0).abs() < LAYER)

@@ -1,7 +1,6 @@
 """The stage `actor_assets`: the actors of a trained model as assets, with a turntable of each and an index."""
 
 import logging
-import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ from drivesplat.editing.assets.completion import completed, filled
 from drivesplat.editing.assets.extraction import assets_of
 from drivesplat.editing.assets.turntable import write_turntable
 from drivesplat.io.storage import Provenance, write_json
-from drivesplat.io.unique_names import unique_names
+from drivesplat.io.unique_names import file_stems
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.asset_references import RECORD
@@ -39,7 +38,7 @@ def write_assets(
     for record in path.parent.glob(f"*/{RECORD}"):
         shutil.rmtree(record.parent)
     found = list(assets_of(trained_model(checkpoint), scene, job.holdout, method, quality, provenance))
-    folders = unique_names((asset.source["track"] for asset in found), lambda id: re.sub(r"[^A-Za-z0-9_-]", "_", id))
+    folders = file_stems(asset.source["track"] for asset in found)
     records = []
     for asset in found:
         track = asset.source["track"]

@@ -27,9 +27,8 @@ def write_turntable(path: Path, asset: Asset) -> None:
 
 def turntable(asset: Asset, views: int = VIEWS) -> list[np.ndarray]:
     """Pictures (h, w, 3) uint8 of an asset from directions all around it, the first from its front."""
-    found = []
-    for azimuth in 2.0 * np.pi * np.arange(views) / views:
-        picture, _ = seen_asset(asset, AssetView(float(azimuth)))
+    found, azimuths = [], 2.0 * np.pi * np.arange(views) / views
+    for picture, _ in seen_asset(asset, map(AssetView, azimuths.tolist())):
         shown = picture.splats + BACKDROP * (1.0 - picture.alpha[..., None])
         found.append((255.0 * shown.clamp(0.0, 1.0)).round().to(torch.uint8).numpy())
     return found
