@@ -34,6 +34,7 @@ from drivesplat.lidar.scans import SensorPoses
 from drivesplat.model.checkpoint import STATE, open_model, read_checkpoint, read_snapshot
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
@@ -157,6 +158,13 @@ class TrainedDrive(Sensors):
             return None
         inserts = read_inserts(self.edit, self.folder)
         return edited_model(self.model, self.scene, self._reference, self.edit, self.where, inserts)
+
+    @cached_property
+    def _fixed(self) -> FixedModel:
+        """The model after the edit, to render from."""
+        if self._edited is not None and self._edited.model is not self.model:
+            return FixedModel(self._edited.model)
+        return FixedModel(self.model) if self.before is None else self.before._fixed
 
     @cached_property
     def _recorded_actors(self) -> list[EditedActor]:
@@ -306,9 +314,8 @@ class TrainedDrive(Sensors):
         if outside == "refuse" and not 0.0 <= time <= self.duration:
             raise RequestError(f"{self.recording.outside(time)}; outside='clamp' renders its start or its end")
         inside = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else time
-        model = self.model if self._edited is None else self._edited.model
         now = float(self.recording.checked(inside))
-        return WorldState(model, self.edited_actors, self._static, self, now, self.edit is None)
+        return WorldState(self._fixed, self.edited_actors, self._static, self, now, self.edit is None)
 
     @overload
     def render(

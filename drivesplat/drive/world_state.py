@@ -23,6 +23,7 @@ from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.tracks import Box
@@ -61,7 +62,7 @@ class SampledWorld:
     """A drive at a `time`: the `actors` of the model with their places, and the objects that it shows in its `static`
     part. `as_recorded`: no object was moved, added or removed."""
 
-    model: SplatModel
+    fixed: FixedModel
     time: float
     actors: tuple[WorldActor, ...]
     static: ShownObjects
@@ -70,12 +71,17 @@ class SampledWorld:
     @cached_property
     def placed(self) -> PlacedModel:
         """The model with the actors at their places."""
-        return PlacedModel(self.model, self.time, [actor.placement for actor in self.actors])
+        return PlacedModel(self.fixed, self.time, [actor.placement for actor in self.actors])
 
     @cached_property
     def shown(self) -> PlacedModel:
         """The model that images show: as recorded where nothing was changed, as films of the recorded drive do."""
-        return PlacedModel(self.model, self.time) if self.as_recorded else self.placed
+        return PlacedModel(self.fixed, self.time) if self.as_recorded else self.placed
+
+    @property
+    def model(self) -> SplatModel:
+        """The model, with objects as recorded."""
+        return self.fixed.model
 
     @property
     def device(self) -> torch.device:
@@ -186,7 +192,7 @@ class WorldState:
 
     def __init__(
         self,
-        model: SplatModel,
+        fixed: FixedModel,
         actors: Sequence[EditedActor],
         static: ShownObjects,
         sensors: Sensors,
@@ -195,7 +201,7 @@ class WorldState:
     ):
         """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of."""
         self.time, now = time, np.array([time])
-        self._model, self._static = model, static
+        self._fixed, self._static = fixed, static
         self._sensors, self._as_recorded = sensors, as_recorded
         self._taken = {item.id for item in (*actors, *static.others)}
         absent = {item.id: "is not there at this time" for item in actors}
@@ -278,7 +284,7 @@ class WorldState:
         at = GivenPose.checked("the camera", ego_to_world, camera_to_world, velocity)
         placed = [self._sensors.placed_camera(one, self.time, at) for one in cameras]
         world = self._sampled()
-        with explain_out_of_memory(lambda: len(self._model)):
+        with explain_out_of_memory(lambda: len(self._fixed.model)):
             views = [world.image(one, outputs) for one in placed]
         return views if several else views[0]
 
@@ -304,10 +310,10 @@ class WorldState:
         """
         at = GivenPose.checked("the LiDAR", ego_to_world, sensor_to_world, velocity)
         sensor, spread = self._sensors.placed_lidar(lidar, self.time, at)
-        with explain_out_of_memory(lambda: len(self._model)):
+        with explain_out_of_memory(lambda: len(self._fixed.model)):
             return self._sampled().scan(sensor, spread)
 
     def _sampled(self) -> SampledWorld:
         actors = tuple(self.actors.values())
         as_recorded = self._as_recorded and not any(actor.changed for actor in actors)
-        return SampledWorld(self._model, self.time, actors, self._static, as_recorded)
+        return SampledWorld(self._fixed, self.time, actors, self._static, as_recorded)

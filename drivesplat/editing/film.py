@@ -19,6 +19,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, recorded_shot, shot_of, write_film
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.images import write_png
@@ -145,8 +146,9 @@ def edited_frames(
     model: SplatModel, views: Iterable[View], actors: Sequence[EditedActor], seconds: np.ndarray
 ) -> Iterator[np.ndarray]:
     """The rendering of each view, of `seconds` (n,), with the actors as they then are, (h, w, 3) uint8 each."""
-    pairs = zip(views, placed_models(model, actors, seconds), strict=True)
-    return film_frames(model, ((view, placed.sets_in(view)) for view, placed in pairs))
+    fixed = FixedModel(model)
+    pairs = zip(views, placed_models(fixed, actors, seconds), strict=True)
+    return film_frames(fixed, ((view, placed.sets_in(view)) for view, placed in pairs))
 
 
 class Still:

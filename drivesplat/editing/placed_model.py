@@ -12,11 +12,11 @@ from torch import Tensor
 from drivesplat.editing.shading import shaded
 from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.picture import Picture
 from drivesplat.model.scans import ScanPicture, ScanView, group_met
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN, Want, want_of
 from drivesplat.model.view import View
+from drivesplat.rendering.fixed_model import FixedModel, RenderedImage
 from drivesplat.trajectories.edited_actors import EditedActor
 from drivesplat.trajectories.motion import HALF_STEP
 
@@ -29,22 +29,27 @@ class PlacedModel:
     Gaussians are sampled once for all cameras with a global shutter, once for those with a rolling one, and once for
     LiDARs.
 
-    >>> placed = PlacedModel(model, 4.2, [ActorPlacement("bf53", object_to_world=pose)])
+    >>> placed = PlacedModel(FixedModel(model), 4.2, [ActorPlacement("bf53", object_to_world=pose)])
     >>> image, car = placed.render(view).image, placed.objects_in(view) == 0
     """
 
-    model: SplatModel
+    fixed: FixedModel
     time: float
     placements: Sequence[ActorPlacement] | None = None
     _sets: dict[Want, Sequence[Gaussians]] = field(default_factory=dict, repr=False)
     _joined: dict[Want, Gaussians] = field(default_factory=dict, repr=False)
+
+    @property
+    def model(self) -> SplatModel:
+        """The model, with objects as recorded."""
+        return self.fixed.model
 
     def sets_in(self, view: View | ScanView) -> Sequence[Gaussians]:
         """The Gaussians that a view shows: a set of each part of the model."""
         want = self._wanted(view)
         if want not in self._sets:
             wanted = want if self.placements is None else replace(want, placements=tuple(self.placements))
-            sets = self.model.sample(self.model.states(self.time, wanted), wanted)
+            sets = self.fixed.sample(self.time, wanted)
             self._sets[want] = self._in_shadow(sets) if want.colors else sets
         return self._sets[want]
 
@@ -55,13 +60,13 @@ class PlacedModel:
             self._joined[want] = concatenate(self.sets_in(view))
         return self._joined[want]
 
-    def render(self, view: View) -> Picture:
+    def render(self, view: View, with_surface_depth: bool = False) -> RenderedImage:
         """What a camera sees."""
-        return self.model.render(view, gaussians=self.sets_in(view))
+        return self.fixed.render(view, self.sets_in(view), with_surface_depth)
 
     def surface_depth(self, view: View) -> Float[Tensor, "h w"]:
         """The depth in metres along the camera's axis of the surfaces that an image shows; 0 where there are none."""
-        depth = self.model.render(view, gaussians=self.sets_in(view), with_surface_depth=True).surface_depth
+        depth = self.render(view, with_surface_depth=True).surface_depth
         assert depth is not None
         return depth
 
@@ -114,8 +119,11 @@ def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list
     return result
 
 
-def placed_models(model: SplatModel, actors: Sequence[EditedActor], seconds: np.ndarray) -> Iterator[PlacedModel]:
+def placed_models(
+    model: SplatModel | FixedModel, actors: Sequence[EditedActor], seconds: np.ndarray
+) -> Iterator[PlacedModel]:
     """The model at each of `seconds` (n,) with the actors that are then present. The index of an object is that among
     those present, in the order of `actors`."""
+    fixed = model if isinstance(model, FixedModel) else FixedModel(model)
     for time, placements in zip(seconds.tolist(), actor_placements(actors, seconds), strict=True):
-        yield PlacedModel(model, time, placements)
+        yield PlacedModel(fixed, time, placements)

@@ -51,17 +51,22 @@ class Posed(NamedTuple):
 
 def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:
     """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
-    quats, translations, sizes = poses.quats.clone(), poses.translations.clone(), poses.sizes.clone()
-    presence = torch.zeros_like(poses.presence)
-    for placement in placements:
-        i, pose = ids.index(placement.source), placement.object_to_world
-        presence[i], sizes[i] = poses.presence[i], placement.scale
-        if pose is not None:
-            presence[i] = 1.0
-            turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
-            quats[i] = torch.from_numpy(turned).to(quats)
-            translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
-    return ObjectPoses(quats, translations, sizes, presence)
+    if not placements:
+        return poses._replace(presence=torch.zeros_like(poses.presence))
+    edited = [placement.object_to_world for placement in placements]
+    matrices = np.stack([np.eye(4) if pose is None else pose for pose in edited])
+    turned = Rotation.from_matrix(matrices[:, :3, :3]).as_quat(scalar_first=True)
+    scales, is_edited = [placement.scale for placement in placements], [pose is not None for pose in edited]
+    values = np.column_stack([turned, matrices[:, :3, 3], scales, is_edited])
+    given = torch.from_numpy(values).to(poses.quats)  # one copy to the device
+    rows = torch.tensor([ids.index(placement.source) for placement in placements], device=given.device)
+    moved = given[:, 8:] > 0.0
+    return ObjectPoses(
+        poses.quats.index_copy(0, rows, torch.where(moved, given[:, :4], poses.quats[rows])),
+        poses.translations.index_copy(0, rows, torch.where(moved, given[:, 4:7], poses.translations[rows])),
+        poses.sizes.index_copy(0, rows, given[:, 7]),
+        torch.zeros_like(poses.presence).index_copy(0, rows, given[:, 8].maximum(poses.presence[rows])),
+    )
 
 
 def with_walked(

@@ -128,10 +128,9 @@ class Actors(Part):
             found = self._placed(want, self._moved(now, own), *beside)
             if want.colors:
                 found = with_colors(found, self.ids, owner, own)
-            numbers = owner.new_full((len(self.ids),), -1)
-            for i, placement in zip(chosen, own, strict=True):
-                numbers[self.ids.index(placement.source)] = i
-            sets.append(replace(found, placement=numbers[owner])[rows])
+            numbers = {placement.source: i for i, placement in zip(chosen, own, strict=True)}
+            placed = torch.tensor([numbers.get(id, -1) for id in self.ids], device=owner.device)
+            sets.append(replace(found, placement=placed[owner])[rows])
         return concatenate(sets)
 
     def _placed(self, want: Want, now: Posed, *around: Posed) -> Gaussians:

@@ -33,6 +33,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanView
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rasterization.scans import RayGrid
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.light import OVERCAST, SceneLight, write_light
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import rigid
@@ -72,12 +73,14 @@ def test_an_asset_looks_as_its_actor_does_from_the_side_to_which_it_is_turned(tu
     pose = straight(0.0) @ rigid(about_z(np.radians(turned)), np.zeros(3))
     view, whole = looking_at(pose[:3, 3], [2.0, -1.0, 2.0]), with_assets(model, {IT: asset})
     images = [
-        PlacedModel(whole, 0.0, [ActorPlacement(name, pose, 1.2)] if name else []).render(view).image
+        PlacedModel(FixedModel(whole), 0.0, [ActorPlacement(name, pose, 1.2)] if name else []).render(view).image
         for name in (AHEAD, IT, None)
     ]
     torch.testing.assert_close(images[1], images[0], atol=2e-4, rtol=0.0)
     assert (images[0] - images[2]).abs().max() > 0.2
-    elsewhere = PlacedModel(whole, 0.0, [ActorPlacement(IT, straight(0.0) @ rigid(about_z(1.0), np.zeros(3)), 1.2)])
+    elsewhere = PlacedModel(
+        FixedModel(whole), 0.0, [ActorPlacement(IT, straight(0.0) @ rigid(about_z(1.0), np.zeros(3)), 1.2)]
+    )
     assert (elsewhere.render(view).image - images[0]).abs().max() > 0.05
 
 
@@ -85,9 +88,9 @@ def test_an_asset_shows_nothing_until_it_is_placed(model, scene):
     whole = with_assets(model, {IT: asset_in(model, scene)})
     assert len(whole) == len(model) + 30 and len(whole.parts) == len(model.parts) + 1
     view = looking_at(straight(1.0)[:3, 3], [2.0, -1.0, 2.0], time=1.0)
-    assert torch.equal(PlacedModel(whole, 1.0).render(view).image, model.render(view).image)
+    assert torch.equal(PlacedModel(FixedModel(whole), 1.0).render(view).image, model.render(view).image)
     for placements in ([], [ActorPlacement(TURNING)]):
-        images = [PlacedModel(own, 1.0, placements).render(view).image for own in (whole, model)]
+        images = [PlacedModel(FixedModel(own), 1.0, placements).render(view).image for own in (whole, model)]
         assert torch.equal(*images)
     assert with_assets(model, {}) is model
 
@@ -124,12 +127,12 @@ def test_a_lidar_measures_of_an_asset_what_it_measures_of_its_actor(scene):
     assert asset.gaussians.lidar_logits[:, 1:].abs().mean() > 0.1
     whole, pose = with_assets(model, {IT: asset}), straight(0.0) @ rigid(about_z(np.pi / 2.0), np.zeros(3))
     view = beams((1.0, -2.0, 2.0), pose[:3, 3])
-    scans = [PlacedModel(whole, 0.0, [ActorPlacement(name, pose)]).scan(view) for name in (AHEAD, IT)]
+    scans = [PlacedModel(FixedModel(whole), 0.0, [ActorPlacement(name, pose)]).scan(view) for name in (AHEAD, IT)]
     for name in ("range", "intensity", "returned", "alpha"):
         torch.testing.assert_close(getattr(scans[1], name), getattr(scans[0], name), atol=1e-4, rtol=1e-4)
     assert (scans[0].range[scans[0].alpha > 0.5] < 15.0).sum() > 20
     plain = replace(asset, gaussians=replace(asset.gaussians, lidar_logits=None))
-    mean = PlacedModel(with_assets(model, {IT: plain}), 0.0, [ActorPlacement(IT, pose)]).scan(view)
+    mean = PlacedModel(FixedModel(with_assets(model, {IT: plain})), 0.0, [ActorPlacement(IT, pose)]).scan(view)
     torch.testing.assert_close(mean.range, scans[0].range, atol=1e-4, rtol=1e-4)
     assert (mean.intensity - scans[0].intensity).abs().max() > 0.02
 
@@ -150,7 +153,7 @@ def test_a_model_without_lidar_stays_so(model, scene):
     whole = with_assets(model, {IT: asset})
     assert all("lidar_logits" not in part.params for part in whole.parts)
     with pytest.raises(ResultError, match="trained without LiDAR"):
-        PlacedModel(whole, 0.0, [ActorPlacement(IT, np.eye(4))]).scan(beams((5.0, 0.0, 0.0), np.zeros(3)))
+        PlacedModel(FixedModel(whole), 0.0, [ActorPlacement(IT, np.eye(4))]).scan(beams((5.0, 0.0, 0.0), np.zeros(3)))
 
 
 def test_the_limbs_of_an_asset_follow_the_distance_that_it_walks():

@@ -18,6 +18,7 @@ from drivesplat.errors import ResultError
 from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.light import RIM, SceneLight, Shade, direction, read_light, write_light
 from drivesplat.scene.rigid import rigid
 
@@ -147,7 +148,7 @@ def road() -> SplatModel:
 
 def placed(model: SplatModel, light: SceneLight | None) -> PlacedModel:
     shade = None if light is None else Shade(CAR, light)
-    return PlacedModel(model, 1.0, [ActorPlacement("car", POSE, shade=shade)])
+    return PlacedModel(FixedModel(model), 1.0, [ActorPlacement("car", POSE, shade=shade)])
 
 
 @pytest.mark.parametrize("light", [DULL, FROM_LEFT], ids=["dull", "sunny"])
@@ -179,7 +180,9 @@ def test_objects_are_not_darkened(road):
     beside = rigid(np.eye(3), np.array([20.0, -2.2, 0.75]))
     shade = Shade(CAR, FROM_LEFT)
     sets = [
-        PlacedModel(road, 1.0, [ActorPlacement("car", POSE, shade=own), ActorPlacement("car", beside)]).sets_in(VIEW)
+        PlacedModel(
+            FixedModel(road), 1.0, [ActorPlacement("car", POSE, shade=own), ActorPlacement("car", beside)]
+        ).sets_in(VIEW)
         for own in (None, shade)
     ]
     assert torch.equal(sets[1][1].sh0, sets[0][1].sh0) and torch.equal(sets[1][2].sh0, sets[0][2].sh0)
@@ -188,7 +191,7 @@ def test_objects_are_not_darkened(road):
 
 
 def test_as_recorded_nothing_has_a_shadow(road):
-    shown = PlacedModel(road, 1.0).gaussians_in(VIEW)
+    shown = PlacedModel(FixedModel(road), 1.0).gaussians_in(VIEW)
     assert torch.equal(shown.sh0[: len(road.parts[0])], road.parts[0].params["sh0"])
 
 
