@@ -351,13 +351,14 @@ rule lidar_film:
 rule edit_truth:
     """
     Compares an edited drive with the truth of a synthetic world in which the edit happened: the errors of inserted
-    objects, of their shadows, and of the rest of the image.
+    objects, of their shadows, and of the rest of the image; and of LiDAR, if the method renders it.
     """
     input:
         scene=plan.annotated_scene,
         truth=plan.truth,
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         parser=plan.of_tracks("parser.npz"),
+        scans=plan.measured_scans,
         masks="<results>/{scene}/masks/masks.json",
         inserts=plan.inserts,
     output:

@@ -9,6 +9,7 @@ from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.evaluation_data import read_evaluation_data
 from drivesplat.scene.images import write_png
+from drivesplat.scene.scan_record import read_scans
 from drivesplat.settings.render import EditJob
 from drivesplat.visuals.edit_truth import measure_edit
 
@@ -18,7 +19,9 @@ with job(snakemake, dataset=("images",)) as current:
     checkpoint, known = read_checkpoint(files.checkpoint), DriveTruth.read(files.truth[0], recording)
     inserts = read_inserts(settings.edit, Path(files.checkpoint).parent)
     inputs = {"truth": sha256_file(known.path), **digests_of(inserts)}
-    provenance = current.provenance(*upstream, checkpoint.provenance, inputs=inputs)
-    record, picture = measure_edit(checkpoint, known, settings, wildcards.edit, inserts, current.device())
+    of_scans = () if scans is None else (scans.provenance,)
+    provenance = current.provenance(*upstream, checkpoint.provenance, *of_scans, inputs=inputs)
+    scans = next(map(read_scans, files.scans), None)
+    record, picture = measure_edit(checkpoint, known, settings, wildcards.edit, inserts, current.device(), scans)
     write_png(current.output.picture, picture)
     write_json(current.output.figures, {**record, "provenance": provenance})

@@ -93,7 +93,7 @@ class RecordedDrive:
         """A sentence about a time outside of the recording."""
         return f"{self.where} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s"
 
-    def camera(self, name: str, exposure: bool, rolling_shutter: bool) -> PoseableCamera:
+    def camera(self, name: str, exposure: bool = False, rolling_shutter: bool = False) -> PoseableCamera:
         """A recorded camera: see `TrainedDrive.camera`."""
         index, frame = self.first_image(name)
         width, height = self.record.image_size(index)
@@ -104,6 +104,16 @@ class RecordedDrive:
             width, height, self.record.Ks[index].astype(np.float64), frame.camera_to_ego, name if exposure else None,
             name, readout, covered=tuple(self.ego_mask.outlines.get(name, ())),
         )  # fmt: skip
+
+    def camera_of_name(self, name: str) -> PoseableCamera:
+        """The same as `camera`, made once: not to be given to a caller that could change it."""
+        if name not in self._named_cameras:
+            self._named_cameras[name] = self.camera(name)
+        return self._named_cameras[name]
+
+    @cached_property
+    def _named_cameras(self) -> dict[str, PoseableCamera]:
+        return {}
 
     def first_image(self, name: str) -> tuple[int, Frame]:
         """The first image of a camera and its index. Raises RequestError for an unknown camera."""

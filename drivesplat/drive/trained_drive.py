@@ -248,7 +248,7 @@ class TrainedDrive(Sensors):
 
     def placed_camera(self, camera: AnyCamera, time: float, at: GivenPose = AS_DRIVEN) -> PlacedCamera:
         """A camera at a time; see `WorldState.render`."""
-        known = self.camera(camera) if isinstance(camera, str) else camera
+        known = self.recording.camera_of_name(camera) if isinstance(camera, str) else camera
         if not isinstance(known, PoseableCamera):
             raise RequestError(f"a camera is a name or a drivesplat.Camera, not {camera!r}")
         if at.sensor_to_world is not None:

@@ -56,9 +56,11 @@ class ScanTruth:
         recorded = {tokens.get((scan.lidar, scan.timestamp), ""): scan for scan in records.scans}
         return cls(truth, path, scene, recorded, rays, order, own_car_radius)
 
-    def scans(self, left_m: float = 0.0, without: str | None = None) -> Iterator[tuple[RecordedScan, TruthScan]]:
-        """The true scans from so far to the left, or without an instance, as recorded ones, each with its own record of
-        the drive as it was: those of recorded key frames.
+    def scans(
+        self, left_m: float = 0.0, without: str | None = None, edit: str | None = None
+    ) -> Iterator[tuple[RecordedScan, TruthScan, TruthScan]]:
+        """The true scans from so far to the left, without an instance, or after an edit, as recorded ones: those of
+        recorded key frames. Each with the true scan itself, and with that of the drive as it was.
 
         The offset from the recorded pose is that between the true poses, so that errors of recorded poses do not shift
         the rays against their truth.
@@ -68,7 +70,7 @@ class ScanTruth:
         for number, token in self.truth.instances.items():
             numbers[int(number)] = indices.get(token, NO_OBJECT)
         true_scans = self.truth.scans_of()
-        for token, found in self.truth.scans_of(left_m, without).items():
+        for token, found in self.truth.scans_of(left_m, without, edit).items():
             recorded, true_scan = self.recorded.get(token), true_scans.get(token)
             if recorded is None or true_scan is None:
                 continue
@@ -85,13 +87,13 @@ class ScanTruth:
                 objects=np.where(returned, numbers[instances], NO_OBJECT).astype(np.int16),
                 blocked=np.zeros(ranges.shape, dtype=bool),
             )
-            yield known, true_scan
+            yield known, found, true_scan
 
-    def met(self, found: TruthScan, instance: str) -> np.ndarray:
-        """The rays (b, a) bool of a true scan that met an instance."""
-        number = next(int(number) for number, token in self.truth.instances.items() if token == instance)
-        (instances,) = self._arrays(found, "instance")
-        return instances == number
+    def met(self, found: TruthScan, *instances: str) -> np.ndarray:
+        """The rays (b, a) bool of a true scan that met one of some instances."""
+        numbers = [int(number) for number, token in self.truth.instances.items() if token in instances]
+        (met,) = self._arrays(found, "instance")
+        return np.isin(met, numbers)
 
     def _arrays(self, found: TruthScan, *names: str) -> list[np.ndarray]:
         """Arrays (b, a) of a scan's file, by increasing azimuth."""
@@ -126,7 +128,7 @@ def lateral_scan_metrics(
     each by region: see `scan_metrics`. `beam_spread` in radians."""
     found = {}
     for left_m in known.truth.left_of_scans:
-        scans = (scan for scan, _ in known.scans(left_m))
+        scans = (scan for scan, _, _ in known.scans(left_m))
         pairs = ((scan, rendered_scan(model, scan, beam_spread, device)) for scan in scans)
         found[str(float(left_m))] = scan_metrics(known.scene, pairs)
     return found
@@ -145,7 +147,7 @@ def removal_scan_metrics(
     pools = {key: {rays: ScanPool() for rays in REMOVAL_RAYS} for key in ("removed", "not_removed")}
     measured = False
     track, interval = known.scene.track(leading), known.scene.key_frame_interval
-    for scan, before in known.scans(without=leading):
+    for scan, _, before in known.scans(without=leading):
         shadow, box = known.met(before, leading), box_at(track, scan.timestamp, interval) if track else None
         if box is None or not shadow.any():
             continue

@@ -99,9 +99,13 @@ class DriveTruth:
         recorded = self.truth.recorded(camera)
         return {index: truth.classes for index, truth in self.frames(recorded)} if recorded else {}
 
+    def instance_of(self, name: str) -> str:
+        """The instance of an object that an edit adds under this name."""
+        return token(self.truth.scene, "instance", name)
+
     def number_of(self, name: str) -> int:
         """The number in instance images of an object that an edit adds under this name; -1 without any."""
-        own = token(self.truth.scene, "instance", name)
+        own = self.instance_of(name)
         return next((int(number) for number, known in self.truth.instances.items() if known == own), -1)
 
     def instances(self, name: str, size: tuple[int, int]) -> np.ndarray:

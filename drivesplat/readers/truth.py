@@ -114,10 +114,12 @@ class Truth:
         """The views of a camera after an edit."""
         return [view for view in self.views if view.camera == camera and view.edit == edit]
 
-    def scans_of(self, left_m: float = 0.0, without: str | None = None) -> dict[str, TruthScan]:
-        """The scans of the drive as it was, from so far to the left and without that instance, by the token of their
-        sample_data."""
-        wanted = (scan for scan in self.scans if scan.edit is None and scan.without == without)
+    def scans_of(
+        self, left_m: float = 0.0, without: str | None = None, edit: str | None = None
+    ) -> dict[str, TruthScan]:
+        """The scans of the drive as it was or after an edit, from so far to the left and without that instance, by the
+        token of their sample_data."""
+        wanted = (scan for scan in self.scans if scan.edit == edit and scan.without == without)
         return {scan.token: scan for scan in wanted if scan.left_m == left_m}
 
     @property

@@ -17,6 +17,17 @@ def to_uint8(colors: Float[Tensor, "*n 3"]) -> UInt8[Tensor, "*n 3"]:
 
 def uint8_image(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     """Colours in [0, 1] as the nearest uint8, in main memory. Raises ResultError where one is NaN or Inf."""
-    if not torch.isfinite(image).all():
+    finite, pixels = (to_host(values) for values in (torch.isfinite(image).all(), to_uint8(image)))
+    if image.is_cuda:
+        torch.cuda.current_stream(image.device).synchronize()
+    if not finite:
         raise ResultError(NOT_FINITE)
-    return to_uint8(image).cpu().numpy()
+    return pixels.numpy()
+
+
+def to_host(values: Tensor) -> Tensor:
+    """A copy in main memory; from a GPU an asynchronous one in pinned memory, which is several times faster than one
+    into pageable memory."""
+    if not values.is_cuda:
+        return values
+    return torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)

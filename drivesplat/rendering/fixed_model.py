@@ -102,29 +102,30 @@ class FixedModel:
 
     @torch.no_grad()
     def render(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool = False) -> RenderedImage:
-        """Renders a set of Gaussians of each part. Waits for a GPU, so that no Gaussian is missing."""
-        if not self._captures:
+        """Renders a set of Gaussians of each part. Waits for a GPU, so that no Gaussian is missing. The depth of
+        surfaces is rendered without a graph, since it waits for the device."""
+        if with_surface_depth or not self._captures:
             return self._rendered(view, sets, with_surface_depth)
-        pending = self.submit(view, sets, with_surface_depth)
+        pending = self.submit(view, sets)
         while overflowed(pending.needed.tolist(), pending.capacities):
             pending = pending.retry()
         return pending.rendered.copied()
 
     @torch.no_grad()
-    def submit(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool = False) -> PendingImage:
+    def submit(self, view: View, sets: Sequence[Gaussians]) -> PendingImage:
         """Starts rendering on a GPU."""
-        return self._without_graphs_if_full(partial(self._planned, view, sets, with_surface_depth))
+        return self._without_graphs_if_full(partial(self._planned, view, sets))
 
-    def _rendered(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool) -> RenderedImage:
+    def _rendered(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool = False) -> RenderedImage:
         picture = self.model.render(view, gaussians=sets, with_surface_depth=with_surface_depth)
         return RenderedImage(picture.image, picture.alpha, picture.surface_depth)
 
-    def _planned(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool) -> PendingImage:
+    def _planned(self, view: View, sets: Sequence[Gaussians]) -> PendingImage:
         """An image with planned capacities, by the entries that earlier ones of its kind needed."""
-        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets, with_surface_depth))
-        kind = self._kind_of(view, sets, with_surface_depth)
+        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets))
+        kind = self._kind_of(view, sets)
         if kind is None:
-            return self._measured(view, sets, with_surface_depth)
+            return self._measured(view, sets)
         self._kinds.sort(key=lambda other: other is kind)
         if kind.graph is None and self._captures:
             kind.graph = self._captured(kind)
@@ -133,29 +134,29 @@ class FixedModel:
             kind.replay(view, sets)
             return PendingImage(kind.graph.result, kind.graph.needed, kind.graph.capacities, retry)
         with capacity.planned(kind.needs) as lists:
-            rendered = self._rendered(view, sets, with_surface_depth)
+            rendered = self._rendered(view, sets)
         needs = [needed.int() for needed, _ in lists]
         needed = torch.stack(needs) if needs else torch.empty(0, dtype=torch.int32)
         return PendingImage(rendered, needed, [available for _, available in lists], retry)
 
-    def _measured(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool) -> PendingImage:
+    def _measured(self, view: View, sets: Sequence[Gaussians]) -> PendingImage:
         """An image with exact capacities, which later ones of its kind get too. Waits for the device."""
-        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets, with_surface_depth))
+        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets))
         with capacity.exact() as needs:
-            rendered = self._rendered(view, sets, with_surface_depth)
-        kind = self._kind_of(view, sets, with_surface_depth)
+            rendered = self._rendered(view, sets)
+        kind = self._kind_of(view, sets)
         if kind is not None:
             kind.needs = [max(pair) for pair in zip(needs, kind.needs, strict=True)]
             if kind.graph is not None and overflowed(needs, kind.graph.capacities):
                 kind.graph = None
         else:
             shared = [own for same in self._same.values() for own in same.values()]
-            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _Kind(view, sets, with_surface_depth, needs, shared)]
+            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _Kind(view, sets, needs, shared)]
         return PendingImage(rendered, torch.empty(0, dtype=torch.int32), [], retry)
 
-    def _kind_of(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool) -> "_Kind | None":
+    def _kind_of(self, view: View, sets: Sequence[Gaussians]) -> "_Kind | None":
         """The known kind that an image is of; that to which the fewest Gaussians are copied."""
-        known = [kind for kind in self._kinds if kind.has(view, sets, with_surface_depth)]
+        known = [kind for kind in self._kinds if kind.has(view, sets)]
         return max(known, key=lambda kind: sum(kind.same), default=None)
 
     def _captured(self, kind: "_Kind") -> CudaGraph[RenderedImage] | None:
@@ -165,7 +166,7 @@ class FixedModel:
         if self._pool is None:
             self._pool = new_pool()
         with capture_stream(device):  # a second thread may encode a film meanwhile
-            work = partial(self._rendered, replace(kind.view), kind.sets, kind.with_surface_depth)
+            work = partial(self._rendered, replace(kind.view), kind.sets)
             return capture(work, kind.needs, self._pool, device, "rendered images", errors="thread_local")
 
     def _without_graphs_if_full(self, render: Callable[[], PendingImage]) -> PendingImage:
@@ -188,7 +189,6 @@ class _Kind:
         self,
         view: View,
         sets: Sequence[Gaussians],
-        with_surface_depth: bool,
         needs: list[int],
         shared: Sequence[Gaussians],
     ):
@@ -202,15 +202,14 @@ class _Kind:
             one if same else Gaussians(**{name: values.clone() for name, values in one.tensors.items()})
             for one, same in zip(sets, self.same, strict=True)
         ]
-        self.with_surface_depth = with_surface_depth
         self.needs = needs
         self.graph: CudaGraph[RenderedImage] | None = None
 
-    def has(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool) -> bool:
+    def has(self, view: View, sets: Sequence[Gaussians]) -> bool:
         """Whether an image is of this kind."""
         return (
             (view.width, view.height, view.camera) == (self.view.width, self.view.height, self.view.camera)
-            and (view.shutter is None, with_surface_depth) == (self.view.shutter is None, self.with_surface_depth)
+            and (view.shutter is None) == (self.view.shutter is None)
             and len(sets) == len(self.sets)
             and all(
                 one is own if same else _shapes(one) == _shapes(own)

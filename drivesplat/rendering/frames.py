@@ -17,7 +17,7 @@ from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.color_bytes import NOT_FINITE, to_uint8, uint8_image
+from drivesplat.rendering.color_bytes import NOT_FINITE, to_host, to_uint8, uint8_image
 from drivesplat.rendering.fixed_model import FixedModel, PendingImage, overflowed
 
 T = TypeVar("T")
@@ -65,8 +65,8 @@ def _sets(fixed: FixedModel, view: View, gaussians: Gaussians | Sequence[Gaussia
 def _on_its_way(pending: PendingImage) -> PendingFrame:
     """The frame of an image, with its copies into main memory submitted."""
     copied, image = torch.cuda.Event(), pending.rendered.image
-    pixels, finite = _to_host(to_uint8(image)), _to_host(torch.isfinite(image).all())
-    needed = _to_host(pending.needed)
+    pixels, finite = to_host(to_uint8(image)), to_host(torch.isfinite(image).all())
+    needed = to_host(pending.needed)
     copied.record()
     return PendingFrame(
         pixels, finite, needed, pending.capacities, copied.synchronize, lambda: _on_its_way(pending.retry())
@@ -91,8 +91,3 @@ def _finished(pending: PendingFrame) -> np.ndarray:
     if not pending.finite:
         raise ResultError(NOT_FINITE)
     return pending.pixels.numpy()
-
-
-def _to_host(values: Tensor) -> Tensor:
-    """An asynchronous copy into pinned memory, which is several times faster than into pageable memory."""
-    return torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)

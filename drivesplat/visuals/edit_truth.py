@@ -18,12 +18,16 @@ from drivesplat.editing.assets.asset import Inserts
 from drivesplat.editing.placed_model import PlacedModel, placed_models
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.metrics import RegionMetrics, depth_summary, relative_depth_errors
+from drivesplat.evaluation.scan_metrics import ScanPool
+from drivesplat.evaluation.scan_truth import ScanTruth
 from drivesplat.evaluation.synthetic import DriveTruth
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
+from drivesplat.model.scans import view_of_scan
 from drivesplat.model.view import View
 from drivesplat.readers.truth import TruthFrame
 from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scan_record import ScanRecords
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob
@@ -74,10 +78,12 @@ def measure_edit(
     name: str,
     inserts: Inserts,
     device_settings: DeviceSettings,
+    scans: ScanRecords | None = None,
 ) -> tuple[dict[str, Any], np.ndarray]:
     """The figures of the objects that the edit `name` inserts, over the key frames of the world's truth of this edit,
     without provenance; and a picture (h, w, 3) uint8 whose rows are the true image, the rendering and the drive without
-    the objects, where most of them is seen.
+    the objects, where most of them is seen. With the scans of a drive whose model renders LiDAR, `lidar` has the
+    figures of the rays that truly met these objects.
 
     Raises DatasetError where the world has no truth of the edit, or the edit inserts nothing; ConfigError as
     `edited_model`; DeviceError.
@@ -111,6 +117,8 @@ def measure_edit(
             count += 1
     if not count:
         raise DatasetError(f"the truth of this world has no image of {job.camera} after edit {name!r}")
+    spread = checkpoint.job.train.scans.beam_spread_rad
+    lidar = None if scans is None else edited_scan_metrics(known, scans, edited, name, inserted, spread, device)
     both, either = np.sum(overlaps, axis=0) if overlaps else (0, 0)
     record = {
         "schema": 1,
@@ -122,6 +130,7 @@ def measure_edit(
         "by_angle_deg": {key: own.summary()["object"] for key, own in by_angle.items()},
         "mask_iou": float(both / either) if either else None,
         "changed_elsewhere": float(untouched[0] / untouched[1]) if untouched[1] else None,
+        "lidar": lidar,
     }
     return record, picture([frame for _, _, frame in sorted(shown, key=lambda one: one[1])])
 
@@ -138,6 +147,28 @@ def edit_frames(
             at = np.array([shown.time])
             (placed,), (other,) = (placed_models(edited.model, actors, at) for actors in (edited.actors, without))
             yield _measured(known, index, frame, truth, shown, placed, other, edited.actors, inserted)
+
+
+@torch.no_grad()
+def edited_scan_metrics(
+    known: DriveTruth, scans: ScanRecords, edited: EditedModel, name: str, inserted: Sequence[str],
+    beam_spread: tuple[float, float], device: torch.device,
+) -> dict[str, dict[str, Any]] | None:  # fmt: skip
+    """The figures (`ScanPool.figures`) of the rays of key frames that truly met inserted objects: of the edited drive,
+    and of that without the objects. None where the world has no scans after the edit. `beam_spread` in radians."""
+    if not known.truth.scans_of(edit=name):
+        return None
+    without = [actor for actor in edited.actors if actor.id not in inserted]
+    shown = {"inserted": edited.actors, "not_inserted": without}
+    pools = {kind: ScanPool(chamfer=False) for kind in shown}
+    truth = ScanTruth.of(known.truth, known.path, known.recording.scene, scans, own_car_radius=0.0)
+    for scan, found, _ in truth.scans(edit=name):
+        rays = truth.met(found, *map(known.instance_of, inserted))
+        view = view_of_scan(scan, beam_spread, device)
+        for kind, actors in shown.items():
+            (placed,) = placed_models(edited.model, actors, np.array([view.time]))
+            pools[kind].add(scan, placed.scan(view).rendered(), rays)
+    return {kind: pool.figures() for kind, pool in pools.items()}
 
 
 def _measured(

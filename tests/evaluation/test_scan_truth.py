@@ -117,7 +117,7 @@ def street(wall_at: float = WALL_AT, car_ahead: float = 0.0, intensity: float = 
 
 
 def test_true_scans_are_seen_from_the_recorded_place_moved_as_the_truth_says(known, scene):
-    recorded, left = ([scan for scan, _ in known.scans(left_m)] for left_m in (0.0, 2.0))
+    recorded, left = ([scan for scan, *_ in known.scans(left_m)] for left_m in (0.0, 2.0))
     assert [scan.sample_index for scan in recorded] == [*KEY_FRAMES]
     for one, other in zip(recorded, left, strict=True):
         sweep = scene.sweeps[one.sample_index]
@@ -174,7 +174,7 @@ def test_without_the_car_its_rays_meet_what_is_behind_it(known):
 def test_a_model_without_actors_loses_what_lies_in_the_box(known):
     """A car in its static part is removed by its box, in each scan."""
     moving = street()
-    car = sampled(moving.parts[1], next(scan.seconds for scan, _ in known.scans()))
+    car = sampled(moving.parts[1], next(scan.seconds for scan, *_ in known.scans()))
     static = round_gaussians(car.means.numpy(), 0.08, 0.99)
     set_lidar_logits(static, 0.5)
     model = SplatModel([moving.parts[0], static], None).requires_grad_(False)

@@ -35,7 +35,7 @@ class FakeGpu:
         monkeypatch.setattr(FixedModel, "_rendered", self.rendered)
         self.model = FixedModel(SplatModel([round_gaussians([[0.0, 0.0, 0.0]])], None))
 
-    def rendered(self, view, sets, with_surface_depth):
+    def rendered(self, view, sets, with_surface_depth=False):
         capacity.capacity_for(torch.tensor(int(view.time)))
         return RenderedImage(torch.full((1, 1, 3), RENDERED), torch.ones(1, 1))
 
