@@ -19,9 +19,9 @@ with job(snakemake, dataset=("images",)) as current:
     checkpoint, known = read_checkpoint(files.checkpoint), DriveTruth.read(files.truth[0], recording)
     inserts = read_inserts(settings.edit, Path(files.checkpoint).parent)
     inputs = {"truth": sha256_file(known.path), **digests_of(inserts)}
+    scans = next(map(read_scans, files.scans), None)
     of_scans = () if scans is None else (scans.provenance,)
     provenance = current.provenance(*upstream, checkpoint.provenance, *of_scans, inputs=inputs)
-    scans = next(map(read_scans, files.scans), None)
     record, picture = measure_edit(checkpoint, known, settings, wildcards.edit, inserts, current.device(), scans)
     write_png(current.output.picture, picture)
     write_json(current.output.figures, {**record, "provenance": provenance})
