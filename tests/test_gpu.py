@@ -42,13 +42,12 @@ from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
 from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.background import Background
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import IMAGE, SCAN, Want
+from drivesplat.model.states import IMAGE, SCAN, ActorPlacement, Want
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.rendering import fixed_model

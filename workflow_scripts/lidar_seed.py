@@ -4,8 +4,8 @@ import dataclasses
 
 from drivesplat.workflow.job import job
 from drivesplat.io.point_cloud import write_ply
-from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.preprocess.poses.triangulated import read_triangulated
 from drivesplat.provenance.record import digests_of
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene

@@ -5,7 +5,7 @@ import dataclasses
 from drivesplat.workflow.job import job
 from drivesplat.io.array_file import write_arrays
 from drivesplat.io.storage import write_json
-from drivesplat.poses.refinement import refine_or_keep
+from drivesplat.preprocess.poses.refinement import refine_or_keep
 from drivesplat.scene.ego_mask import NO_EGO_MASK, read_ego_mask
 from drivesplat.scene.scene import read_scene, write_scene
 from drivesplat.settings.refine_poses import RefinePosesJob

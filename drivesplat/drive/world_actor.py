@@ -8,7 +8,7 @@ import numpy as np
 from drivesplat.drive.cameras import Matrix, Vector, require_pose, require_vector
 from drivesplat.errors import UnknownObjectError
 from drivesplat.lidar.moved_sensor import steady_motion
-from drivesplat.model.actor_placements import ActorPlacement
+from drivesplat.model.states import ActorPlacement
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.tracks import matching_ids
 from drivesplat.trajectories.edited_actors import EditedActor

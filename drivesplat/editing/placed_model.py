@@ -10,11 +10,10 @@ from jaxtyping import Float, Int16
 from torch import Tensor
 
 from drivesplat.editing.shading import shaded
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.scans import ScanPicture, ScanView, group_met
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import SCAN, Want, want_of
+from drivesplat.model.states import SCAN, ActorPlacement, Want, want_of
 from drivesplat.model.view import View
 from drivesplat.rendering.fixed_model import FixedModel, RenderedImage
 from drivesplat.trajectories.edited_actors import EditedActor

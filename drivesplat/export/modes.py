@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.export.sampled_motion import SampledShapes
 from drivesplat.export.trained_parts import SampledGroup
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 
 MIN_SHARE = 0.03
 """Of the singular values of the sampled weights, relative to the largest: smaller ones are noise."""

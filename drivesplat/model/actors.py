@@ -27,12 +27,12 @@ from drivesplat.kernels.placement import (
 )
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import sums_of_squares
-from drivesplat.model.actor_placements import ActorPlacement, Posed, placement_sets, with_colors, with_placements
+from drivesplat.model.actor_placements import Posed, placement_sets, with_colors, with_placements
 from drivesplat.model.gaussians import Gaussians, concatenate, no_colors
 from drivesplat.model.harmonics import rotation_of_harmonics_by
 from drivesplat.model.parameters import fade, init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part, PartDefinition, RigidGroup
-from drivesplat.model.states import IMAGE, State, Want
+from drivesplat.model.states import IMAGE, ActorPlacement, State, Want
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings

@@ -16,11 +16,12 @@ from torch.nn.functional import normalize
 
 from drivesplat.kernels.placement import LocalGaussians
 from drivesplat.kernels.quaternions import turned
-from drivesplat.model.actor_placements import ActorPlacement, Posed, with_walked
+from drivesplat.model.actor_placements import Posed, with_walked
 from drivesplat.model.actors import Actors
 from drivesplat.model.lattice import Lattice, Undeformed
 from drivesplat.model.parameters import make_parameters
 from drivesplat.model.part import Shapes
+from drivesplat.model.states import ActorPlacement
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import DeformableSettings

@@ -13,9 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.states import IMAGE, State, Want
+from drivesplat.model.states import IMAGE, ActorPlacement, State, Want
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.trajectories.motion import Motion

@@ -1,13 +1,41 @@
-"""What a sample of a model's Gaussians holds, and the tensors of a time that it depends on beside parameters."""
+"""What a sample of a model's Gaussians holds, and what it depends on beside parameters: the places of objects, and the
+tensors of a time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.view import View
+from drivesplat.scene.light import Shade
+
+
+@dataclass(frozen=True)
+class ActorPlacement:
+    """An edited pose of an object at one time: the Gaussians of the track `source`, scaled by `scale` about the box
+    centre, at `object_to_world` (4, 4) in world metres (None: the recorded pose), their RGB colours mapped by
+    `color_matrix` (3, 3) (None: as trained). `around` are the poses HALF_STEP seconds before and after an edited one,
+    which give velocities; None: the object stands. `walked` is the length (metres) of the object's path until then,
+    which the limbs of deformable objects follow, and `walked_around` HALF_STEP seconds before and after; None: as
+    recorded at the time. Their gait is ahead by `phase` cycles. With a `shade`, the object darkens the ground."""
+
+    source: str
+    object_to_world: np.ndarray | None = None
+    scale: float = 1.0
+    color_matrix: np.ndarray | None = None
+    around: tuple[np.ndarray, np.ndarray] | None = None
+    walked: float | None = None
+    walked_around: tuple[float, float] | None = None
+    phase: float = 0.0
+    shade: Shade | None = None
+
+    def beside(self, number: int) -> "ActorPlacement":
+        """The placement HALF_STEP seconds before (0) or after (1)."""
+        pose = self.object_to_world if self.around is None else self.around[number]
+        walked = self.walked if self.walked_around is None else self.walked_around[number]
+        return replace(self, object_to_world=pose, walked=walked)
 
 
 @dataclass(frozen=True)

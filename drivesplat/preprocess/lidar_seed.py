@@ -22,7 +22,7 @@ from drivesplat.io.point_cloud import PointCloud, read_positions
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import ColorView, KeptViews, color_by_visibility, in_image
 from drivesplat.lidar.sweeps import outside_boxes, thin, world_returns
-from drivesplat.poses.triangulated import TriangulatedPoints
+from drivesplat.preprocess.poses.triangulated import TriangulatedPoints
 from drivesplat.readers.outline import without_lidar, without_training
 from drivesplat.readers.sweeps import sweep_fault
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask

@@ -77,7 +77,7 @@ class FixedModel:
     def __init__(self, model: SplatModel):
         self.model = model
         self._same: dict[tuple[bool, bool], dict[int, Gaussians]] = {}  # by what is wanted, then by number of the part
-        self._kinds: list[_Kind] = []  # the one used last is the last
+        self._kinds: list[_ImageKind] = []  # the one used last is the last
         self._pool: MemoryPool | None = None
         self._captures = graphs_supported(model.parts[0].params["means"].device)
 
@@ -151,15 +151,15 @@ class FixedModel:
                 kind.graph = None
         else:
             shared = [own for same in self._same.values() for own in same.values()]
-            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _Kind(view, sets, needs, shared)]
+            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _ImageKind(view, sets, needs, shared)]
         return PendingImage(rendered, torch.empty(0, dtype=torch.int32), [], retry)
 
-    def _kind_of(self, view: View, sets: Sequence[Gaussians]) -> "_Kind | None":
+    def _kind_of(self, view: View, sets: Sequence[Gaussians]) -> "_ImageKind | None":
         """The known kind that an image is of; that to which the fewest Gaussians are copied."""
         known = [kind for kind in self._kinds if kind.has(view, sets)]
         return max(known, key=lambda kind: sum(kind.same), default=None)
 
-    def _captured(self, kind: "_Kind") -> CudaGraph[RenderedImage] | None:
+    def _captured(self, kind: "_ImageKind") -> CudaGraph[RenderedImage] | None:
         """A graph of images of a kind; None where the GPU or its driver refuses. Graphs are replayed one after the
         other and their results copied before, so that they can share memory."""
         device = kind.view.K.device
@@ -181,7 +181,7 @@ class FixedModel:
         return dropped
 
 
-class _Kind:
+class _ImageKind:
     """Images that one graph renders: its inputs, into which those of other images are copied. `needs` are the most
     entries that each of their lists needed. Sets that are among `shared` are the same in all of them."""
 

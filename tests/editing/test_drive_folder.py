@@ -29,8 +29,8 @@ from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_driv
 from drivesplat.editing.render_plan import image_render_plan
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import unwritable
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
 from drivesplat.readers.drive.check import check, whole_scene
 from drivesplat.readers.drive.format import read_drive

@@ -21,8 +21,8 @@ from drivesplat.editing.actors import other_objects, trained_actors
 from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_drive
 from drivesplat.editing.film import track_labels
 from drivesplat.editing.shown_objects import ShownObjects, parts_that_may_show
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
 from drivesplat.readers.drive.format import read_drive
 from drivesplat.rendering.frames import film_frame

@@ -25,8 +25,8 @@ from drivesplat.editing.actors import warn_of_collisions
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.panels import Panels

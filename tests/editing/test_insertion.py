@@ -28,10 +28,10 @@ from drivesplat.editing.render_plan import image_render_plan
 from drivesplat.editing.scans import scan_render_plan
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.storage import sha256_file
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.scans import ScanView
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.rasterization.scans import RayGrid
 from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.light import OVERCAST, SceneLight, write_light

@@ -9,8 +9,8 @@ import torch
 from helpers.hand_made_street import AHEAD, straight, street_model
 
 from drivesplat.editing.placed_model import PlacedModel
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.rendering.fixed_model import FixedModel
 

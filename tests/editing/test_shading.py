@@ -15,9 +15,9 @@ from drivesplat.editing.assets.inserted import with_assets
 from drivesplat.editing.placed_model import PlacedModel
 from drivesplat.editing.shading import BELOW, LAYER, shaded
 from drivesplat.errors import ResultError
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.light import RIM, SceneLight, Shade, direction, read_light, write_light
 from drivesplat.scene.rigid import rigid

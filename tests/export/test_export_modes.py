@@ -38,10 +38,11 @@ from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_scene import ViewerContent, modes_array
 from drivesplat.kernels.placement import LocalGaussians
-from drivesplat.model.actor_placements import ActorPlacement, with_walked
+from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.model.timeline import TimeState
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit

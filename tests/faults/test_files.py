@@ -23,7 +23,7 @@ from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.objects.record import read_discovered
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.model.splat_ply import read_splat_ply
-from drivesplat.poses.triangulated import read_triangulated
+from drivesplat.preprocess.poses.triangulated import read_triangulated
 from drivesplat.provenance.file_digests import checked_digest, record_output
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.ego_mask import read_ego_mask

@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.features import image_pairs, write_images
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.features import image_pairs, write_images
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame, Scene

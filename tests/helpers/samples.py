@@ -3,11 +3,10 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import IMAGE, Want
+from drivesplat.model.states import IMAGE, ActorPlacement, Want
 
 EVERYTHING = Want(velocities=True, lidar=True)
 

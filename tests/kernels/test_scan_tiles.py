@@ -6,7 +6,7 @@ import torch
 from helpers.random_scans import ScanScene, even_rays, random_scan
 
 from drivesplat.kernels.numba import scan_tiles
-from drivesplat.kernels.numba.tiles import NumbaTileLists
+from drivesplat.kernels.numba.layout import NumbaTileLists
 from drivesplat.rasterization import RayGrid
 
 

@@ -12,11 +12,10 @@ from torch.nn.functional import one_hot
 
 from drivesplat.kernels.placement import ObjectPoses, colors_in_object
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotated_back, rotation_matrix, turned
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.actors import Actors
 from drivesplat.model.harmonics import rotated
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import State
+from drivesplat.model.states import ActorPlacement, State
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings

@@ -20,12 +20,19 @@ from helpers.hand_made_views import (
 )  # fmt: skip
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.adjustment import Priors, bundle_adjust, observations_of, priors_of, triangulate, with_poses
-from drivesplat.poses.from_matches import MatchJudge
-from drivesplat.poses.from_sweeps import SweepJudge
-from drivesplat.poses.refine import poses_of, refine_from_matches
-from drivesplat.poses.refinement_record import Refinement
-from drivesplat.poses.rig import RigImages, from_pycolmap, sensor, to_pycolmap
+from drivesplat.preprocess.poses.adjustment import (
+    Priors,
+    bundle_adjust,
+    observations_of,
+    priors_of,
+    triangulate,
+    with_poses,
+)
+from drivesplat.preprocess.poses.from_matches import MatchJudge
+from drivesplat.preprocess.poses.from_sweeps import SweepJudge
+from drivesplat.preprocess.poses.refine import poses_of, refine_from_matches
+from drivesplat.preprocess.poses.refinement_record import Refinement
+from drivesplat.preprocess.poses.rig import RigImages, from_pycolmap, sensor, to_pycolmap
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.settings.refine_poses import PriorSettings
@@ -287,7 +294,7 @@ def test_cameras_move_alone_only_if_the_path_keeps_its_length(front, by_lidar, d
     after = 2.0 if by_lidar else 0.5
     monkeypatch.setattr(SweepJudge, "distance", lambda _, it: 1.0 if it is front.drive.scene else after)
     monkeypatch.setattr(MatchJudge, "distance", lambda _, it: 1.0 if it is front.drive.scene else 0.5)
-    monkeypatch.setattr("drivesplat.poses.refine.stretched", lambda *_: "the path is longer")
+    monkeypatch.setattr("drivesplat.preprocess.poses.refine.stretched", lambda *_: "the path is longer")
     job = job_of(priors_with_lidar=PriorSettings().model_dump())
     judges = SweepJudge({}, []), MatchJudge([])
     found = refine_from_matches(front.images, front.start, front.database, job, 1, *judges)

@@ -8,7 +8,7 @@ from helpers.classed import classed
 from helpers.hand_made_views import drive_of, ego_at
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.corrections import Corrections, apply_corrections
+from drivesplat.preprocess.poses.corrections import Corrections, apply_corrections
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep, Track, read_scene, write_scene
 from drivesplat.scene.splits import frame_groups

@@ -12,7 +12,7 @@ from helpers.workflow_copy import WorkflowCopy
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.refine import refine_poses
+from drivesplat.preprocess.poses.refine import refine_poses
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame, Scene, Track, read_scene
 from drivesplat.settings.refine_poses import RefinePosesJob

@@ -8,7 +8,7 @@ from helpers.classed import classed
 from helpers.hand_made_views import HEADINGS, SIZE, drive_of, job_of
 from PIL import Image
 
-from drivesplat.poses.features import (
+from drivesplat.preprocess.poses.features import (
     detect_features,
     image_pairs,
     largest_scales,
@@ -16,7 +16,7 @@ from drivesplat.poses.features import (
     static_pixels,
     views_overlap,
 )
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse, rigid

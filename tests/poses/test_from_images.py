@@ -13,11 +13,11 @@ from helpers.hand_made_views import FRONT, Drive, Seen, drive_of, error_at, view
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
-from drivesplat.poses.from_images import align_poses
-from drivesplat.poses.mapping import MappingProgress
-from drivesplat.poses.refine import estimate_from_matches
-from drivesplat.poses.refinement_record import Refinement
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.from_images import align_poses
+from drivesplat.preprocess.poses.mapping import MappingProgress
+from drivesplat.preprocess.poses.refine import estimate_from_matches
+from drivesplat.preprocess.poses.refinement_record import Refinement
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.readers.drive.reader import read
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep

@@ -7,11 +7,11 @@ import pytest
 from helpers.hand_made_views import drive_of
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.corrections import Corrections, apply_corrections
-from drivesplat.poses.features import later_images
-from drivesplat.poses.from_matches import MatchJudge, withheld_pairs
-from drivesplat.poses.refine import path_length, stretched
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.corrections import Corrections, apply_corrections
+from drivesplat.preprocess.poses.features import later_images
+from drivesplat.preprocess.poses.from_matches import MatchJudge, withheld_pairs
+from drivesplat.preprocess.poses.refine import path_length, stretched
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene

@@ -8,8 +8,8 @@ import pytest
 from helpers.hand_made_views import Drive, Seen, drive_of, job_of, street_points, views, write_database
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.lens import LensTrial, lens_trial
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.lens import LensTrial, lens_trial
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import rigid
 

@@ -8,10 +8,10 @@ import pytest
 from helpers.hand_made_views import FRONT, SIZE, Drive, Seen, drive_of, job_of, street_points, write_database
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.readout import at_timestamp
-from drivesplat.poses.refine import refine_from_matches
-from drivesplat.poses.refinement_record import Refinement
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.readout import at_timestamp
+from drivesplat.preprocess.poses.refine import refine_from_matches
+from drivesplat.preprocess.poses.refinement_record import Refinement
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene

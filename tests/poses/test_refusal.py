@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.io.storage import canonical_json
-from drivesplat.poses import refine
-from drivesplat.poses.adjustment import bundle_adjust, priors_of, triangulate
-from drivesplat.poses.refine import WithheldTrial, no_gain, refine_from_matches, refine_poses, unusable
-from drivesplat.poses.refinement import refine_or_keep
-from drivesplat.poses.refinement_record import Refinement
-from drivesplat.poses.rig import RigImages
-from drivesplat.poses.triangulated import Observations, TriangulatedPoints
+from drivesplat.preprocess.poses import refine
+from drivesplat.preprocess.poses.adjustment import bundle_adjust, priors_of, triangulate
+from drivesplat.preprocess.poses.refine import WithheldTrial, no_gain, refine_from_matches, refine_poses, unusable
+from drivesplat.preprocess.poses.refinement import refine_or_keep
+from drivesplat.preprocess.poses.refinement_record import Refinement
+from drivesplat.preprocess.poses.rig import RigImages
+from drivesplat.preprocess.poses.triangulated import Observations, TriangulatedPoints
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene
@@ -279,7 +279,7 @@ def test_images_without_features_or_matches_leave_the_poses(tmp_path, key_frames
 
 def without_pycolmap(folder, monkeypatch) -> tuple[Drive, str]:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    monkeypatch.delitem(sys.modules, "drivesplat.poses.refine", raising=False)
+    monkeypatch.delitem(sys.modules, "drivesplat.preprocess.poses.refine", raising=False)
     return painted(folder, drive_of(3, size=SMALL), pattern), "pycolmap or pyceres cannot be imported"
 
 

@@ -10,7 +10,9 @@ from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
-from drivesplat.poses.triangulated import (
+from drivesplat.preprocess import lidar_seed
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.preprocess.poses.triangulated import (
     MAX_MEAN_ERROR,
     Observations,
     TriangulatedPoints,
@@ -18,8 +20,6 @@ from drivesplat.poses.triangulated import (
     read_triangulated,
     triangulated_points,
 )
-from drivesplat.preprocess import lidar_seed
-from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.lidar_seed import SeedJob
 

@@ -13,7 +13,7 @@ from helpers.drives import scene_at
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses import lens
+from drivesplat.preprocess.poses import lens
 from drivesplat.readers.drive.__main__ import main
 from drivesplat.readers.drive.format import Pose
 from drivesplat.readers.drive.poses import matrix_of

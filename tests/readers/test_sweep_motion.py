@@ -9,7 +9,7 @@ import pytest
 from helpers import drives
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.corrections import Corrections, apply_corrections
+from drivesplat.preprocess.poses.corrections import Corrections, apply_corrections
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import read_drive
 from drivesplat.readers.drive.reader import read

@@ -381,7 +381,7 @@ COMMENTS = (
     ("drivesplat/settings/train.py", "Number of optimisation", "The number of optimisation"),
     ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json'),
 )
-UNUSED = ("drivesplat/poses/refinement_record.py", "SCHEMA = 1", "SCHEMA = 2")
+UNUSED = ("drivesplat/preprocess/poses/refinement_record.py", "SCHEMA = 1", "SCHEMA = 2")
 
 
 @pytest.mark.parametrize(

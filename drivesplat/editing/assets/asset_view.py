@@ -8,10 +8,9 @@ import torch
 
 from drivesplat.editing.assets.asset import Asset
 from drivesplat.editing.assets.inserted import part_of
-from drivesplat.model.actor_placements import ActorPlacement
 from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.states import Want
+from drivesplat.model.states import ActorPlacement, Want
 from drivesplat.model.view import View
 
 WIDTH, HEIGHT = 320, 240

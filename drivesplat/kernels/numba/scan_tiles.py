@@ -13,9 +13,8 @@ from typing import no_type_check
 import numpy as np
 
 from drivesplat.kernels.cache import callee, kernel
-from drivesplat.kernels.numba.layout import MIN_ALPHA
+from drivesplat.kernels.numba.layout import MIN_ALPHA, NumbaTileLists
 from drivesplat.kernels.numba.threads import parallel_for
-from drivesplat.kernels.numba.tiles import NumbaTileLists
 from drivesplat.kernels.scan_borders import ON_CPU, ScanBorders
 
 BEAMS, FIRINGS = ON_CPU

@@ -26,6 +26,7 @@ from drivesplat.kernels.numba.layout import (
     SLACK,
     TILE_HEIGHT,
     TILE_WIDTH,
+    NumbaTileLists,
 )
 from drivesplat.kernels.numba.threads import parallel_for
 
@@ -47,23 +48,6 @@ class Splats:
     order: np.ndarray
     shapes: np.ndarray
     values: np.ndarray
-
-
-@dataclass(frozen=True)
-class NumbaTileLists:
-    """The Gaussians of tiles `first` to `last` (excluded) of an image or a LiDAR scan, in rows of tiles.
-
-    Those of tile t are `ranks[offsets[t - first] : offsets[t - first + 1]]`, as rows of `shapes`, front to back.
-    Entry i has place `slots[i]` in a numbering by Gaussian; those of Gaussian r are
-    `slot_offsets[r]` to `slot_offsets[r + 1]` (excluded).
-    """
-
-    first: int
-    last: int
-    offsets: np.ndarray
-    ranks: np.ndarray
-    slots: np.ndarray
-    slot_offsets: np.ndarray
 
 
 def grid(width: int, height: int) -> tuple[int, int]:

@@ -77,9 +77,9 @@ def _check(asked: argparse.Namespace) -> int:
 
 def camera_warnings(scene: Scene) -> list[str]:
     """`intrinsics_warnings`, and sentences about cameras whose images contradict their intrinsics, by a trial with some
-    images (`drivesplat.poses.lens`)."""
+    images (`drivesplat.preprocess.poses.lens`)."""
     try:
-        from drivesplat.poses.lens import lens_warnings, with_tested_images  # imports pycolmap
+        from drivesplat.preprocess.poses.lens import lens_warnings, with_tested_images  # imports pycolmap
 
         with tempfile.TemporaryDirectory(prefix="drivesplat-undistorted-") as folder:
             found = lens_warnings(undistorted(with_tested_images(scene), Path(folder)))

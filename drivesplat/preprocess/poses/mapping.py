@@ -15,8 +15,8 @@ import numpy as np
 import pycolmap
 
 from drivesplat.errors import DatasetError
-from drivesplat.poses.features import image_name
-from drivesplat.poses.rig import RigImages, from_pycolmap
+from drivesplat.preprocess.poses.features import image_name
+from drivesplat.preprocess.poses.rig import RigImages, from_pycolmap
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.refine_poses import RefinePosesJob
 

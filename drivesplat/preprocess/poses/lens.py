@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from drivesplat.poses.adjustment import (
+from drivesplat.preprocess.poses.adjustment import (
     Priors,
     adjust_in_rounds,
     bundle_adjust,
@@ -26,9 +26,9 @@ from drivesplat.poses.adjustment import (
     priors_of,
     with_poses,
 )
-from drivesplat.poses.features import detect_features, match_features
-from drivesplat.poses.readout import RollingFeatures
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.features import detect_features, match_features
+from drivesplat.preprocess.poses.readout import RollingFeatures
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.scene import UNPOSED, Frame, Scene
 from drivesplat.settings.refine_poses import FeatureSettings, RefinePosesJob, RefinePosesSettings

@@ -5,9 +5,9 @@ import logging
 from dataclasses import replace
 
 from drivesplat.errors import DatasetError, DriveSplatError
-from drivesplat.poses.from_sweeps import Alignment, align_sweeps
-from drivesplat.poses.refinement_record import Refinement, finite, record_header
-from drivesplat.poses.triangulated import no_points
+from drivesplat.preprocess.poses.from_sweeps import Alignment, align_sweeps
+from drivesplat.preprocess.poses.refinement_record import Refinement, finite, record_header
+from drivesplat.preprocess.poses.triangulated import no_points
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
@@ -31,9 +31,9 @@ MEASURED = (
 
 
 def refine_or_keep(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_MASK, threads: int = 1) -> Refinement:
-    """Registers LiDAR sweeps to each other (`drivesplat.poses.from_sweeps`), then refines the poses with the images
-    (`drivesplat.poses.refine`). With `enabled: auto` and recorded poses, a scene whose images cannot refine them keeps
-    them with a warning, also where pycolmap cannot be imported.
+    """Registers LiDAR sweeps to each other (`from_sweeps`), then refines the poses with the images (`refine`). With
+    `enabled: auto` and recorded poses, a scene whose images cannot refine them keeps them with a warning, also where
+    pycolmap cannot be imported.
 
     Raises DriveSplatError otherwise: without pycolmap, and the errors of `refine_poses`.
     """
@@ -61,7 +61,7 @@ def _with_images(aligned: Alignment, job: RefinePosesJob, ego_mask: EgoMask, thr
         return Refinement(scene, record, no_points())
     required = job.refine_poses.enabled is True or job.refine_poses.start == "images"
     try:
-        from drivesplat.poses.refine import refine_poses  # imports pycolmap
+        from drivesplat.preprocess.poses.refine import refine_poses  # imports pycolmap
     except ImportError as error:
         reason = f"pycolmap or pyceres cannot be imported ({error})"
         if required:

@@ -16,9 +16,9 @@ import pyceres
 import pycolmap
 from pycolmap import cost_functions
 
-from drivesplat.poses.readout import RollingFeatures
-from drivesplat.poses.rig import RigImages, from_pycolmap, to_pycolmap
-from drivesplat.poses.triangulated import Observations
+from drivesplat.preprocess.poses.readout import RollingFeatures
+from drivesplat.preprocess.poses.rig import RigImages, from_pycolmap, to_pycolmap
+from drivesplat.preprocess.poses.triangulated import Observations
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob, RefinePosesSettings
 

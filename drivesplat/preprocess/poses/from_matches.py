@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from drivesplat.poses.features import later_images, match_pairs
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.features import later_images, match_pairs
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import cross_matrix, inverse
 from drivesplat.scene.scene import Frame, Scene

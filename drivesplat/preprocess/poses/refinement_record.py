@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.poses.triangulated import TriangulatedPoints
+from drivesplat.preprocess.poses.triangulated import TriangulatedPoints
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 

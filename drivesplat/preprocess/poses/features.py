@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.linalg import inv
 
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.rigid import inverse, path_lengths

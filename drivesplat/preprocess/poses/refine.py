@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.adjustment import (
+from drivesplat.preprocess.poses.adjustment import (
     Priors,
     adjust_in_rounds,
     bundle_adjust,
@@ -24,16 +24,16 @@ from drivesplat.poses.adjustment import (
     priors_of,
     with_poses,
 )
-from drivesplat.poses.corrections import Corrections, apply_corrections, magnitudes
-from drivesplat.poses.features import detect_features, match_features
-from drivesplat.poses.from_images import estimate_poses
-from drivesplat.poses.from_matches import MatchJudge, match_judge
-from drivesplat.poses.from_sweeps import SweepJudge
-from drivesplat.poses.lens import lens_warnings, with_tested_images
-from drivesplat.poses.readout import RollingFeatures
-from drivesplat.poses.refinement_record import Refinement, finite, record_header
-from drivesplat.poses.rig import RigImages
-from drivesplat.poses.triangulated import Observations, no_points, triangulated_points
+from drivesplat.preprocess.poses.corrections import Corrections, apply_corrections, magnitudes
+from drivesplat.preprocess.poses.features import detect_features, match_features
+from drivesplat.preprocess.poses.from_images import estimate_poses
+from drivesplat.preprocess.poses.from_matches import MatchJudge, match_judge
+from drivesplat.preprocess.poses.from_sweeps import SweepJudge
+from drivesplat.preprocess.poses.lens import lens_warnings, with_tested_images
+from drivesplat.preprocess.poses.readout import RollingFeatures
+from drivesplat.preprocess.poses.refinement_record import Refinement, finite, record_header
+from drivesplat.preprocess.poses.rig import RigImages
+from drivesplat.preprocess.poses.triangulated import Observations, no_points, triangulated_points
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import LimitSettings, RefinePosesJob

@@ -14,7 +14,7 @@ from scipy.sparse import bsr_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.surfaces import Surfaces
+from drivesplat.preprocess.poses.surfaces import Surfaces
 from drivesplat.scene.rigid import apply, cross_matrix, inverse, path_lengths, rigid
 from drivesplat.settings.refine_poses import PriorSettings
 

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from drivesplat.errors import DatasetError
-from drivesplat.poses import scale
-from drivesplat.poses.corrections import Corrections, apply_corrections
-from drivesplat.poses.mapping import REMEDY, MappedImages, map_images
-from drivesplat.poses.rig import RigImages, ego_to_camera
+from drivesplat.preprocess.poses import scale
+from drivesplat.preprocess.poses.corrections import Corrections, apply_corrections
+from drivesplat.preprocess.poses.mapping import REMEDY, MappedImages, map_images
+from drivesplat.preprocess.poses.rig import RigImages, ego_to_camera
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.shutter import Shutter, displaced, shutters
 

@@ -12,8 +12,8 @@ from scipy.spatial import QhullError, cKDTree
 from drivesplat.lidar.coloring import visible
 from drivesplat.lidar.occlusion import patches, unoccluded
 from drivesplat.lidar.sweeps import nearest_returns
-from drivesplat.poses.mapping import MappedImages
-from drivesplat.poses.rig import RigImages
+from drivesplat.preprocess.poses.mapping import MappedImages
+from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene

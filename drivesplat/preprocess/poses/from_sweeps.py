@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from drivesplat.poses.corrections import Corrections, apply_corrections, magnitudes
-from drivesplat.poses.refinement_record import finite
-from drivesplat.poses.registration import Pair, pairs_of, plane_distances, register
-from drivesplat.poses.surfaces import Surfaces, surfaces_of
+from drivesplat.preprocess.poses.corrections import Corrections, apply_corrections, magnitudes
+from drivesplat.preprocess.poses.refinement_record import finite
+from drivesplat.preprocess.poses.registration import Pair, pairs_of, plane_distances, register
+from drivesplat.preprocess.poses.surfaces import Surfaces, surfaces_of
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.settings.refine_poses import RefinePosesJob
