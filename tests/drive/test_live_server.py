@@ -13,8 +13,7 @@ from helpers.hand_made_street import AHEAD, checkpoint_of, street_model, street_
 from helpers.patience import wait_until
 from helpers.trainings import PROVENANCE
 
-from drivesplat.drive.live_overlays import EDGES
-from drivesplat.drive.live_server import LiveServer
+from drivesplat.drive.live_server import EDGES, LiveServer
 from drivesplat.drive.live_view import wxyz_of
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.errors import RequestError
