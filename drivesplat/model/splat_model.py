@@ -18,7 +18,7 @@ from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.states import IMAGE, SCAN, ModelStates, Want, want_of
 from drivesplat.model.view import View, depth_at_lines, limited_scales, where_seen
 from drivesplat.model.view_colors import projected_sets, rasterizer_colors
-from drivesplat.rasterization import Rendering, rasterize, rasterize_projected
+from drivesplat.rasterization.rasterization import Rendering, rasterize, rasterize_projected
 
 
 class SplatModel(nn.Module):
