@@ -1,6 +1,6 @@
 """A trained drive: the model of a method, with its scene."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +33,7 @@ from drivesplat.lidar.moved_sensor import moved, steady_motion
 from drivesplat.lidar.scans import SensorPoses
 from drivesplat.model.checkpoint import STATE, open_model, read_checkpoint, read_snapshot
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
 from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.scan_record import RecordedScan
@@ -173,6 +174,11 @@ class TrainedDrive(Sensors):
             return self.before._recorded_actors
         return trained_actors(self.model, self.scene, self.where)
 
+    @property
+    def other_objects(self) -> Sequence[EditedActor]:
+        """The annotated objects that the model shows in its static part, if at all, as recorded."""
+        return self._static.others
+
     @cached_property
     def _static(self) -> ShownObjects:
         """The annotated objects that the model shows in its static part, if at all. No edit changes them."""
@@ -231,7 +237,7 @@ class TrainedDrive(Sensors):
         RequestError for a time outside of the recording."""
         _ = self.ego_to_world(time)  # refuses where there is none
         ends = np.clip(time + np.array([-HALF_SPAN, HALF_SPAN]), 0.0, self.duration)
-        now, first, last = self._ego_path(np.array([time, *ends]))
+        now, first, last = self.ego_path(np.array([time, *ends]))
         if not ends[1] > ends[0]:
             return np.zeros(6)
         turn = Rotation.from_matrix(first[:3, :3].T @ last[:3, :3]).as_rotvec()  # about axes of the first pose
@@ -302,11 +308,14 @@ class TrainedDrive(Sensors):
             of_ego = steady_motion(ego, linear, angular)
             return lambda offsets: of_ego(offsets) @ mount
         if recorded is not None:
-            return self.recording.carried(recorded, self._ego_path, time)
-        return lambda offsets: self._ego_path(time + offsets) @ mount
+            return self.recording.carried(recorded, self.ego_path, time)
+        return lambda offsets: self.ego_path(time + offsets) @ mount
 
-    def state(self, time: float, outside: str = "refuse") -> WorldState:
-        """The drive at a time. One outside of the recording is refused by a RequestError, or clamped to it."""
+    def state(
+        self, time: float, outside: str = "refuse", placements: Mapping[str, ActorPlacement] | None = None
+    ) -> WorldState:
+        """The drive at a time. One outside of the recording is refused by a RequestError, or clamped to it. With
+        `placements`, the objects of these ids, of `edited_actors`, are at these places, and no others are there."""
         if outside not in OUTSIDE:
             raise RequestError(f"outside is {outside!r}; it is one of {', '.join(OUTSIDE)}")
         if not isinstance(time, float | int | np.floating | np.integer):
@@ -315,7 +324,8 @@ class TrainedDrive(Sensors):
             raise RequestError(f"{self.recording.outside(time)}; outside='clamp' renders its start or its end")
         inside = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else time
         now = float(self.recording.checked(inside))
-        return WorldState(self._fixed, self.edited_actors, self._static, self, now, self.edit is None)
+        as_recorded = self.edit is None and placements is None
+        return WorldState(self._fixed, self.edited_actors, self._static, self, now, as_recorded, placements)
 
     @overload
     def render(
@@ -374,8 +384,8 @@ class TrainedDrive(Sensors):
         return None if self.edit is None else EgoEdit.of(self.scene, self._reference, self.edit, self.where)
 
     @cached_property
-    def _ego_path(self) -> EgoPoses:
-        """The poses of the ego vehicle after the edit."""
+    def ego_path(self) -> EgoPoses:
+        """The poses (n, 4, 4) of the ego vehicle after the edit, at seconds (n,) of the recording."""
         change = self._ego_edit
         if change is None:
             return self.recording.ego

@@ -1,7 +1,7 @@
 """A drive at one time, whose objects can be moved one by one, as cameras and LiDARs see it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import overload
@@ -22,6 +22,7 @@ from drivesplat.errors import RequestError
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
 from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.object_class import ObjectClass
@@ -198,16 +199,22 @@ class WorldState:
         sensors: Sensors,
         time: float,
         as_recorded: bool,
+        placements: Mapping[str, ActorPlacement] | None = None,
     ):
-        """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of."""
+        """`actors` of the drive at all times; `static` knows the objects that the model has no Gaussians of. With
+        `placements`, the actors of these ids are present, at these places, and no others."""
         self.time, now = time, np.array([time])
         self._fixed, self._static = fixed, static
         self._sensors, self._as_recorded = sensors, as_recorded
         self._taken = {item.id for item in (*actors, *static.others)}
         absent = {item.id: "is not there at this time" for item in actors}
         fixed = {item.id: "is not editable (the table `actors` of the drive says why)" for item in static.others}
-        present = [actor for actor in actors if actor.present(now)[0]]
-        (placed,) = actor_placements(present, now)
+        if placements is None:
+            present = [actor for actor in actors if actor.present(now)[0]]
+            (placed,) = actor_placements(present, now)
+        else:
+            present = [actor for actor in actors if actor.id in placements]
+            placed = [placements[actor.id] for actor in present]
         own = zip(present, placed, strict=True)
         self.actors = ActorsById(
             {actor.id: WorldActor(actor, placement, time) for actor, placement in own}, {**absent, **fixed}

@@ -1,0 +1,100 @@
+"""Settings of runs in the closed loop."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from drivesplat.settings import Settings
+
+Length = Annotated[float, Field(gt=0, le=40)]
+Seconds = Annotated[float, Field(ge=0, le=36000)]
+
+
+class VehicleSettings(Settings):
+    """The ego vehicle. Its origin is on the ground below the rear axle."""
+
+    length: Length = 4.6
+    """Metres."""
+    width: Length = 1.9
+    height: Length = 1.6
+    wheelbase: Length = 2.8
+    """Metres between the axles."""
+    rear_overhang: float = Field(0.9, ge=0, le=20)
+    """Metres of the body behind the rear axle."""
+    max_steering: float = Field(0.6, gt=0, le=1.2)
+    """The largest angle of the front wheels, radians."""
+    max_steering_rate: float = Field(1.0, gt=0, le=20)
+    """The largest change of that angle, radians a second."""
+    max_acceleration: float = Field(3.0, gt=0, le=20)
+    """m/s²."""
+    max_braking: float = Field(8.0, gt=0, le=20)
+    """m/s²."""
+    max_speed: float = Field(40.0, gt=0, le=100)
+    """m/s; backwards a quarter of it."""
+
+
+class TrafficSettings(Settings):
+    """The other objects."""
+
+    vehicles: Literal["replay", "react"] = "react"
+    """'replay': as recorded or edited. 'react': the same until one would come too close to what is ahead of it on its
+    path; from then on it follows this path by the intelligent driver model."""
+    people: Literal["go_on", "stop"] = "go_on"
+    """'stop': people wait while the ego vehicle is about to come close to them."""
+    time_gap: float = Field(1.5, gt=0, le=10)
+    """Seconds that a driver keeps to the vehicle ahead."""
+    standstill_gap: float = Field(2.0, gt=0, le=20)
+    """Metres that a standing driver keeps."""
+    acceleration: float = Field(1.5, gt=0, le=10)
+    """The largest acceleration of a driver, m/s²."""
+    braking: float = Field(2.0, gt=0, le=10)
+    """The comfortable deceleration of a driver, m/s²."""
+    variation: float = Field(0.0, ge=0, le=0.5)
+    """Standard deviation of drivers' time gaps and accelerations, relative, drawn by the seed."""
+
+
+class SimulationSettings(Settings):
+    """A run in the closed loop. docs/closed_loop.md"""
+
+    rate_hz: float = Field(10.0, gt=0, le=100)
+    """Steps a second."""
+    start: Seconds = 0.0
+    """The second of the recording at which a run begins."""
+    seconds: Seconds | None = None
+    """The length of a run. null = to the end of the recording."""
+    recorded_until: Seconds = 0.0
+    """Seconds after the start up to which the ego vehicle follows the recorded path, whatever the policy does."""
+    beyond: Literal["end", "go_on"] = "end"
+    """What happens at the end of the recording: the run ends, or goes on with the scene as it was last seen."""
+    actions: Literal["control", "poses"] = "control"
+    """What a policy gives: 'control', the angle of the front wheels (radians) and the acceleration (m/s²); 'poses', x,
+    y and heading of the next `horizon` steps in the frame of the vehicle."""
+    horizon: int = Field(10, ge=1, le=200)
+    """Steps of an action of 'poses'."""
+    end_on_collision: bool = True
+    """Whether a run ends when the ego vehicle touches an object."""
+    max_offset: float | None = Field(None, gt=0)
+    """Metres from the recorded path at which a run ends. null = never."""
+    cameras: tuple[str, ...] | None = None
+    """The cameras that a policy sees. null = the first one; () = none."""
+    width: int | None = Field(None, ge=16, le=8192)
+    """The width of their images in pixels. null = as recorded."""
+    outputs: tuple[Literal["rgb", "depth", "instance"], ...] = ("rgb",)
+    """What a policy sees of a camera."""
+    lidar: str | None = None
+    """The LiDAR that a policy sees. null = none."""
+    max_boxes: int = Field(32, ge=1, le=1000)
+    """The number of objects that a policy is told of, the nearest ones."""
+    route_points: int = Field(20, ge=1, le=500)
+    """The number of points of the recorded path ahead."""
+    route_step: float = Field(2.0, gt=0, le=50)
+    """Metres between them."""
+    vehicle: VehicleSettings = Field(default_factory=VehicleSettings)
+    traffic: TrafficSettings = Field(default_factory=TrafficSettings)
+
+    @field_validator("cameras", "outputs")
+    @classmethod
+    def _once(cls, values: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if values is not None and len(set(values)) < len(values):
+            raise ValueError("a name stands twice")
+        return values

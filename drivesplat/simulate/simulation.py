@@ -1,0 +1,375 @@
+"""A trained drive in which a policy drives: its state from step to step, what it sees, and what it leaves."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+
+from drivesplat.drive.cameras import PoseableCamera
+from drivesplat.drive.drive_view import DriveView
+from drivesplat.drive.trained_drive import TrainedDrive
+from drivesplat.drive.world_state import WorldState
+from drivesplat.errors import RequestError
+from drivesplat.model.road import RoadPart
+from drivesplat.scene.rigid import inverse
+from drivesplat.settings.simulate import SimulationSettings
+from drivesplat.simulate.driven_run import Drivable, DrivenRun, OtherObject
+from drivesplat.simulate.traffic import MovingBox, Traffic
+from drivesplat.simulate.vehicle import (
+    RecordedGround,
+    VehicleState,
+    advanced,
+    control_towards,
+    shape_of,
+    state_of,
+)  # fmt: skip
+
+BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw", "speed")
+"""What is known of an object: its place (metres) and heading (radians) in the frame of the ego vehicle at the centre of
+its box, its size (metres), and its speed (m/s)."""
+EGO_COLUMNS = ("speed", "acceleration", "steering", "yaw_rate", "seconds")
+"""What is known of the ego vehicle: m/s, m/s², radians, radians per second, and seconds since the run began."""
+PATH_S = 0.05
+"""Seconds between the places of the recorded path."""
+SEARCH = 300
+"""Places of the route, 0.1 m apart, among which the nearest one is looked for after a step."""
+GROUND_CLEARANCE = 0.3
+"""Metres from the ground to the body of the ego vehicle."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a policy sees: `cameras`, by name and then by output, images (h, w, 3) uint8, depth (h, w) in metres and
+    instances (h, w), an index into the ids of `objects` of the rendering, -1 for anything else; `lidar`: the range in
+    metres, 0 without a return, and the intensity of every ray (b, a); None without one."""
+
+    cameras: Mapping[str, Mapping[str, np.ndarray]]
+    lidar: Mapping[str, np.ndarray] | None
+
+
+class Simulation:
+    """A drive, edited or not, in which the ego vehicle is driven. `reset` begins a run, `step` moves it on.
+
+    >>> drive = drivesplat.open("results/demo/street")
+    >>> run = Simulation(drive, SimulationSettings(cameras=()))
+    >>> run.reset(seed=0)
+    >>> run.step([0.0, -2.0])  # the wheels straight, braking with 2 m/s²
+    """
+
+    def __init__(self, drive: TrainedDrive, settings: SimulationSettings | None = None):
+        """Raises RequestError for an unknown sensor, and a start that the drive does not have."""
+        self.drive, self.settings = drive, settings or SimulationSettings()
+        self.step_s = 1.0 / self.settings.rate_hz
+        first, last = self._driven_span
+        if not first <= self.settings.start < last:
+            raise RequestError(
+                f"{drive.where}: a run cannot begin at {self.settings.start:g} s; the vehicle drives from {first:.2f} "
+                f"to {last:.2f} s"
+            )
+        self.cameras = {name: self._camera(name) for name in self._camera_names}
+        self.lidar = None if self.settings.lidar is None else drive.lidar(self.settings.lidar, self.settings.start)
+        self._shape = shape_of(self.settings.vehicle)
+        self.reset()
+
+    @cached_property
+    def _driven_span(self) -> tuple[float, float]:
+        """The first and the last second at which the ego vehicle has a place in the drive."""
+        times = np.arange(0.0, self.drive.duration + 1e-9, PATH_S)
+        there = []
+        for time in times:
+            try:
+                self.drive.ego_to_world(float(time))
+            except RequestError:
+                continue
+            there.append(float(time))
+        if not there:
+            raise RequestError(f"{self.drive.where}: the ego vehicle has no place at any time")
+        return there[0], there[-1]
+
+    @property
+    def _camera_names(self) -> Sequence[str]:
+        return self.drive.cameras[:1] if self.settings.cameras is None else self.settings.cameras
+
+    def _camera(self, name: str) -> PoseableCamera:
+        camera = self.drive.camera(name)
+        return camera if self.settings.width is None else camera.resized(self.settings.width)
+
+    @cached_property
+    def _recorded(self) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, "m 4 4"]]:
+        """Seconds of the recorded path, and the poses of the ego vehicle."""
+        first, last = self._driven_span
+        times = np.append(np.arange(first, last, PATH_S), last)
+        return times, self.drive.ego_path(times)
+
+    @cached_property
+    def _ground(self) -> RecordedGround:
+        return RecordedGround(self._recorded[1])
+
+    @cached_property
+    def drivable(self) -> Drivable | None:
+        """The surface of the road, cut at kerbs, where the model has one; None where no drivable area is known."""
+        roads = [part for part in self.drive.model.parts if isinstance(part, RoadPart)]
+        if not roads:
+            return None
+        surface = roads[0].surface
+
+        def on_road(places: np.ndarray) -> np.ndarray:
+            wanted = torch.from_numpy(np.asarray(places, dtype=np.float32)).to(surface.heights.device)
+            return surface.covers(wanted).cpu().numpy()
+
+        return on_road
+
+    # ---- from step to step
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begins a run. `seed` draws what the settings vary; None: 0."""
+        settings = self.settings
+        actors = [*self.drive.edited_actors, *self.drive.other_objects]
+        last = self._driven_span[1] if settings.beyond == "end" else self.drive.duration + self.length_s
+        self.traffic = Traffic(
+            actors, len(self.drive.edited_actors), settings.traffic, settings.start, last,
+            np.random.default_rng(0 if seed is None else seed),
+        )  # fmt: skip
+        self.steps, self.follows = 0, True
+        self.ego = self._recorded_state(settings.start)
+        self._on_route = self._nearest_on_route(None)
+        self._log: list[tuple[VehicleState, np.ndarray, np.ndarray, np.ndarray]] = []
+        self._note()
+
+    @property
+    def length_s(self) -> float:
+        """The length of a run in seconds."""
+        rest = self._driven_span[1] - self.settings.start
+        wanted = self.settings.seconds
+        if wanted is None:
+            return rest
+        return min(wanted, rest) if self.settings.beyond == "end" else wanted
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the run began."""
+        return self.steps * self.step_s
+
+    @property
+    def time(self) -> float:
+        """The time of the drive, seconds since the first image."""
+        return self.settings.start + self.seconds
+
+    @property
+    def ended(self) -> bool:
+        """Whether the time of the run is over."""
+        return self.seconds + 0.5 * self.step_s >= self.length_s
+
+    def step(self, action: Sequence[float] | np.ndarray) -> None:
+        """Moves on by a step with an action of the settings' kind; values beyond the vehicle's limits are clipped.
+        Raises RequestError for an action that is not finite or has another shape, and after the end."""
+        if self.ended:
+            raise RequestError("the run is over: reset() begins another one")
+        steering, acceleration = self._control(action)
+        self.traffic.advance(self.time, self.step_s, self.moving_box)
+        self.steps += 1
+        if self.seconds <= self.settings.recorded_until + 1e-9:
+            self.ego = self._recorded_state(self.time)
+        else:
+            self.follows = False
+            self.ego = advanced(self.ego, steering, acceleration, self.step_s, self.settings.vehicle)
+        self._on_route = self._nearest_on_route(self._on_route)
+        self._note()
+
+    def _control(self, action: Sequence[float] | np.ndarray) -> tuple[float, float]:
+        poses = self.settings.actions == "poses"
+        shape = (self.settings.horizon, 3) if poses else (2,)
+        try:
+            values = np.array(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.full(shape, np.nan)
+        if values.shape != shape or not np.isfinite(values).all():
+            what = "x, y and heading of each step" if poses else "steering and acceleration"
+            raise RequestError(f"an action is {what}: finite numbers of shape {shape}, not {action!r}")
+        if poses:
+            return control_towards(self.ego, values, self.step_s, self.settings.vehicle)
+        return float(values[0]), float(values[1])
+
+    def _recorded_state(self, time: float) -> VehicleState:
+        """The state of the recorded vehicle."""
+        first, last = self._driven_span
+        ends = np.clip(time + np.array([-0.05, 0.05]), first, last)
+        now, before, after = self.drive.ego_path(np.array([np.clip(time, first, last), *ends]))
+        moved = inverse(before) @ after
+        span = max(ends[1] - ends[0], 1e-6)
+        speed = math.copysign(float(np.linalg.norm(moved[:3, 3])), moved[0, 3]) / span
+        yaw_rate = math.atan2(moved[1, 0], moved[0, 0]) / span
+        return state_of(now, speed, yaw_rate, self.settings.vehicle.wheelbase)
+
+    def _note(self) -> None:
+        self._log.append((self.ego, self.ego_to_world, self.traffic.poses, self.traffic.present))
+
+    # ---- where everything is
+
+    @property
+    def ego_to_world(self) -> Float64[np.ndarray, "4 4"]:
+        """The pose of the ego vehicle, on the ground."""
+        if self.follows:
+            first, last = self._driven_span
+            return self.drive.ego_path(np.array([min(max(self.time, first), last)]))[0]
+        return self._ground.ego_to_world(self.ego)
+
+    @property
+    def moving_box(self) -> MovingBox:
+        """The ego vehicle as others see it."""
+        ego, shape = self.ego, self._shape
+        centre = np.array([ego.x, ego.y]) + shape.centre * np.array([math.cos(ego.yaw), math.sin(ego.yaw)])
+        return MovingBox(centre, ego.yaw, ego.speed, shape.length, shape.width)
+
+    def ego_values(self) -> Float32[np.ndarray, " e"]:
+        """The ego vehicle, by EGO_COLUMNS."""
+        ego = self.ego
+        rate = ego.yaw_rate(self.settings.vehicle.wheelbase)
+        return np.array([ego.speed, ego.acceleration, ego.steering, rate, self.seconds], dtype=np.float32)
+
+    def route(self) -> Float32[np.ndarray, "r 3"]:
+        """The recorded path ahead: x, y (metres) and heading (radians) in the frame of the ego vehicle at equal steps,
+        from the place that is nearest to it. Beyond its end the path goes straight on."""
+        along, places = self._route
+        wanted = along[self._on_route] + self.settings.route_step * np.arange(1, self.settings.route_points + 1)
+        points = np.stack([np.interp(wanted, along, places[:, axis]) for axis in (0, 1)], axis=1)
+        local = self.ego.in_frame(points)
+        ahead = self.ego.in_frame(points + np.gradient(points, axis=0) if len(points) > 1 else points)
+        heading = np.arctan2(*(ahead - local)[:, ::-1].T)
+        return np.column_stack([local, heading]).astype(np.float32)
+
+    @property
+    def progress(self) -> float:
+        """Metres along the recorded path, from where it begins."""
+        return float(self._route[0][self._on_route])
+
+    @property
+    def offset(self) -> float:
+        """Metres from the recorded path."""
+        return math.dist(self._route[1][self._on_route], (self.ego.x, self.ego.y))
+
+    def _nearest_on_route(self, before: int | None) -> int:
+        """The place of the route that is nearest to the ego vehicle; not far from that `before`, since a path may cross
+        itself."""
+        places = self._route[1]
+        low, high = (0, len(places)) if before is None else (max(0, before - SEARCH), before + SEARCH)
+        return low + int(np.linalg.norm(places[low:high] - [self.ego.x, self.ego.y], axis=1).argmin())
+
+    @cached_property
+    def _route(self) -> tuple[np.ndarray, np.ndarray]:
+        """The recorded path without rests: lengths (p,) and places (p, 2), continued straight on."""
+        places = self._recorded[1][:, :2, 3]
+        steps = np.concatenate([[0.0], np.linalg.norm(np.diff(places, axis=0), axis=1)])
+        kept = np.flatnonzero(np.diff(np.floor(np.cumsum(steps) / 0.1), prepend=-1.0))
+        places, forward = places[kept], self._recorded[1][-1, :2, 0]
+        far = self.settings.route_step * (self.settings.route_points + 2)
+        places = np.concatenate([places, places[-1:] + np.linspace(1.0, far, max(2, int(far)))[:, None] * forward])
+        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+        return lengths, places
+
+    def boxes(self) -> tuple[list[str], Float32[np.ndarray, "k 8"]]:
+        """The ids of the objects that are there, the nearest first, and what is known of them, by BOX_COLUMNS."""
+        ids, values = self._all_boxes()
+        return ids[: self.settings.max_boxes], values[: self.settings.max_boxes].astype(np.float32)
+
+    def _all_boxes(self) -> tuple[list[str], Float64[np.ndarray, "k 8"]]:
+        traffic = self.traffic
+        there = np.flatnonzero(traffic.present)
+        local = inverse(self.ego_to_world) @ traffic.poses[there]
+        order = np.argsort(np.linalg.norm(local[:, :2, 3], axis=1), kind="stable")
+        local, there = local[order], there[order]
+        yaw = np.arctan2(local[:, 1, 0], local[:, 0, 0])
+        values = np.column_stack([local[:, :3, 3], traffic.sizes[there], yaw, traffic.speeds[there]])
+        return [traffic.actors[i].id for i in there], values.reshape(-1, len(BOX_COLUMNS))
+
+    def contacts(self) -> list[str]:
+        """The ids of the objects that the body of the ego vehicle touches."""
+        ids, boxes = self._all_boxes()
+        shape, found = self._shape, []
+        body = _corners(shape.centre, 0.0, 0.0, shape.length, shape.width)
+        for id, (x, y, z, length, width, height, yaw, _) in zip(ids, boxes.tolist(), strict=True):
+            above = z - 0.5 * height < shape.height and z + 0.5 * height > GROUND_CLEARANCE
+            if above and _overlap(body, _corners(x, y, yaw, length, width)):
+                found.append(id)
+        return found
+
+    # ---- what is seen, and what is left
+
+    def world(self) -> WorldState:
+        """The drive as it now is, to be rendered from anywhere."""
+        within = self.time <= self.drive.duration
+        placements = None if self.traffic.as_recorded and within else self.traffic.placements()
+        return self.drive.state(min(self.time, self.drive.duration), placements=placements)
+
+    def look(self) -> Sight:
+        """What the policy sees now."""
+        if not self.cameras and self.lidar is None:
+            return Sight({}, None)
+        world, views = self.world(), {}
+        placed: dict[str, Any] = {} if self.follows else {"ego_to_world": self.ego_to_world, "velocity": self._velocity}
+        if self.cameras:
+            found = world.render(list(self.cameras.values()), outputs=self.settings.outputs, **placed)
+            views = {name: _arrays(view) for name, view in zip(self.cameras, found, strict=True)}
+        if self.lidar is None:
+            return Sight(views, None)
+        scan = world.scan(self.lidar, **placed).arrays()
+        returned = scan["returned"]
+        lidar = {name: np.where(returned, scan[name], 0.0).astype(np.float32) for name in ("range", "intensity")}
+        return Sight(views, lidar)
+
+    @property
+    def _velocity(self) -> Float64[np.ndarray, "6"]:
+        """That of the ego vehicle along its axes."""
+        rate = self.ego.yaw_rate(self.settings.vehicle.wheelbase)
+        return np.array([self.ego.speed, 0.0, 0.0, 0.0, 0.0, rate])
+
+    def driven(self) -> DrivenRun:
+        """The record of the run so far."""
+        states, poses, objects, present = zip(*self._log, strict=True)
+        every, there = np.stack(objects), np.stack(present)
+        others = [
+            OtherObject(actor.id, actor.object_class, actor.size, there[:, i], every[:, i])
+            for i, actor in enumerate(self.traffic.actors)
+            if there[:, i].any()
+        ]
+        seconds, recorded = self._recorded
+        return DrivenRun(
+            self.settings.start + self.step_s * np.arange(len(states)),
+            np.stack(poses),
+            np.array([state.speed for state in states]),
+            np.array([state.steering for state in states]),
+            self._shape,
+            others,
+            seconds,
+            recorded,
+            self.drivable,
+            min(len(states) - 1, int(self.settings.recorded_until * self.settings.rate_hz + 1e-6)),
+        )
+
+
+def _arrays(view: DriveView) -> dict[str, np.ndarray]:
+    """The outputs of a rendering as arrays; its colours as 8-bit integers."""
+    found = {} if view.rgb is None else {"rgb": view.image}
+    return {**found, **replace(view, rgb=None).arrays()}
+
+
+def _corners(x: float, y: float, yaw: float, length: float, width: float) -> Float64[np.ndarray, "4 2"]:
+    """The corners of a rectangle."""
+    forward, left = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+    signs = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0)])
+    return np.array([x, y]) + 0.5 * signs[:, :1] * length * forward + 0.5 * signs[:, 1:] * width * left
+
+
+def _overlap(one: Float64[np.ndarray, "4 2"], other: Float64[np.ndarray, "4 2"]) -> bool:
+    """Whether two rectangles overlap: no edge of either separates them."""
+    for corners in (one, other):
+        for axis in (corners[0] - corners[1], corners[1] - corners[2]):
+            a, b = one @ axis, other @ axis
+            if a.max() < b.min() or b.max() < a.min():
+                return False
+    return True
