@@ -30,7 +30,9 @@ class VehicleSettings(Settings):
     max_braking: float = Field(8.0, gt=0, le=20)
     """m/s²."""
     max_speed: float = Field(40.0, gt=0, le=100)
-    """m/s; backwards a quarter of it."""
+    """m/s."""
+    max_reverse_speed: float = Field(0.0, ge=0, le=50)
+    """The largest speed backwards, m/s. 0: a vehicle that brakes stays where it comes to rest."""
 
 
 class TrafficSettings(Settings):

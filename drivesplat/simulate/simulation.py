@@ -207,12 +207,14 @@ class Simulation:
         return state_of(now, speed, yaw_rate, self.settings.vehicle.wheelbase)
 
     def _note(self) -> None:
+        """Keeps where everything is after a step."""
+        self.ego_to_world = self._ego_pose()
+        self._objects = self._seen_from_ego()
         self._log.append((self.ego, self.ego_to_world, self.traffic.poses, self.traffic.present))
 
     # ---- where everything is
 
-    @property
-    def ego_to_world(self) -> Float64[np.ndarray, "4 4"]:
+    def _ego_pose(self) -> Float64[np.ndarray, "4 4"]:
         """The pose of the ego vehicle, on the ground."""
         if self.follows:
             first, last = self._driven_span
@@ -274,10 +276,10 @@ class Simulation:
 
     def boxes(self) -> tuple[list[str], Float32[np.ndarray, "k 8"]]:
         """The ids of the objects that are there, the nearest first, and what is known of them, by BOX_COLUMNS."""
-        ids, values = self._all_boxes()
+        ids, values = self._objects
         return ids[: self.settings.max_boxes], values[: self.settings.max_boxes].astype(np.float32)
 
-    def _all_boxes(self) -> tuple[list[str], Float64[np.ndarray, "k 8"]]:
+    def _seen_from_ego(self) -> tuple[list[str], Float64[np.ndarray, "k 8"]]:
         traffic = self.traffic
         there = np.flatnonzero(traffic.present)
         local = inverse(self.ego_to_world) @ traffic.poses[there]
@@ -289,12 +291,13 @@ class Simulation:
 
     def contacts(self) -> list[str]:
         """The ids of the objects that the body of the ego vehicle touches."""
-        ids, boxes = self._all_boxes()
+        ids, boxes = self._objects
         shape, found = self._shape, []
         body = _corners(shape.centre, 0.0, 0.0, shape.length, shape.width)
         for id, (x, y, z, length, width, height, yaw, _) in zip(ids, boxes.tolist(), strict=True):
+            near = math.hypot(x - shape.centre, y) < 0.5 * (shape.length + shape.width + length + width)
             above = z - 0.5 * height < shape.height and z + 0.5 * height > GROUND_CLEARANCE
-            if above and _overlap(body, _corners(x, y, yaw, length, width)):
+            if near and above and _overlap(body, _corners(x, y, yaw, length, width)):
                 found.append(id)
         return found
 

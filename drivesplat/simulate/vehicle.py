@@ -57,8 +57,7 @@ def advanced(
     """The state after `seconds` of a kinematic bicycle whose reference point is the middle of the rear axle: x' = v cos
     yaw, y' = v sin yaw, yaw' = v tan(steering) / wheelbase, v' = acceleration.
 
-    The wheels turn towards `steering` as fast as they can; both inputs and the speed are kept within the limits. A
-    vehicle that brakes comes to rest and does not go backwards in the same step.
+    The wheels turn towards `steering` as fast as they can; both inputs and the speed are kept within the limits.
     """
     wanted = float(np.clip(steering, -limits.max_steering, limits.max_steering))
     pushed = float(np.clip(acceleration, -limits.max_braking, limits.max_acceleration))
@@ -67,10 +66,7 @@ def advanced(
     for _ in range(count):
         turn = limits.max_steering_rate * h
         angle = now.steering + min(max(wanted - now.steering, -turn), turn)
-        speed = now.speed + pushed * h
-        if state.speed * speed < 0.0 or (now.speed == 0.0 and state.speed != 0.0):
-            speed = 0.0
-        speed = min(max(speed, -0.25 * limits.max_speed), limits.max_speed)
+        speed = min(max(now.speed + pushed * h, -limits.max_reverse_speed), limits.max_speed)
         mean = 0.5 * (now.speed + speed)
         yaw = now.yaw + h * mean * math.tan(angle) / limits.wheelbase
         middle = 0.5 * (now.yaw + yaw)  # exact to second order in h
