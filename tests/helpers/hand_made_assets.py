@@ -54,3 +54,13 @@ def painted_box(**changes: Any) -> Asset:
 def rgb_of(gaussians: Gaussians) -> torch.Tensor:
     """The colours (n, 3) of Gaussians without their dependence on the direction."""
     return 0.5 + SH_C0 * gaussians.sh0[:, 0]
+
+
+def filled_car(count: int = 400, sh_degree: int = 3, seed: int = 5, **changes: Any) -> Asset:
+    """A car whose box is full of Gaussians of other lengths in each direction, in colours that depend on it."""
+    generator = torch.Generator().manual_seed(seed)
+    random = torch.rand(count, 7, generator=generator)
+    quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1)
+    sh = 0.2 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator)
+    means = (random[:, :3] - 0.5) * torch.from_numpy(CAR).float()
+    return asset_of(Gaussians.of(means, quats, 0.02 + 0.1 * random[:, 3:6], 0.3 + 0.6 * random[:, 6], sh), **changes)

@@ -39,6 +39,8 @@ MIN_EDGE, MAX_EDGE = 0.1, 30.0
 """Metres; the edges of the box of anything that drives or walks."""
 MAX_OF_PEOPLE = 3.0
 """Metres; the longest edge of the box of a person."""
+VISIBLE = np.radians(75.0)
+"""A surface is seen from directions within this of the one that it faces; at grazing angles it is not."""
 LIDAR = tuple(f"lidar_{i}" for i in range(8))
 INVENTED = "invented"
 
@@ -122,15 +124,20 @@ NO_INSERTS = Inserts(MappingProxyType({}))
 def write_asset(folder: Path, asset: Asset) -> dict[str, Any]:
     """Writes the files of an asset into its folder; returns the record."""
     folder.mkdir(parents=True, exist_ok=True)
-    extra = {INVENTED: asset.invented.cpu().numpy().astype(np.uint8)}
-    logits = asset.gaussians.lidar_logits
-    if logits is not None:
-        values = logits.reshape(len(asset.gaussians), 8).detach().cpu().numpy().astype(np.float32)
-        extra |= dict(zip(LIDAR, values.T, strict=True))
-    record = asset.record()
+    extra, record = extra_columns(asset.gaussians, asset.invented), asset.record()
     write_splat_ply(folder / PLY, asset.gaussians, {"asset": asset.name, "frame": "object"}, extra)
     write_json(folder / RECORD, {**record, "provenance": asset.provenance})
     return record
+
+
+def extra_columns(gaussians: Gaussians, invented: Bool[Tensor, " n"]) -> dict[str, np.ndarray]:
+    """The columns (n,) of asset.ply that other splats lack, by name: `invented`, and LiDAR logits where known."""
+    extra = {INVENTED: invented.cpu().numpy().astype(np.uint8)}
+    logits = gaussians.lidar_logits
+    if logits is not None:
+        values = logits.reshape(len(gaussians), 8).detach().cpu().numpy().astype(np.float32)
+        extra |= dict(zip(LIDAR, values.T, strict=True))
+    return extra
 
 
 def read_asset(folder: Path) -> Asset:

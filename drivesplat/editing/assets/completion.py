@@ -11,14 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from drivesplat.editing.assets.asset import Asset
+from drivesplat.editing.assets.asset import VISIBLE, Asset
 from drivesplat.editing.assets.asset_view import AssetView, seen_asset
 from drivesplat.model.gaussians import Gaussians, no_colors
 from drivesplat.model.harmonics import rotation_of_harmonics_by
 from drivesplat.scene.object_class import ObjectClass
-
-VISIBLE = np.radians(75.0)
-"""A surface is seen from directions within this of the one that it faces; at grazing angles it is not."""
 
 SPACING, THICKNESS = 0.1, 0.01
 """Metres between the Gaussians of a hull, and their standard deviation across it."""

@@ -1,0 +1,1 @@
+"""The template of `index.html`, the page of a library of assets."""
