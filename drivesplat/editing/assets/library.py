@@ -50,6 +50,10 @@ def read_asset_index(file: Path) -> dict[str, str]:
     """The folders of a method's assets by their tracks, from assets.json. Raises ResultError where it is not one."""
     index = read_record(file, RULE, "assets")
     try:
-        return {str(record["track"]): str(record["folder"]) for record in index["assets"]}
+        folders = {str(record["track"]): str(record["folder"]) for record in index["assets"]}
     except (KeyError, TypeError) as error:
         raise unreadable(file, RULE, f"not what the rule writes (it lacks {error})") from error
+    for folder in folders.values():
+        if Path(folder).name != folder or folder in ("", ".."):
+            raise unreadable(file, RULE, f"{folder!r} is not a folder beside it")
+    return folders
