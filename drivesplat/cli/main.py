@@ -17,6 +17,7 @@ from pathlib import Path
 
 import drivesplat
 from drivesplat import SNAKEFILE, WORKFLOW
+from drivesplat.cli import assets
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import default_config, in_this_copy, of_the_workflow
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "drivesplat") ->
             raise DriveSplatError("the current folder has been removed; change to another one") from None
         if given[:1] == [RUN]:  # all the rest is Snakemake's
             return run_workflow(given[1:])
-        parsed = _parser(program).parse_args(given)
+        parsed = _parser(program).parse_args(assets.with_action(given))
         with standard_output():
             return run_command(parsed)
         return 0  # nobody reads the rest
@@ -81,6 +82,8 @@ def _parser(program: str) -> argparse.ArgumentParser:
     live.add_argument("--port", type=int, default=8080, help="port to listen at (8080)")
     live.add_argument("--device", default="any", choices=["any", "cuda", "cpu"], help="any: a GPU where there is one")
 
+    assets.add_parser(commands)
+
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
 
@@ -122,6 +125,8 @@ def run_command(parsed: argparse.Namespace) -> int:
         count = drivesplat.render_poses(drive, parsed.poses, parsed.camera, outputs, parsed.out, parsed.ego)
         print(f"{parsed.out}: {count} images each of {', '.join(outputs)}, and render.json")
         return 0
+    if parsed.command == assets.COMMAND:
+        return assets.run_assets(parsed)
     if parsed.command == "view":
         drives = [drivesplat.open(folder, parsed.device) for folder in parsed.folders]
         server = drivesplat.LiveServer(drives, parsed.host, parsed.port, parsed.edits)
