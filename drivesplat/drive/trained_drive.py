@@ -174,16 +174,11 @@ class TrainedDrive(Sensors):
             return self.before._recorded_actors
         return trained_actors(self.model, self.scene, self.where)
 
-    @property
-    def other_objects(self) -> Sequence[EditedActor]:
-        """The annotated objects that the model shows in its static part, if at all, as recorded."""
-        return self._static.others
-
     @cached_property
-    def _static(self) -> ShownObjects:
+    def static_objects(self) -> ShownObjects:
         """The annotated objects that the model shows in its static part, if at all. No edit changes them."""
         if self.before is not None:
-            return self.before._static
+            return self.before.static_objects
         dynamic = {track.id for track in self.scene.tracks if track.object_class.is_dynamic}
         others = [item for item in other_objects(self.scene, self._recorded_actors) if item.id in dynamic]
         return ShownObjects.of_scene(self.scene, self.model, [], others)
@@ -325,7 +320,7 @@ class TrainedDrive(Sensors):
         inside = min(max(time, 0.0), self.duration) if outside == "clamp" and np.isfinite(time) else time
         now = float(self.recording.checked(inside))
         as_recorded = self.edit is None and placements is None
-        return WorldState(self._fixed, self.edited_actors, self._static, self, now, as_recorded, placements)
+        return WorldState(self._fixed, self.edited_actors, self.static_objects, self, now, as_recorded, placements)
 
     @overload
     def render(

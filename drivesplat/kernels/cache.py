@@ -16,7 +16,7 @@ from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_write
 from drivesplat.kernels.cache_folder import cache_folder
 from drivesplat.kernels.numba_private import cached_on_disk
-from drivesplat.provenance.code_digest import code_digest
+from drivesplat.provenance.code.code_digest import code_digest
 
 OPTIONS = {"nogil": True, "error_model": "numpy"}
 callee = numba.njit(**OPTIONS)

@@ -2,8 +2,8 @@
 their base class, and one-line messages for their errors.
 
 Fields are documented by attribute docstrings, so that a reworded comment does not change the code digest (see
-`drivesplat.provenance.code_digest`). A docstring that begins with `:printed:` puts its field into config.yaml, which
-users read first; docs/settings.md and config.schema.json have all fields.
+`drivesplat.provenance.code`). A docstring that begins with `:printed:` puts its field into config.yaml, which users
+read first; docs/settings.md and config.schema.json have all fields.
 """
 
 from collections.abc import Collection, Mapping, Sequence

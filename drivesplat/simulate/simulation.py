@@ -129,7 +129,7 @@ class Simulation:
     def reset(self, seed: int | None = None) -> None:
         """Begins a run. `seed` draws what the settings vary; None: 0."""
         settings = self.settings
-        actors = [*self.drive.edited_actors, *self.drive.other_objects]
+        actors = [*self.drive.edited_actors, *self.drive.static_objects.others]
         last = self._driven_span[1] if settings.beyond == "end" else self.drive.duration + self.length_s
         self.traffic = Traffic(
             actors, len(self.drive.edited_actors), settings.traffic, settings.start, last,

@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from drivesplat.provenance.code_states import code_states
+from drivesplat.provenance.code.code_states import code_states
 
 IN_SCRIPT = hasattr(sys.modules["__main__"], "snakemake")
 """Whether this runs in a rule's script, which imports this package before all others."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json, sha256_text
-from drivesplat.provenance.code_digest import code_digest
+from drivesplat.provenance.code.code_digest import code_digest
 from drivesplat.settings.asset_references import FOLDER, INDEX, LIGHT, asset_names, asset_of_results, files_of_asset
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat

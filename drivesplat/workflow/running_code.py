@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.provenance.code_digest import PACKAGE, code_digest, code_files
-from drivesplat.provenance.code_states import file_state
+from drivesplat.provenance.code.code_digest import PACKAGE, code_digest, code_files
+from drivesplat.provenance.code.code_states import file_state
 from drivesplat.workflow import CODE_AT_START
 
 PLANNED = "DRIVESPLAT_PLANNED"

@@ -14,7 +14,7 @@ from helpers import REPOSITORY
 from helpers.patience import PATIENCE_S
 from packaging.requirements import Requirement
 
-from drivesplat.provenance.code_digest import code_digest
+from drivesplat.provenance.code.code_digest import code_digest
 
 FOLDERS = ("envs", "presets", "profiles", "report", "rules", "workflow_scripts")
 FILES = (
@@ -80,7 +80,7 @@ def test_an_installed_copy_has_the_code_digests_of_the_checkout_and_its_own_page
     """A result is not out of date where another installation made it."""
     code = (
         "import json; from drivesplat import IS_CHECKOUT, WORKFLOW; from drivesplat.export import viewer_page; "
-        "from drivesplat.provenance.code_digest import code_digest; "
+        "from drivesplat.provenance.code.code_digest import code_digest; "
         "from drivesplat.report.files import render_ghosts_page; "
         "assert not IS_CHECKOUT and '<h2' in render_ghosts_page(); "
         "print(json.dumps({p.stem: code_digest(p) for p in (WORKFLOW / 'workflow_scripts').glob('*.py')}))"

@@ -60,8 +60,8 @@ for line in sys.stdin:
 
 
 USED = (
-    "kernels/cache kernels/cache_folder kernels/numba_private provenance/code_digest provenance/syntax_digest "
-    "io/file_lock io/regular_file io/storage errors"
+    "kernels/cache kernels/cache_folder kernels/numba_private provenance/code/code_digest "
+    "provenance/code/syntax_digest io/file_lock io/regular_file io/storage errors"
 )
 """Modules that `drivesplat.kernels.cache` imports."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.provenance import code_digest as module
+from drivesplat.provenance.code import code_digest as module
 
 LEAF = '''\
 """What the others import."""
@@ -196,7 +196,7 @@ def test_touched_files_and_another_folder_change_no_digest(toy, tmp_path, monkey
 def test_every_stages_digest_is_the_same_in_every_process():
     """Sets and dicts have no order to rely on: hashes of strings differ from process to process."""
     code = (
-        "from pathlib import Path; from drivesplat.provenance.code_digest import code_digest\n"
+        "from pathlib import Path; from drivesplat.provenance.code.code_digest import code_digest\n"
         "print([(p.name, code_digest(p)) for p in sorted(Path('workflow_scripts').glob('*.py'))])"
     )
     printed = set()

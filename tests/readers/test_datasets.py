@@ -7,7 +7,7 @@ import pytest
 
 import drivesplat.readers
 from drivesplat.errors import DatasetError
-from drivesplat.provenance.code_digest import expanded
+from drivesplat.provenance.code.code_digest import expanded
 from drivesplat.readers.datasets import LAYOUT, READER, layout, reader
 from drivesplat.readers.sweeps import SWEEP_FILE
 from drivesplat.settings.dataset import DatasetSettings

@@ -12,7 +12,7 @@ from helpers import REPOSITORY
 from helpers.workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.errors import ConfigError
-from drivesplat.provenance.code_digest import code_digest
+from drivesplat.provenance.code.code_digest import code_digest
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.running_code import PLANNED, planned_digest
 
@@ -79,7 +79,7 @@ def outcome(folder: Path, imported: str, body: str, before: str = "", running: s
     executed when it starts; `running` stands in for the source that runs."""
     script, source = folder / "toy.py", TOY.format(imported=imported, body=body)
     script.write_text(source)
-    ask = "import sys; from drivesplat.provenance.code_digest import code_digest; print(code_digest(sys.argv[1]))"
+    ask = "import sys; from drivesplat.provenance.code.code_digest import code_digest; print(code_digest(sys.argv[1]))"
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     told = {"cwd": folder, "env": environment, "capture_output": True, "text": True}
     code = subprocess.run([sys.executable, "-c", ask, str(script)], check=True, **told).stdout.strip()
@@ -122,7 +122,7 @@ def test_bytecode_of_the_same_size_and_second_is_not_run_instead_of_an_edit(libr
     module, script = library / "drivesplat/toy.py", tmp_path / "script.py"
     script.write_text("from drivesplat import toy\n")
     ask = [sys.executable, "-c", "from drivesplat import toy; print(toy.VALUE)"]
-    digest = f"from drivesplat.provenance.code_digest import code_digest as d; d({str(script)!r})"
+    digest = f"from drivesplat.provenance.code.code_digest import code_digest as d; d({str(script)!r})"
     digest = [sys.executable, "-c", digest]
     told = {"cwd": library, "env": {"PYTHONPATH": str(library)}, "check": True}
     for value in ("1", "2"):

@@ -14,7 +14,7 @@ from drivesplat.io.storage import atomic_write
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.cache_folder import cache_folder
 from drivesplat.kernels.cuda import scan_source, source
-from drivesplat.provenance.code_digest import code_digest
+from drivesplat.provenance.code.code_digest import code_digest
 
 log = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
 
-from drivesplat.provenance.syntax_digest import cached_digest
+from drivesplat.provenance.code.syntax_digest import cached_digest
 
 PACKAGE = "drivesplat"
-PACKAGE_FOLDER = Path(__file__).parents[1]
+PACKAGE_FOLDER = Path(__file__).parents[2]
 PAGE_FILES = (".html", ".js")
 """Files beside a package's modules that are part of the package's code."""
 

@@ -1,0 +1,1 @@
+"""Digests and states of code: what a rule and a kernel cache depend on."""
