@@ -162,7 +162,7 @@ class Traffic:
         """The rates of the clocks of drivers."""
         recorded = self.tables.at(self.tables.speeds, self.clocks)
         later = self.tables.at(self.tables.speeds, self.clocks + seconds)
-        for i in np.flatnonzero(self._vehicles & self.present):
+        for i in np.flatnonzero(self._vehicles & self.present).tolist():
             if not self.reacting[i] and recorded[i] < MOVING:
                 continue  # it stands, or waits as recorded
             gap, approach = self._gap(i, ego)
@@ -176,7 +176,7 @@ class Traffic:
             if not self.reacting[i] and interaction + as_recorded < INTERACTION:
                 continue
             self.reacting[i] = True
-            rates[i] = self._rate(i, interaction, recorded[i], seconds)
+            rates[i] = self._rate(i, float(interaction), float(recorded[i]), seconds)
         return rates
 
     def _rate(self, i: int, interaction: float, recorded: float, seconds: float) -> float:

@@ -97,7 +97,7 @@ def control_towards(
     steering = math.atan2(2.0 * limits.wheelbase * aim[1], float(aim @ aim))
     forward = 1.0 if targets[-1, 0] >= 0.0 else -1.0
     speed = forward * (along[-1] - along[1]) / (step_s * (len(targets) - 1)) if len(targets) > 1 else state.speed
-    lag = forward * along[1] - 0.5 * (state.speed + speed) * step_s
+    lag = float(targets[0, 0]) - 0.5 * (state.speed + speed) * step_s
     return steering, 2.0 * (speed - state.speed) / CATCH_UP_S + lag / CATCH_UP_S**2
 
 

@@ -33,7 +33,7 @@ def standing_at(x: float, y: float = 0.0, speed: float = 0.0, yaw: float = 0.0) 
 
 def traffic_of(*actors, seed=0, **settings) -> Traffic:
     made = TrafficSettings.model_validate(settings)
-    return Traffic(actors, len(actors), made, 0.0, 10.0, np.random.default_rng(seed))
+    return Traffic(actors, len(actors), made, 0.0, 60.0, np.random.default_rng(seed))
 
 
 def played(traffic: Traffic, ego, steps: int) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_who_follows_the_one_that_braked_brakes_too():
         (standing_at(20.0, 3.0), False),  # in the next lane
         (standing_at(20.0, 2.1), True),  # its side reaches into the corridor
         (standing_at(-10.0), False),  # behind
-        (standing_at(20.0, 0.0, 8.0), False),  # drives ahead as fast
+        (standing_at(40.0, 0.0, 8.0), False),  # drives ahead as fast
         (standing_at(30.0, 0.0, 8.0, math.pi), True),  # comes towards it
         (standing_at(22.0, 3.0, 0.0, math.pi / 2), True),  # stands across its lane
     ],

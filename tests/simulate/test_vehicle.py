@@ -79,7 +79,7 @@ def test_the_controller_follows_poses_that_the_vehicle_can_drive(speed, angle, p
 
 
 def test_the_controller_brakes_where_the_targets_stay_here():
-    steering, acceleration = control_towards(VehicleState(0, 0, 0, 3.0, 0.1), np.zeros((5, 3)), STEP, LIMITS)
+    steering, acceleration = control_towards(VehicleState(0.0, 0.0, 0.0, 3.0, 0.1), np.zeros((5, 3)), STEP, LIMITS)
     assert (steering, acceleration) == (0.1, pytest.approx(-30.0))
 
 
