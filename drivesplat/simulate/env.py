@@ -11,19 +11,15 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.errors import RequestError
 from drivesplat.settings.simulate import SimulationSettings
-from drivesplat.simulate.simulation import BOX_COLUMNS, EGO_COLUMNS, Sight, Simulation
-
-Observation = dict[str, Any]
+from drivesplat.simulate.simulation import BOX_COLUMNS, EGO_COLUMNS, Observation, Simulation
 
 
 class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
     """A trained drive as an environment: a policy drives the ego vehicle, and sees what its cameras then show.
 
-    Observations are a dictionary: `cameras` (by name, then by output), `lidar`, `ego` (EGO_COLUMNS), `route` (points of
-    the recorded path ahead in the frame of the vehicle) and `boxes` (BOX_COLUMNS, rows of zeros beyond the objects that
-    are there; `info["objects"]` has their ids). Every array is a copy. The reward is the progress in metres along the
-    recorded path. An episode terminates at a contact with an object or too far from the path, by the settings, and is
-    truncated at the end of its time.
+    Observations are those of `Simulation.observation`, `info` that of `Simulation.facts`. The reward is the progress in
+    metres along the recorded path. An episode terminates at a contact with an object or too far from the path, by the
+    settings, and is truncated at the end of its time.
 
     The same seed and actions give the same states, on a CPU also the same images.
 
@@ -63,7 +59,7 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
         self.action_space = self._actions()
         self.observation_space = self._observations()
         self._over = True
-        self._sight: Sight | None = None
+        self._seen: Observation = {}
 
     def _actions(self) -> spaces.Box:
         limits = self.settings.vehicle
@@ -106,7 +102,7 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
         own = int(self.np_random.integers(2**31)) if seed is None else seed
         self.simulation.reset(own)
         self._over = False
-        return self._observed(), self._info()
+        return self._observed(), self.simulation.facts()
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Moves on by a step. Raises RequestError for an action that is not finite or has another shape, and after the
@@ -115,7 +111,7 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
             raise RequestError("the episode is over: reset() begins another one")
         before = self.simulation.progress
         self.simulation.step(action)
-        info = self._info()
+        info = self.simulation.facts()
         far = self.settings.max_offset is not None and self.simulation.offset > self.settings.max_offset
         touches = self.settings.end_on_collision and bool(info["contacts"]) and not self.simulation.follows
         terminated, truncated = far or touches, self.simulation.ended
@@ -124,34 +120,15 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """The last image of the first camera, if `render_mode` is 'rgb_array'."""
-        if self.render_mode is None or self._sight is None:
+        if self.render_mode is None or not self._seen:
             return None
-        if not self._sight.cameras or "rgb" not in self.settings.outputs:
+        if "cameras" not in self._seen or "rgb" not in self.settings.outputs:
             raise RequestError("the environment has no image: give it a camera, and 'rgb' among `outputs`")
-        return next(iter(self._sight.cameras.values()))["rgb"].copy()
+        return next(iter(self._seen["cameras"].values()))["rgb"].copy()
 
     def _observed(self) -> Observation:
-        ids, boxes = self.simulation.boxes()
-        padded = np.zeros((self.settings.max_boxes, len(BOX_COLUMNS)), dtype=np.float32)
-        padded[: len(ids)] = boxes
-        self._sight = self.simulation.look()
-        found: Observation = {"ego": self.simulation.ego_values(), "route": self.simulation.route(), "boxes": padded}
-        if self._sight.cameras:
-            found["cameras"] = {name: dict(own) for name, own in self._sight.cameras.items()}
-        if self._sight.lidar is not None:
-            found["lidar"] = dict(self._sight.lidar)
-        return found
-
-    def _info(self) -> dict[str, Any]:
-        run = self.simulation
-        return {
-            "time": run.time,
-            "ego_to_world": run.ego_to_world,
-            "objects": run.boxes()[0],
-            "contacts": run.contacts(),
-            "offset": run.offset,
-            "follows_recording": run.follows,
-        }
+        self._seen = self.simulation.observation()
+        return self._seen
 
 
 def vector_env(

@@ -1,8 +1,8 @@
 """A trained drive in which a policy drives: its state from step to step, what it sees, and what it leaves."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -42,14 +42,7 @@ GROUND_CLEARANCE = 0.3
 """Metres from the ground to the body of the ego vehicle."""
 
 
-@dataclass(frozen=True)
-class Sight:
-    """What a policy sees: `cameras`, by name and then by output, images (h, w, 3) uint8, depth (h, w) in metres and
-    instances (h, w), an index into the ids of `objects` of the rendering, -1 for anything else; `lidar`: the range in
-    metres, 0 without a return, and the intensity of every ray (b, a); None without one."""
-
-    cameras: Mapping[str, Mapping[str, np.ndarray]]
-    lidar: Mapping[str, np.ndarray] | None
+Observation = dict[str, Any]
 
 
 class Simulation:
@@ -309,27 +302,46 @@ class Simulation:
         placements = None if self.traffic.as_recorded and within else self.traffic.placements()
         return self.drive.state(min(self.time, self.drive.duration), placements=placements)
 
-    def look(self) -> Sight:
-        """What the policy sees now."""
-        if not self.cameras and self.lidar is None:
-            return Sight({}, None)
-        world, views = self.world(), {}
-        placed: dict[str, Any] = {} if self.follows else {"ego_to_world": self.ego_to_world, "velocity": self._velocity}
-        if self.cameras:
-            found = world.render(list(self.cameras.values()), outputs=self.settings.outputs, **placed)
-            views = {name: _arrays(view) for name, view in zip(self.cameras, found, strict=True)}
-        if self.lidar is None:
-            return Sight(views, None)
-        scan = world.scan(self.lidar, **placed).arrays()
-        returned = scan["returned"]
-        lidar = {name: np.where(returned, scan[name], 0.0).astype(np.float32) for name in ("range", "intensity")}
-        return Sight(views, lidar)
-
     @property
-    def _velocity(self) -> Float64[np.ndarray, "6"]:
-        """That of the ego vehicle along its axes."""
+    def place(self) -> dict[str, Any]:
+        """Where `WorldState.render` and `scan` place the sensors: nothing while the vehicle follows the recording."""
+        if self.follows:
+            return {}
         rate = self.ego.yaw_rate(self.settings.vehicle.wheelbase)
-        return np.array([self.ego.speed, 0.0, 0.0, 0.0, 0.0, rate])
+        velocity = np.array([self.ego.speed, 0.0, 0.0, 0.0, 0.0, rate])
+        return {"ego_to_world": self.ego_to_world, "velocity": velocity}
+
+    def observation(self) -> Observation:
+        """What a policy sees now: `ego`, `route`, and `boxes` (max_boxes, 8), rows of zeros beyond the objects that are
+        there; `cameras`, where there are some, by name and then by output: `rgb` (h, w, 3) uint8, `depth` (h, w) in
+        metres, `instance` (h, w), an index into the objects of the model, -1 for anything else; `lidar`, where there is
+        one: `range` in metres, 0 without a return, and `intensity` of every ray (b, a). Every array is a copy."""
+        ids, boxes = self.boxes()
+        padded = np.zeros((self.settings.max_boxes, len(BOX_COLUMNS)), dtype=np.float32)
+        padded[: len(ids)] = boxes
+        found: Observation = {"ego": self.ego_values(), "route": self.route(), "boxes": padded}
+        world = self.world() if self.cameras or self.lidar is not None else None
+        if world is not None and self.cameras:
+            views = world.render(list(self.cameras.values()), outputs=self.settings.outputs, **self.place)
+            found["cameras"] = {name: _arrays(view) for name, view in zip(self.cameras, views, strict=True)}
+        if world is not None and self.lidar is not None:
+            scan = world.scan(self.lidar, **self.place).arrays()
+            values = {name: np.where(scan["returned"], scan[name], 0.0) for name in ("range", "intensity")}
+            found["lidar"] = {name: own.astype(np.float32) for name, own in values.items()}
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """What is known beside the observation: the time of the drive, the pose of the ego vehicle, the ids of the
+        objects in the rows of `boxes`, those that it touches, metres from the recorded path, and whether it follows
+        the recording."""
+        return {
+            "time": self.time,
+            "ego_to_world": self.ego_to_world.copy(),
+            "objects": self.boxes()[0],
+            "contacts": self.contacts(),
+            "offset": self.offset,
+            "follows_recording": self.follows,
+        }
 
     def driven(self) -> DrivenRun:
         """The record of the run so far."""

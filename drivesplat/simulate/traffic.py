@@ -172,8 +172,8 @@ class Traffic:
                 wanted = self._settings.standstill_gap + self.speeds[i] * self._time_gaps[i]
                 wanted += self.speeds[i] * approach / (2.0 * np.sqrt(self._accelerations[i] * self._settings.braking))
                 interaction = self._accelerations[i] * (max(wanted, 0.0) / max(gap, 0.1)) ** 2
-            as_recorded = (later[i] - recorded[i]) / seconds
-            if not self.reacting[i] and interaction + as_recorded < INTERACTION:
+            brakes = max(float(recorded[i] - later[i]) / seconds, 0.0)
+            if not self.reacting[i] and interaction < INTERACTION + brakes:
                 continue
             self.reacting[i] = True
             rates[i] = self._rate(i, float(interaction), float(recorded[i]), seconds)

@@ -66,7 +66,7 @@ def advanced(
     for _ in range(count):
         turn = limits.max_steering_rate * h
         angle = now.steering + min(max(wanted - now.steering, -turn), turn)
-        speed = min(max(now.speed + pushed * h, -limits.max_reverse_speed), limits.max_speed)
+        speed = min(max(now.speed + pushed * h, -limits.max_reverse_speed), limits.max_speed) + 0.0  # no -0.0
         mean = 0.5 * (now.speed + speed)
         yaw = now.yaw + h * mean * math.tan(angle) / limits.wheelbase
         middle = 0.5 * (now.yaw + yaw)  # exact to second order in h
