@@ -29,6 +29,7 @@ from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.sensor_path import EgoPoses
 from drivesplat.editing.shown_objects import ShownObjects
 from drivesplat.errors import RequestError
+from drivesplat.io.storage import Provenance
 from drivesplat.lidar.moved_sensor import moved, steady_motion
 from drivesplat.lidar.scans import SensorPoses
 from drivesplat.model.checkpoint import STATE, open_model, read_checkpoint, read_snapshot
@@ -79,7 +80,8 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
         raise RequestError(f"there is no device {device!r}; there are: {', '.join(kinds)}")
     settings = device if isinstance(device, DeviceSettings) else DeviceSettings.model_validate(device)
     model, chosen = open_model(checkpoint, settings)
-    return TrainedDrive(folder, recording, model, chosen, checkpoint.job.train.scans.beam_spread_rad)
+    spread = checkpoint.job.train.scans.beam_spread_rad
+    return TrainedDrive(folder, recording, model, chosen, spread, checkpoint.provenance)
 
 
 def model_file(folder: Path) -> Path:
@@ -104,6 +106,8 @@ class TrainedDrive(Sensors):
     model: SplatModel
     device: torch.device
     beam_spread: tuple[float, float]
+    provenance: Provenance
+    """That of the checkpoint."""
     edit: Edit | None = None
     before: "TrainedDrive | None" = None
     """The drive as recorded, of an edited one."""

@@ -86,6 +86,8 @@ class Config(Settings):
     opacity penalised in sky pixels) or 'none' (black). Without a cube map, Gaussians fill the sky."""
     train: TrainSettings = TrainSettings()
     render: RenderSettings = RenderSettings()
+    runs: str | None = None
+    """File of runs in the closed loop, for all scenes. docs/closed_loop.md"""
     subjects: dict[str, SubjectSettings] = Field(default_factory=dict)
     """:printed: Vehicle of the ghost panel and of the removal, by scene: {"0061": {track: 6e5c..., key_frame: 12}}.
     Other scenes take the moving vehicle that fills most pixels."""

@@ -1,10 +1,11 @@
 """Settings of runs in the closed loop."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.edit import Edit
 
 Length = Annotated[float, Field(gt=0, le=40)]
 Seconds = Annotated[float, Field(ge=0, le=36000)]
@@ -100,3 +101,35 @@ class SimulationSettings(Settings):
         if values is not None and len(set(values)) < len(values):
             raise ValueError("a name stands twice")
         return values
+
+
+class RunSettings(Settings):
+    """A run of a runs file: who drives where."""
+
+    policy: str = Field(min_length=1)
+    """'recorded', 'constant_speed' or 'pure_pursuit'; or an entry point, `my_package.my_module:MyPolicy`, of a module
+    beside the Snakefile or of an installed package."""
+    policy_settings: dict[str, Any] = Field(default_factory=dict)
+    """What the policy is made with."""
+    scenes: tuple[str, ...] | None = None
+    """The scenes to drive in. null = all of the batch, with an edit those that have it."""
+    methods: tuple[str, ...] = Field(("street",), min_length=1)
+    """The methods whose models are driven in."""
+    edit: str | None = None
+    """The name of an edit in each scene's edits file. null = as recorded."""
+    seeds: tuple[Annotated[int, Field(ge=0, lt=2**31)], ...] = Field((0,), min_length=1)
+    """The seeds of the episodes."""
+    timeout_s: float = Field(60.0, gt=0)
+    """Seconds that a policy may take for an action."""
+    film_width: int = Field(640, ge=64, le=3840)
+    """The width in pixels of the camera's image in the film."""
+    simulation: SimulationSettings = Field(default_factory=SimulationSettings)
+
+
+class RunJob(Settings):
+    """All settings that determine a run; `edit` has the steps, `code` is a digest of the policy's module."""
+
+    run: RunSettings
+    edit: Edit | None
+    code: str | None
+    crf: int

@@ -59,16 +59,21 @@ class PurePursuit:
     """Follows the recorded path by pure pursuit (Coulter 1992), keeps its distance to what is ahead by the intelligent
     driver model (Treiber et al. 2000) on boxes, and is slow in bends."""
 
-    def __init__(self, speed: float = 10.0, width: float = 1.9, front: float = 3.7, **driver: float):
-        """`speed` (m/s) is what it drives where nothing is ahead; `width` is that of the vehicle, `front` is how far it
-        reaches ahead of its rear axle (metres); `driver` are settings of `TrafficSettings`, such as `time_gap`."""
-        self._speed, self._width, self._front = speed, width, front
+    def __init__(
+        self, speed: float = 10.0, lateral: float = 0.0, width: float = 1.9, front: float = 3.7, **driver: float
+    ):
+        """`speed` (m/s) is what it drives where nothing is ahead; `lateral` are the metres to the left of the recorded
+        path at which it drives; `width` is that of the vehicle, `front` is how far it reaches ahead of its rear axle
+        (metres); `driver` are settings of `TrafficSettings`, such as `time_gap`."""
+        self._speed, self._lateral, self._width, self._front = speed, lateral, width, front
         self._driver = TrafficSettings.model_validate(driver)
         self._wheelbase = VehicleSettings().wheelbase
 
     def act(self, observation: Mapping[str, Any], facts: Mapping[str, Any]) -> list[float]:
         """Steering and acceleration."""
-        now, route, driver = float(observation["ego"][0]), observation["route"], self._driver
+        now, route, driver = float(observation["ego"][0]), observation["route"].copy(), self._driver
+        route[:, 0] -= self._lateral * np.sin(route[:, 2])
+        route[:, 1] += self._lateral * np.cos(route[:, 2])
         wanted = max(min(self._speed, bend_speed(route)), 0.1)
         gap, other = self._ahead(route, observation["boxes"])
         push = driver.acceleration * (1.0 - (now / wanted) ** 4)

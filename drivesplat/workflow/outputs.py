@@ -16,6 +16,7 @@ from drivesplat.workflow.film_names import EDITS, QUAD, TRAJECTORIES, no_such_ed
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.named_tracks import fitting_edits
 from drivesplat.workflow.running_code import planned_digest
+from drivesplat.workflow.runs_file import RUNS, runs_of
 from drivesplat.workflow.stages import (
     OF_ONE_SCENE,
     SCAN_BASELINES,
@@ -141,11 +142,20 @@ class Outputs(Inputs):
         """The indices of the assets of the batch's scenes, of every method that can be edited."""
         return self.of_methods(lambda _, method: [f"{FOLDER}/{INDEX}"] if method in self.methods_with_actors else [])
 
+    def runs(self, _: Any = None) -> list[str]:
+        """The records of the runs in the batch's scenes."""
+        return self.of_methods(lambda *at: [f"{RUNS}/{name}.json" for name in runs_of(self.config, *at)])
+
     def inserts(self, wildcards: Any) -> list[str]:
         """The files of the assets that the edit of a job inserts, and of the light of its scene. Raises ConfigError for
         an asset of an unknown scene or of a method that has none."""
-        kind, name = getattr(wildcards, "kind", EDITS), getattr(wildcards, "edit", None) or wildcards.drive
-        edit = scene_edits(self.config, wildcards.scene).get(name) if kind == EDITS else None
+        kind, name = getattr(wildcards, "kind", EDITS), getattr(wildcards, "edit", None)
+        if hasattr(wildcards, "run"):
+            run = runs_of(self.config, wildcards.scene, wildcards.method).get(wildcards.run)
+            name = run and run.edit
+        elif name is None:
+            name = wildcards.drive
+        edit = scene_edits(self.config, wildcards.scene).get(name) if kind == EDITS and name else None
         if edit is None:
             return []
         names = asset_names(edit)

@@ -37,6 +37,7 @@ from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_t
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.recordings import Recordings
 from drivesplat.workflow.report_plan import ReportPlan
+from drivesplat.workflow.runs_file import RUNS, no_such_run, runs_of
 from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
 from drivesplat.world.marker import refuse_foreign_data
@@ -68,9 +69,10 @@ class Plan(JobResources):
         """The function of wildcards that gives a stage's settings as canonical JSON."""
 
         def settings_of(wildcards: Any) -> str:
-            method, trajectory, edit = (getattr(wildcards, name, None) for name in ("method", "trajectory", "edit"))
+            named = (getattr(wildcards, name, None) for name in ("method", "trajectory", "edit", "run"))
+            method, *films = named
             folder = f"{wildcards.kind}/{wildcards.drive}" if hasattr(wildcards, "drive") else None
-            return self.stage_settings(stage, wildcards.scene, method, trajectory or edit or folder)
+            return self.stage_settings(stage, wildcards.scene, method, next(filter(None, films), folder))
 
         return settings_of
 
@@ -140,6 +142,11 @@ class Plan(JobResources):
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
+        if len(path) == 2 and path[0] == RUNS:
+            runs, name = runs_of(self.config, scene, method), path[1].rpartition(".")[0]
+            if name not in runs:
+                raise ConfigError(no_such_run(scene, method, name, runs))
+            return
         if len(path) > 2 and path[0] in (EDITS, TRAJECTORIES):
             self._refuse_unknown_drive(scene, method, path)
             return

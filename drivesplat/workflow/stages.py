@@ -28,12 +28,14 @@ from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, Region
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob, TruthFilmJob
 from drivesplat.settings.scans import ScansJob
+from drivesplat.settings.simulate import RunJob
 from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.visuals import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.world import WorldDonor, WorldJob
 from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.named_tracks import fitting_edits, shows_subject
+from drivesplat.workflow.runs_file import code_of, no_such_run, runs_of
 from drivesplat.workflow.without_cameras import (
     CAMERA_STAGES,
     HOW,
@@ -52,7 +54,7 @@ SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
     WORLD, "extract", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
-    "scan_folder",
+    "scan_folder", "run",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
@@ -312,6 +314,16 @@ def _scan_folder(at: JobScope) -> dict[str, Any]:
     return {**_edit_or_trajectory(at), "eval_camera": camera, "formats": at.config.export.scan_formats}
 
 
+def _run(at: JobScope) -> dict[str, Any]:
+    """Of a `RunJob`. Raises ConfigError for an unknown run."""
+    runs = runs_of(at.config, at.scene, at.method)
+    if at.film not in runs:
+        raise ConfigError(no_such_run(at.scene, at.method, at.film, runs))
+    run = runs[at.film]
+    edit = None if run.edit is None else scene_edits(at.config, at.scene)[run.edit]
+    return {"run": run, "edit": edit, "code": code_of(run.policy), "crf": at.config.render.crf}
+
+
 def _encoding(at: JobScope) -> dict[str, Any]:
     """How films that combine others are encoded."""
     return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
@@ -356,6 +368,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "edit_truth": (EditJob, _quad),
     "drive_folder": (DriveJob, _drive_folder),
     "scan_folder": (ScanFolderJob, _scan_folder),
+    "run": (RunJob, _run),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

@@ -1,0 +1,95 @@
+"""The film of a run: what the camera sees, and the street from above."""
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from drivesplat.drive.cameras import PoseableCamera
+from drivesplat.simulate.simulation import Simulation
+
+METRES_AHEAD, METRES_BEHIND = 45.0, 15.0
+"""What the view from above shows along the heading of the ego vehicle."""
+GROUND, PATH, EGO, OTHER, TOUCHED = (38, 40, 44), (90, 150, 230), (80, 200, 120), (190, 190, 195), (235, 80, 70)
+"""Colours."""
+
+
+class RunFilm:
+    """Frames of a film: the image of a camera beside the street from above, and lines of text below."""
+
+    def __init__(self, simulation: Simulation, width: int):
+        drive = simulation.drive
+        self._camera: PoseableCamera | None = None
+        height = 2 * round(width * 9 / 32)
+        if drive.cameras:
+            camera = drive.camera(next(iter(simulation.cameras), drive.cameras[0]))
+            self._camera = camera.resized(width - width % 2)
+            height = self._camera.height + self._camera.height % 2
+        self._height = height
+        self._scale = height / (METRES_AHEAD + METRES_BEHIND)
+        self._above = 2 * (height // 3)
+        self._text = 2 * max(12, round(0.03 * height))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        beside = 0 if self._camera is None else self._camera.width
+        return beside + self._above, self._height + self._text
+
+    def frame(
+        self, simulation: Simulation, note: str = "", validity: float | None = None
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """The frame of a run as it now is, with a `note` and a bar of the image's `validity` (0 to 1; None: no bar)."""
+        width, height = self.size
+        frame = np.zeros((height, width, 3), dtype=np.uint8)
+        frame[: self._height, width - self._above :] = self._from_above(simulation)
+        if self._camera is not None:
+            image = simulation.world().render(self._camera, **simulation.place).image
+            frame[: self._camera.height, : self._camera.width] = image
+            if validity is not None:
+                self._bar(frame, validity)
+        ego = simulation.ego
+        text = f"{simulation.time:.1f} s   {3.6 * ego.speed:.0f} km/h   {simulation.offset:.1f} m from the path"
+        size = 0.5 * self._text / 24.0
+        for words, line in ((text, 1), (note, 2)):
+            place = (self._text // 4, self._height + line * self._text // 2 - self._text // 10)
+            cv2.putText(frame, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)
+        return frame
+
+    def _bar(self, frame: np.ndarray, validity: float) -> None:
+        """A bar at the lower edge of the camera's image: green where it can be trusted, red where not."""
+        assert self._camera is not None
+        thick, wide = max(3, self._height // 60), round(self._camera.width * min(max(validity, 0.0), 1.0))
+        color = (round(230 * (1.0 - validity)), round(200 * validity), 60)
+        frame[self._camera.height - thick : self._camera.height, : self._camera.width] //= 3
+        frame[self._camera.height - thick : self._camera.height, :wide] = color
+
+    def _from_above(self, simulation: Simulation) -> UInt8[np.ndarray, "h w 3"]:
+        """The street from above, the heading of the ego vehicle upwards."""
+        picture = np.full((self._height, self._above, 3), GROUND, dtype=np.uint8)
+        route = np.concatenate([np.zeros((1, 2)), simulation.route()[:, :2]]).astype(np.float64)
+        cv2.polylines(picture, [self._pixels(route)], False, PATH, max(1, self._height // 200), cv2.LINE_AA)
+        touched, shape = set(simulation.contacts()), simulation.settings.vehicle
+        ids, boxes = simulation.boxes()
+        for id, (x, y, _, length, width, _, yaw, _) in zip(ids, boxes.tolist(), strict=True):
+            self._box(picture, x, y, yaw, length, width, TOUCHED if id in touched else OTHER)
+        self._box(picture, 0.5 * shape.length - shape.rear_overhang, 0.0, 0.0, shape.length, shape.width, EGO)
+        return picture
+
+    def _box(
+        self, picture: np.ndarray, x: float, y: float, yaw: float, length: float, width: float, color: Sequence[int]
+    ) -> None:
+        forward, left = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+        signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+        corners = np.array([x, y]) + 0.5 * signs[:, :1] * length * forward + 0.5 * signs[:, 1:] * width * left
+        cv2.fillPoly(picture, [self._pixels(corners)], tuple(color), cv2.LINE_AA)
+        nose = np.array([[x, y], [x, y] + 0.5 * length * forward])
+        cv2.polylines(picture, [self._pixels(nose)], False, GROUND, 1, cv2.LINE_AA)
+
+    def _pixels(self, places: Float64[np.ndarray, "k 2"]) -> np.ndarray:
+        """Places in the frame of the ego vehicle, x upwards in the picture."""
+        across = 0.5 * self._above - self._scale * places[:, 1]
+        down = self._scale * (METRES_AHEAD - places[:, 0])
+        return np.stack([across, down], axis=1).clip(-1e5, 1e5).round().astype(np.int32)
