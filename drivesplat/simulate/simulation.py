@@ -158,7 +158,7 @@ class Simulation:
         """Whether the time of the run is over."""
         return self.seconds + 0.5 * self.step_s >= self.length_s
 
-    def step(self, action: Sequence[float] | np.ndarray) -> None:
+    def step(self, action: Any) -> None:
         """Moves on by a step with an action of the settings' kind; values beyond the vehicle's limits are clipped.
         Raises RequestError for an action that is not finite or has another shape, and after the end."""
         if self.ended:
@@ -174,7 +174,7 @@ class Simulation:
         self._on_route = self._nearest_on_route(self._on_route)
         self._note()
 
-    def _control(self, action: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    def _control(self, action: Any) -> tuple[float, float]:
         poses = self.settings.actions == "poses"
         shape = (self.settings.horizon, 3) if poses else (2,)
         try:
