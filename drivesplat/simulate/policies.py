@@ -6,10 +6,11 @@ from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from drivesplat.errors import RequestError
 from drivesplat.settings.simulate import TrafficSettings, VehicleSettings
+from drivesplat.simulate.corridor import first_in_the_way
 
 CORRIDOR = 0.4
 """Metres beside the bodies within which something ahead is in the way."""
@@ -88,27 +89,21 @@ class PurePursuit:
     def _ahead(self, route: Float32[np.ndarray, "r 3"], boxes: Float32[np.ndarray, "k 8"]) -> tuple[float, float]:
         """The metres to what is in the way, and its speed (m/s) along the path; infinite and 0 where nothing is."""
         there = boxes[boxes[:, 3] > 0.0].astype(np.float64)
+        there = there[there[:, 2] - 0.5 * there[:, 5] < 2.0]  # not a bridge
         path = np.concatenate([np.zeros((1, 2)), route[:, :2]]).astype(np.float64)
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-        fine = np.linspace(0.0, along[-1], max(2, int(along[-1] / 0.5)))
-        places = np.stack([np.interp(fine, along, path[:, axis]) for axis in (0, 1)], axis=1)
-        directions = np.gradient(places, axis=0)
-        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
-        gap, speed = math.inf, 0.0
-        for x, y, z, length, width, height, yaw, own in there:
-            nearest = int(np.hypot(places[:, 0] - x, places[:, 1] - y).argmin())
-            forward, offset = directions[nearest], np.array([x, y]) - places[nearest]
-            cosine = abs(forward @ [math.cos(yaw), math.sin(yaw)])
-            sine = math.sqrt(max(1.0 - cosine**2, 0.0))
-            lateral = abs(forward[0] * offset[1] - forward[1] * offset[0])
-            position = fine[nearest] + forward @ offset
-            free = lateral > 0.5 * (width * cosine + length * sine + self._width) + CORRIDOR
-            if free or position <= 0.0 or z - 0.5 * height > 2.0:
-                continue
-            distance = position - 0.5 * (length * cosine + width * sine) - self._front
-            if distance < gap:
-                gap, speed = distance, own * float(forward @ [math.cos(yaw), math.sin(yaw)])
-        return gap, speed
+        headings = np.stack([np.cos(there[:, 6]), np.sin(there[:, 6])], axis=1)
+        width = self._width + 2.0 * CORRIDOR
+        found = first_in_the_way(_evenly(path, 0.5), there[:, :2], headings, there[:, 3:5], width)
+        if found is None:
+            return math.inf, 0.0
+        return found.near - self._front, float(there[found.index, 7]) * found.cosine
+
+
+def _evenly(path: Float64[np.ndarray, "p 2"], step: float) -> Float64[np.ndarray, "q 2"]:
+    """Points of a path in equal steps of about so many metres."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    wanted = np.linspace(0.0, along[-1], max(2, int(along[-1] / step)))
+    return np.stack([np.interp(wanted, along, path[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def pursuit(route: Float32[np.ndarray, "r 3"], speed: float, wheelbase: float) -> float:

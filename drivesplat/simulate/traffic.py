@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.model.states import ActorPlacement
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.simulate import TrafficSettings
+from drivesplat.simulate.corridor import first_in_the_way
 from drivesplat.trajectories.edited_actors import EditedActor
 from drivesplat.trajectories.motion import HALF_STEP
 
@@ -193,37 +194,20 @@ class Traffic:
         """The metres of free path ahead of a driver, and how much faster (m/s) he is than what is there; infinite and 0
         where nothing is. While he drives as recorded, others who do so are not in his way."""
         table, start = self.tables, self.tables.at(self.tables.path, self.clocks)[i]
-        ahead = np.flatnonzero((table.path[i] > start - 0.1) & (table.path[i] < start + LOOK_AHEAD) & table.present[i])
-        if len(ahead) < 2:
-            return np.inf, 0.0
-        places, along = table.places[i, ahead, :2], table.path[i, ahead] - start
+        ahead = (table.path[i] > start + 0.05) & (table.path[i] < start + LOOK_AHEAD) & table.present[i]
         others = np.flatnonzero(self.present & (self.reacting if not self.reacting[i] else True))
         others = others[others != i]
         centres = np.concatenate([self.poses[others, :2, 3], ego.centre[None]])
-        forward = np.concatenate([self.poses[others, :2, 0], ego.forward[None]])
-        half = 0.5 * np.concatenate([self.sizes[others, :2], [[ego.length, ego.width]]])
-        speeds = np.append(self.speeds[others], ego.speed)
         near = np.linalg.norm(centres - self.poses[i, :2, 3], axis=1) < LOOK_AHEAD + 10.0
-        if not near.any():
+        headings = np.concatenate([self.poses[others, :2, 0], ego.forward[None]])
+        sizes = np.concatenate([self.sizes[others, :2], [[ego.length, ego.width]]])
+        path = np.concatenate([self.poses[i, :2, 3][None], table.places[i, ahead, :2]])
+        width = self.sizes[i, 1] + 2.0 * CORRIDOR
+        found = first_in_the_way(path, centres[near], headings[near], sizes[near], float(width))
+        if found is None:
             return np.inf, 0.0
-        centres, forward, half, speeds = centres[near], forward[near], half[near], speeds[near]
-        distance = np.linalg.norm(centres[:, None] - places, axis=2)
-        nearest = distance.argmin(axis=1)
-        direction = np.gradient(places, axis=0)
-        direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-        own, offset = direction[nearest], centres - places[nearest]
-        cosine = np.abs((forward * own).sum(axis=1))
-        sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
-        length, width = half[:, 0] * cosine + half[:, 1] * sine, half[:, 0] * sine + half[:, 1] * cosine
-        lateral = np.abs(own[:, 0] * offset[:, 1] - own[:, 1] * offset[:, 0])
-        position = along[nearest] + (own * offset).sum(axis=1)
-        gaps = position - length - 0.5 * self.sizes[i, 0]
-        in_way = (lateral < width + 0.5 * self.sizes[i, 1] + CORRIDOR) & (position > 0.0)
-        if not in_way.any():
-            return np.inf, 0.0
-        first = np.flatnonzero(in_way)[gaps[in_way].argmin()]
-        same_way = (forward[first] * own[first]).sum() * speeds[first]
-        return float(gaps[first]), float(self.speeds[i] - same_way)
+        speed = np.append(self.speeds[others], ego.speed)[near][found.index]
+        return found.near - 0.5 * float(self.sizes[i, 0]), float(self.speeds[i] - found.cosine * speed)
 
 
 @dataclass(frozen=True)
