@@ -1,7 +1,7 @@
 """What a run in the closed loop leaves: where everything was at each step."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -41,15 +41,19 @@ class OtherObject:
     present: Bool[np.ndarray, " n"]
     object_to_world: Float64[np.ndarray, "n 4 4"]
 
-    def speeds(self, seconds: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-        """Horizontal speeds in m/s by central differences over present steps; 0 where there is one step alone."""
-        places, found = self.object_to_world[:, :2, 3], np.zeros(len(seconds))
+    def velocities(self, seconds: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 3"]:
+        """Velocities in world axes, m/s, by central differences over present steps, one-sided at the ends of a
+        presence; 0 where there is one step alone, and at absent steps."""
+        places, found = self.object_to_world[:, :3, 3], np.zeros((len(seconds), 3))
         steps = np.flatnonzero(self.present)
         for run in np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1):
             if len(run) > 1:
-                along = [np.gradient(places[run, axis], seconds[run]) for axis in (0, 1)]
-                found[run] = np.hypot(*along)
+                found[run] = np.gradient(places[run], seconds[run], axis=0)
         return found
+
+    def speeds(self, seconds: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        """Horizontal speeds in m/s, of `velocities`."""
+        return np.linalg.norm(self.velocities(seconds)[:, :2], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,3 +80,15 @@ class DrivenRun:
 
     def __len__(self) -> int:
         return len(self.seconds)
+
+    def from_loop(self) -> "DrivenRun":
+        """The steps that count: those from `loop_from` on, of which the first has index 0."""
+        part = slice(self.loop_from, None)
+        others = [
+            replace(other, present=other.present[part], object_to_world=other.object_to_world[part])
+            for other in self.others
+        ]
+        return replace(
+            self, seconds=self.seconds[part], ego_to_world=self.ego_to_world[part], speed=self.speed[part],
+            steering=self.steering[part], others=others, loop_from=0,
+        )  # fmt: skip
