@@ -27,6 +27,16 @@ def box(x: float, y: float = 0.0, speed: float = 0.0, yaw: float = 0.0, z: float
     return x, y, z, 4.0, 2.0, 1.6, yaw, speed
 
 
+MINE = """
+class Mine:
+    def __init__(self, a):
+        self.a = a
+
+    def act(self, seen, facts):
+        return [self.a, 0]
+"""
+
+
 # ---- what drives
 
 
@@ -99,8 +109,7 @@ def test_the_nearest_edge_on_a_bent_path_is_found():
 
 def test_policies_are_made_by_name_or_entry_point(tmp_path, monkeypatch):
     assert isinstance(policy_of("recorded", {}), RecordedEgo) and RecordedEgo.follows_recording
-    (tmp_path / "my_policies.py").write_text("class Mine:\n    def __init__(self, a):\n        self.a = a\n"
-                                             "    def act(self, seen, facts):\n        return [self.a, 0]\n")  # fmt: skip
+    (tmp_path / "my_policies.py").write_text(MINE)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert policy_of("my_policies:Mine", {"a": 0.1}).act({}, {}) == [0.1, 0]
     digest = code_of("my_policies:Mine")
