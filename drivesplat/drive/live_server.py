@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from drivesplat.drive.live_controls import LiveControls
 from drivesplat.drive.live_view import EditSession, FreeCamera, LiveView, describe, wxyz_of
 from drivesplat.drive.pictures import name_colors, with_rest
-from drivesplat.drive.trained_drive import TrainedDrive, model_file, open_drive
+from drivesplat.drive.recorded_drive import model_file
+from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.drive.world_actor import WorldActor
 from drivesplat.errors import DriveSplatError, RequestError
 from drivesplat.scene.rigid import rigid

@@ -21,7 +21,7 @@ from drivesplat.drive.cameras import (
 )
 from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.lidars import PoseableLidar
-from drivesplat.drive.recorded_drive import RecordedDrive, object_table
+from drivesplat.drive.recorded_drive import RecordedDrive, model_file, object_table
 from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
 from drivesplat.editing.actors import EditedModel, edited_model, other_objects, trained_actors
 from drivesplat.editing.assets.library import read_inserts
@@ -32,7 +32,7 @@ from drivesplat.errors import RequestError
 from drivesplat.io.storage import Provenance
 from drivesplat.lidar.moved_sensor import moved, steady_motion
 from drivesplat.lidar.scans import SensorPoses
-from drivesplat.model.checkpoint import STATE, open_model, read_checkpoint, read_snapshot
+from drivesplat.model.checkpoint import open_model, read_checkpoint, read_snapshot
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
@@ -82,18 +82,6 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
     model, chosen = open_model(checkpoint, settings)
     spread = checkpoint.job.train.scans.beam_spread_rad
     return TrainedDrive(folder, recording, model, chosen, spread, checkpoint.provenance)
-
-
-def model_file(folder: Path) -> Path:
-    """The file of a method's model: its checkpoint, or the last state of a training that runs or was interrupted.
-    Raises RequestError where there is neither."""
-    for file in (folder / "checkpoint.npz", folder / "resume" / STATE):
-        if file.is_file():
-            return file
-    raise RequestError(
-        f"{folder} has no checkpoint.npz: name the folder of a method that has been trained, such as "
-        "results/demo/street; a training that runs saves its first state after a minute"
-    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)

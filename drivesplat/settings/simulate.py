@@ -87,7 +87,7 @@ class SimulationSettings(Settings):
     lidar: str | None = None
     """The LiDAR that a policy sees. null = none."""
     max_boxes: int = Field(32, ge=1, le=1000)
-    """The number of objects that a policy is told of, the nearest ones."""
+    """The largest number of objects in an observation, the nearest ones."""
     route_points: int = Field(20, ge=1, le=500)
     """The number of points of the recorded path ahead."""
     route_step: float = Field(2.0, gt=0, le=50)

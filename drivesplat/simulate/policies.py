@@ -21,8 +21,8 @@ TURN_ACCELERATION = 2.5
 @runtime_checkable
 class Policy(Protocol):
     """Drives. `act` gets an observation and facts (`Simulation.observation`, `Simulation.facts`), and gives an action
-    of the settings' kind. A policy with a `reset` is told the seed of each run. Where `follows_recording` is True, the
-    ego vehicle drives as recorded, whatever `act` gives."""
+    of the settings' kind. `reset`, of a policy that has one, gets the seed of each run. Where `follows_recording` is
+    True, the ego vehicle drives as recorded, whatever `act` gives."""
 
     def act(self, observation: Mapping[str, Any], facts: Mapping[str, Any]) -> Any:
         """The action of the next step."""

@@ -19,7 +19,7 @@ from drivesplat.simulate.simulation import Simulation
 
 def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
     """Drives the episodes of a run, of each seed one, and writes the film of the first. Returns the content of the
-    run's record without provenance. A policy that cannot be made, or that fails, is told in the record.
+    run's record without provenance; its `failed` says what is wrong with a policy that cannot be made, or that fails.
 
     Raises RequestError and ConfigError where the drive does not fit the settings.
     """

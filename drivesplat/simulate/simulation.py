@@ -19,6 +19,7 @@ from drivesplat.model.road import RoadPart
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.driven_run import Drivable, DrivenRun, OtherObject
+from drivesplat.simulate.footprints import ego_boxes, overlapping, upright_boxes
 from drivesplat.simulate.traffic import MovingBox, Traffic
 from drivesplat.simulate.vehicle import (
     RecordedGround,
@@ -38,8 +39,6 @@ PATH_S = 0.05
 """Seconds between the places of the recorded path."""
 SEARCH = 300
 """Places of the route, 0.1 m apart, among which the nearest one is looked for after a step."""
-GROUND_CLEARANCE = 0.3
-"""Metres from the ground to the body of the ego vehicle."""
 
 
 Observation = dict[str, Any]
@@ -284,15 +283,9 @@ class Simulation:
 
     def contacts(self) -> list[str]:
         """The ids of the objects that the body of the ego vehicle touches."""
-        ids, boxes = self._objects
-        shape, found = self._shape, []
-        body = _corners(shape.centre, 0.0, 0.0, shape.length, shape.width)
-        for id, (x, y, z, length, width, height, yaw, _) in zip(ids, boxes.tolist(), strict=True):
-            near = math.hypot(x - shape.centre, y) < 0.5 * (shape.length + shape.width + length + width)
-            above = z - 0.5 * height < shape.height and z + 0.5 * height > GROUND_CLEARANCE
-            if near and above and _overlap(body, _corners(x, y, yaw, length, width)):
-                found.append(id)
-        return found
+        traffic, ego = self.traffic, ego_boxes(self.ego_to_world[None], self._shape)
+        touched = traffic.present & overlapping(ego, upright_boxes(traffic.poses, traffic.sizes))
+        return [traffic.actors[i].id for i in np.flatnonzero(touched)]
 
     # ---- what is seen, and what is left
 
@@ -371,20 +364,3 @@ def _arrays(view: DriveView) -> dict[str, np.ndarray]:
     """The outputs of a rendering as arrays; its colours as 8-bit integers."""
     found = {} if view.rgb is None else {"rgb": view.image}
     return {**found, **replace(view, rgb=None).arrays()}
-
-
-def _corners(x: float, y: float, yaw: float, length: float, width: float) -> Float64[np.ndarray, "4 2"]:
-    """The corners of a rectangle."""
-    forward, left = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
-    signs = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0)])
-    return np.array([x, y]) + 0.5 * signs[:, :1] * length * forward + 0.5 * signs[:, 1:] * width * left
-
-
-def _overlap(one: Float64[np.ndarray, "4 2"], other: Float64[np.ndarray, "4 2"]) -> bool:
-    """Whether two rectangles overlap: no edge of either separates them."""
-    for corners in (one, other):
-        for axis in (corners[0] - corners[1], corners[1] - corners[2]):
-            a, b = one @ axis, other @ axis
-            if a.max() < b.min() or b.max() < a.min():
-                return False
-    return True
