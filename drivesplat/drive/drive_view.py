@@ -75,9 +75,9 @@ class DriveScan:
 
     `range` in metres from the sensor's position at the ray's own time, 0 where no Gaussian is met; `probability` of a
     return; `returned`, the rays that more probably return than not; `intensity` in [0, 1]; `instance`, the index into
-    `objects` of the object that a ray meets, -1 for anything else. `objects` are the ids of the objects that are
-    present and of which the model has Gaussians. `sensor` has the rays with their times, the sensor's pose at the
-    scan's time and its velocities.
+    `objects` of the object that a ray meets, -1 for anything else (None: not asked for). `objects` are the ids of the
+    objects that are present and of which the model has Gaussians. `sensor` has the rays with their times, the sensor's
+    pose at the scan's time and its velocities.
     """
 
     objects: tuple[str, ...]
@@ -86,7 +86,7 @@ class DriveScan:
     probability: Float[Tensor, "b a"]
     returned: Bool[Tensor, "b a"]
     intensity: Float[Tensor, "b a"]
-    instance: Int16[Tensor, "b a"]
+    instance: Int16[Tensor, "b a"] | None
 
     def points(self, frame: PointFrame = "world") -> Float64[np.ndarray, "n 3"]:
         """The returns, beam by beam, in metres: in the world, or in the sensor's frame at the scan's time, in which the

@@ -352,11 +352,12 @@ class TrainedDrive(Sensors):
         ego_to_world: Matrix | None = None,
         sensor_to_world: Matrix | None = None,
         velocity: Vector | None = None,
+        with_instance: bool = True,
         outside: str = "refuse",
     ) -> DriveScan:
         """What a LiDAR measures about a time: `state(time, outside).scan(...)`."""
-        state = self.state(time, outside)
-        return state.scan(lidar, ego_to_world=ego_to_world, sensor_to_world=sensor_to_world, velocity=velocity)
+        placed = {"ego_to_world": ego_to_world, "sensor_to_world": sensor_to_world, "velocity": velocity}
+        return self.state(time, outside).scan(lidar, **placed, with_instance=with_instance)
 
     @property
     def _reference(self) -> str:

@@ -318,7 +318,7 @@ class Simulation:
             views = world.render(list(self.cameras.values()), outputs=self.settings.outputs, **self.place)
             found["cameras"] = {name: _arrays(view) for name, view in zip(self.cameras, views, strict=True)}
         if world is not None and self.lidar is not None:
-            scan = world.scan(self.lidar, **self.place).arrays()
+            scan = world.scan(self.lidar, **self.place, with_instance=False).arrays()
             values = {name: np.where(scan["returned"], scan[name], 0.0) for name in ("range", "intensity")}
             found["lidar"] = {name: own.astype(np.float32) for name, own in values.items()}
         return found
@@ -337,7 +337,7 @@ class Simulation:
         }
 
     def driven(self) -> DrivenRun:
-        """The record of the run so far."""
+        """The record of the run so far. Every step counts where the vehicle has always followed the recording."""
         states, poses, objects, present = zip(*self._log, strict=True)
         every, there = np.stack(objects), np.stack(present)
         others = [
@@ -346,6 +346,7 @@ class Simulation:
             if there[:, i].any()
         ]
         seconds, recorded = self._recorded
+        until = 0 if self.follows else int(self.settings.recorded_until * self.settings.rate_hz + 1e-6)
         return DrivenRun(
             self.settings.start + self.step_s * np.arange(len(states)),
             np.stack(poses),
@@ -356,7 +357,7 @@ class Simulation:
             seconds,
             recorded,
             self.drivable,
-            min(len(states) - 1, int(self.settings.recorded_until * self.settings.rate_hz + 1e-6)),
+            until,
         )
 
 

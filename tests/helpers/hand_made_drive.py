@@ -9,6 +9,7 @@ import torch
 from drivesplat.drive.recorded_drive import RecordedDrive
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.io.array_file import write_arrays
+from drivesplat.io.storage import no_provenance
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.ego_mask import NO_EGO_MASK
 from drivesplat.scene.scan_record import ScanRecords
@@ -27,4 +28,4 @@ def drive_of(scene: Scene, model: SplatModel, folder: Path, scans: ScanRecords |
     if scans is not None:
         write_arrays(file, dataclasses.asdict(scans))
     recording = RecordedDrive("a test", scene, record, NO_EGO_MASK, file)
-    return TrainedDrive(folder / "street", recording, model, torch.device("cpu"), BEAM_SPREAD)
+    return TrainedDrive(folder / "street", recording, model, torch.device("cpu"), BEAM_SPREAD, no_provenance())
