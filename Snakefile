@@ -105,6 +105,7 @@ rule all:
         rules.metrics.input,
         rules.films.input,
         rules.edits.input,
+        rules.runs.input,
         rules.looks.input,
         rules.exports.input,
         rules.gap_report.output,

@@ -34,6 +34,7 @@ rule gap_report:
     input:
         metrics=across_scenes.metrics,
         pictures=across_scenes.pictures,
+        runs=across_scenes.runs,
     output:
         page="<results>/gap_report.html",
         # the same with the links of the archive that --report writes

@@ -9,4 +9,4 @@ from drivesplat.settings.report import ReportJob
 with job(snakemake, check_inputs=False) as current:
     results, found = Path(current.output.page).parent, current.input
     links = snakemake.params.links
-    write_report(results, current.settings(ReportJob), found.metrics, found.pictures, links)
+    write_report(results, current.settings(ReportJob), found.metrics, found.pictures, links, found.runs)

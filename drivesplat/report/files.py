@@ -19,6 +19,7 @@ from drivesplat.report import film_page, ghosts_page
 from drivesplat.report.gaps import gap_report, summary_sentences
 from drivesplat.report.html import report_page
 from drivesplat.report.media import collect_media
+from drivesplat.report.runs import run_rows
 from drivesplat.report.tables import (
     aside_tables,
     gap_table,
@@ -39,12 +40,17 @@ _LINK = re.compile(r"\[([^\]\n]+)\]\((?!https?:)[^)\s]+\)")
 
 
 def write_report(
-    results: Path, job: ReportJob, metrics: Sequence[str], pictures: Sequence[str], links: Sequence[str]
+    results: Path,
+    job: ReportJob,
+    metrics: Sequence[str],
+    pictures: Sequence[str],
+    links: Sequence[str],
+    runs: Sequence[str] = (),
 ) -> None:
-    """Writes the REPORT_FILES of these metrics.json files into the results folder, with these images and links in the
-    page, and prints the table."""
+    """Writes the REPORT_FILES of these metrics.json files and records of runs into the results folder, with these
+    images and links in the page, and prints the table."""
     page, record, table, ghosts, archived = (results / name for name in REPORT_FILES)
-    report = gap_report(list(metrics), job, results / "logs")
+    report = {**gap_report(list(metrics), job, results / "logs"), "runs": run_rows(runs)}
     media = collect_media([*pictures, *links], results)
     # the archive has films, but not the pages that show them
     packed = collect_media([*pictures, *(link for link in links if Path(link).name != FILM_PAGE)], results)

@@ -18,6 +18,7 @@ from drivesplat.report.aside import aside_table
 from drivesplat.report.gaps import moving_gap, shows_other_tracks, shows_people, summary_sentences
 from drivesplat.report.lidar import page_table
 from drivesplat.report.media import MethodMedia, data_url, difference_position, read_image
+from drivesplat.report.runs import run_table
 from drivesplat.report.tables import pixels_label, scene_label
 from drivesplat.workflow.film_names import FILM_PAGE
 
@@ -93,6 +94,7 @@ def report_page(
         ],
         aside=aside_table(report["aside"]),
         lidar=page_table(report["lidar"]),
+        runs=run_table(report.get("runs", ())),
         publications=list(tables.values()),
         published_columns=PUBLISHED_FIGURES,
         scenes=scenes,

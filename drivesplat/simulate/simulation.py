@@ -16,6 +16,7 @@ from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.drive.world_state import WorldState
 from drivesplat.errors import RequestError
 from drivesplat.model.road import RoadPart
+from drivesplat.model.states import IMAGE, SCAN
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.driven_run import Drivable, DrivenRun, OtherObject
@@ -66,6 +67,7 @@ class Simulation:
         self.cameras = {name: self._camera(name) for name in self._camera_names}
         self.lidar = None if self.settings.lidar is None else drive.lidar(self.settings.lidar, self.settings.start)
         self._shape = shape_of(self.settings.vehicle)
+        self._precompute()
         self.reset()
 
     @cached_property
@@ -82,6 +84,14 @@ class Simulation:
         if not there:
             raise RequestError(f"{self.drive.where}: the ego vehicle has no place at any time")
         return there[0], there[-1]
+
+    def _precompute(self) -> None:
+        """Computes the states of the model at the times of all steps, which takes hardly longer than of one."""
+        times = self.settings.start + self.step_s * np.arange(int(self.length_s * self.settings.rate_hz) + 2)
+        within = np.minimum(times, self.drive.duration).tolist()
+        wanted = ([IMAGE] if self.cameras else []) + ([SCAN] if self.lidar is not None else [])
+        for want in wanted:
+            self.drive.model.precompute(within, want)
 
     @property
     def _camera_names(self) -> Sequence[str]:

@@ -142,9 +142,9 @@ class Outputs(Inputs):
         """The indices of the assets of the batch's scenes, of every method that can be edited."""
         return self.of_methods(lambda _, method: [f"{FOLDER}/{INDEX}"] if method in self.methods_with_actors else [])
 
-    def runs(self, _: Any = None) -> list[str]:
-        """The records of the runs in the batch's scenes."""
-        return self.of_methods(lambda *at: [f"{RUNS}/{name}.json" for name in runs_of(self.config, *at)])
+    def runs(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
+        """The records of the runs in `scenes`, by default the batch's."""
+        return self.of_methods(lambda *at: [f"{RUNS}/{name}.json" for name in runs_of(self.config, *at)], scenes)
 
     def inserts(self, wildcards: Any) -> list[str]:
         """The files of the assets that the edit of a job inserts, and of the light of its scene. Raises ConfigError for

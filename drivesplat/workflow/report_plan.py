@@ -61,6 +61,10 @@ class ReportPlan:
         looks = self._plan.of_methods(self._looks, self.scenes, cameras=False)
         return [*_chosen(with_figures, not self._alone), *_chosen(looks, self._everything)]
 
+    def runs(self, _: Any = None) -> list[str]:
+        """The records of runs in its scenes."""
+        return _chosen(self._plan.runs(scenes=self.scenes), self._everything)
+
     def links(self, _: Any = None) -> list[str]:
         """The files that its page links to: films, pages of films, edits and viewers, in an order that does not depend
         on files of settings."""
