@@ -82,6 +82,8 @@ class SimulationSettings(Settings):
     """The cameras that a policy sees. null = the first one; () = none."""
     width: int | None = Field(None, ge=16, le=8192)
     """The width of their images in pixels. null = as recorded."""
+    rolling_shutter: bool = False
+    """Whether these images have the rolling shutter of the recorded camera, where it is known."""
     outputs: tuple[Literal["rgb", "depth", "instance"], ...] = ("rgb",)
     """What a policy sees of a camera."""
     lidar: str | None = None

@@ -98,7 +98,7 @@ class Simulation:
         return self.drive.cameras[:1] if self.settings.cameras is None else self.settings.cameras
 
     def _camera(self, name: str) -> PoseableCamera:
-        camera = self.drive.camera(name)
+        camera = self.drive.camera(name, rolling_shutter=self.settings.rolling_shutter)
         return camera if self.settings.width is None else camera.resized(self.settings.width)
 
     @cached_property

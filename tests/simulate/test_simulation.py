@@ -1,6 +1,7 @@
 """The simulation and the Gymnasium environment, on a finished workflow."""
 
 import math
+import re
 import sys
 from itertools import pairwise
 
@@ -8,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from helpers import REPOSITORY
 from helpers.shared_runs import CAR
 
 import drivesplat
@@ -16,6 +18,7 @@ from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import ConfigError, RequestError
 from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.env import DriveEnv, vector_env
+from drivesplat.simulate.policies import policy_of
 from drivesplat.simulate.simulation import BOX_COLUMNS, Simulation
 
 pytestmark = pytest.mark.workflow
@@ -301,6 +304,23 @@ def test_without_gymnasium_the_environment_says_what_it_needs(monkeypatch):
     assert drivesplat.simulate.Simulation is Simulation
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         _ = drivesplat.simulate.Nothing
+
+
+def test_the_examples_of_the_guide_run(drive, tmp_path, monkeypatch):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/demo").symlink_to(drive.folder.resolve().parent)
+    monkeypatch.chdir(tmp_path)
+    examples = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs/closed_loop.md").read_text(), flags=re.DOTALL)
+    names: dict = {}
+    for example in examples:
+        exec(example, names)
+    assert examples and names["image"].shape == (225, 400, 3)
+
+
+def test_the_example_of_a_camera_policy_drives_along_the_path(drive):
+    seen = simulated(drive, cameras=(CAMERA,), width=64, seconds=1.0).observation()
+    steering, push = policy_of("examples.camera_policy:CameraPolicy", {}).act(seen, {})
+    assert abs(steering) < 0.6 and push == 0.0
 
 
 def test_the_package_gives_the_environment():
