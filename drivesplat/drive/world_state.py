@@ -235,6 +235,10 @@ class WorldState:
         self.actors = self.actors.with_one(copy)
         return copy
 
+    def placed(self) -> PlacedModel:
+        """The model with the objects at their places, by their order in `actors`."""
+        return self._sampled().placed
+
     @overload
     def render(
         self,
