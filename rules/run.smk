@@ -1,7 +1,7 @@
 # The closed loop: policies that drive in a trained drive.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz of any method, scene.json and parser.npz; scans.npz of methods
-# that render LiDAR; the runs file, named by `runs`, is read while planning, like the scene's edits file: a changed run
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz and eval.json of any method, scene.json and parser.npz; scans.npz
+# of methods that render LiDAR; the runs file, named by `runs`, is read while planning, like the scene's edits file: a changed run
 # reruns, its neighbours in the file do not. The assets that the run's edit inserts.
 # OUTPUTS: <results>/{scene}/{method}/runs/{run}.json and {run}.mp4.
 
@@ -14,6 +14,8 @@ rule run:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         parser=plan.of_tracks("parser.npz"),
+        # what its held-out images say of others
+        evaluation="<results>/{scene}/{method}/eval.json",
         scans=plan.training_input("scans"),
         inserts=plan.inserts,
     output:

@@ -21,12 +21,12 @@ class RunFilm:
 
     def __init__(self, simulation: Simulation, width: int):
         drive = simulation.drive
-        self._camera: PoseableCamera | None = None
+        self.camera: PoseableCamera | None = None
         height = 2 * round(width * 9 / 32)
         if drive.cameras:
             camera = drive.camera(next(iter(simulation.cameras), drive.cameras[0]))
-            self._camera = camera.resized(width - width % 2)
-            height = self._camera.height + self._camera.height % 2
+            self.camera = camera.resized(width - width % 2)
+            height = self.camera.height + self.camera.height % 2
         self._height = height
         self._scale = height / (METRES_AHEAD + METRES_BEHIND)
         self._above = 2 * (height // 3)
@@ -35,7 +35,7 @@ class RunFilm:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
-        beside = 0 if self._camera is None else self._camera.width
+        beside = 0 if self.camera is None else self.camera.width
         return beside + self._above, self._height + self._text
 
     def frame(
@@ -45,9 +45,9 @@ class RunFilm:
         width, height = self.size
         frame = np.zeros((height, width, 3), dtype=np.uint8)
         frame[: self._height, width - self._above :] = self._from_above(simulation)
-        if self._camera is not None:
-            image = simulation.world().render(self._camera, **simulation.place).image
-            frame[: self._camera.height, : self._camera.width] = image
+        if self.camera is not None:
+            image = simulation.world().render(self.camera, **simulation.place).image
+            frame[: self.camera.height, : self.camera.width] = image
             if validity is not None:
                 self._bar(frame, validity)
         ego = simulation.ego
@@ -60,11 +60,11 @@ class RunFilm:
 
     def _bar(self, frame: np.ndarray, validity: float) -> None:
         """A bar at the lower edge of the camera's image: green where it can be trusted, red where not."""
-        assert self._camera is not None
-        thick, wide = max(3, self._height // 60), round(self._camera.width * min(max(validity, 0.0), 1.0))
+        assert self.camera is not None
+        thick, wide = max(3, self._height // 60), round(self.camera.width * min(max(validity, 0.0), 1.0))
         color = (round(230 * (1.0 - validity)), round(200 * validity), 60)
-        frame[self._camera.height - thick : self._camera.height, : self._camera.width] //= 3
-        frame[self._camera.height - thick : self._camera.height, :wide] = color
+        frame[self.camera.height - thick : self.camera.height, : self.camera.width] //= 3
+        frame[self.camera.height - thick : self.camera.height, :wide] = color
 
     def _from_above(self, simulation: Simulation) -> UInt8[np.ndarray, "h w 3"]:
         """The street from above, the heading of the ego vehicle upwards."""

@@ -1,6 +1,5 @@
 """The stage `run`: a policy drives in a trained drive, into figures and a film."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,10 @@ from drivesplat.simulate.policies import Policy, policy_of
 from drivesplat.simulate.run_film import RunFilm
 from drivesplat.simulate.scores import run_scores
 from drivesplat.simulate.simulation import Simulation
+from drivesplat.simulate.validity import ViewValidity
+
+BELIEVABLE = 0.5
+"""The validity below which an image is not believed: 6 dB worse than held-out images, or half of it never seen."""
 
 
 def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
@@ -31,23 +34,23 @@ def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
     except RequestError as error:
         policy, refused = None, str(error)
     simulation = Simulation(edited, _settings(run.simulation, policy))
-    episodes: list[Episode] = []
     pictures = RunFilm(simulation, run.film_width)
     rate = max(1, round(run.simulation.rate_hz))
+    driven: list[_Driven] = []
     if policy is None:
-        still = pictures.frame(simulation, "no policy")
-        write_video(film, [still], pictures.size, rate, job.crf)
+        write_video(film, [pictures.frame(simulation, "no policy")], pictures.size, rate, job.crf)
     else:
-        frames = _filmed(simulation, policy, run.seeds[0], run.timeout_s, pictures, episodes)
-        write_video(film, frames, pictures.size, rate, job.crf)
-        for seed in run.seeds[1:]:
-            episodes.append(driven_episode(simulation, policy, seed, run.timeout_s))
+        driven = [
+            _Driven(simulation, policy, seed, run.timeout_s, pictures, n == 0) for n, seed in enumerate(run.seeds)
+        ]
+        write_video(film, driven[0].frames, pictures.size, rate, job.crf)
+    failures = (own.episode.failed for own in driven)
     return {
         "schema": 1,
         "run": run.model_dump(mode="json"),
         "edit": None if job.edit is None else job.edit.model_dump(mode="json"),
-        "failed": refused or next((episode.failed for episode in episodes if episode.failed), None),
-        "episodes": [_figures(episode) for episode in episodes],
+        "failed": refused or next(filter(None, failures), None),
+        "episodes": [own.figures() for own in driven],
     }
 
 
@@ -58,32 +61,42 @@ def _settings(settings: SimulationSettings, policy: Policy | None) -> Simulation
     return settings
 
 
-def _filmed(
-    simulation: Simulation, policy: Policy, seed: int, timeout_s: float, pictures: RunFilm, episodes: list[Episode]
-) -> Iterator[np.ndarray]:
-    """The frames of an episode, which is appended to `episodes`."""
-    frames: list[np.ndarray] = []
+class _Driven:
+    """An episode with the validity of its images, and with `frames` of its film if it is `filmed`."""
 
-    def keep(now: Simulation) -> None:
-        touched = now.contacts()
-        frames.append(pictures.frame(now, f"contact with {', '.join(touched)}" if touched else ""))
+    def __init__(
+        self, simulation: Simulation, policy: Policy, seed: int, timeout_s: float, pictures: RunFilm, filmed: bool
+    ):
+        self.frames: list[np.ndarray] = []
+        self._views: list[ViewValidity] = []
 
-    episodes.append(driven_episode(simulation, policy, seed, timeout_s, keep))
-    yield from frames
+        def look(now: Simulation) -> None:
+            known = None if pictures.camera is None else now.validity(pictures.camera)
+            if known is not None:
+                self._views.append(known)
+            if filmed:
+                touched = now.contacts()
+                note = f"contact with {', '.join(touched)}" if touched else ""
+                self.frames.append(pictures.frame(now, note, None if known is None else known.validity))
 
+        self.episode: Episode = driven_episode(simulation, policy, seed, timeout_s, look)
 
-def _figures(episode: Episode) -> dict[str, Any]:
-    """An episode as plain data: its scores, and the path of the ego vehicle."""
-    run = episode.run
-    scores = run_scores(run)
-    places = run.ego_to_world[:, :3, 3]
-    headings = np.arctan2(run.ego_to_world[:, 1, 0], run.ego_to_world[:, 0, 0])
-    path = np.column_stack([run.seconds, places, headings, run.speed, run.steering])
-    return {
-        "seed": episode.seed,
-        "ended": episode.ended,
-        "failed": episode.failed,
-        "scores": scores.summary,
-        "path_columns": ["seconds", "x", "y", "z", "yaw", "speed", "steering"],
-        "path": np.round(path, 4).tolist(),
-    }
+    def figures(self) -> dict[str, Any]:
+        """The episode as plain data: its scores, the path of the ego vehicle, how far its images can be trusted, and
+        the seconds up to which they can (None: to the end)."""
+        run, views = self.episode.run, self._views
+        headings = np.arctan2(run.ego_to_world[:, 1, 0], run.ego_to_world[:, 0, 0])
+        path = np.column_stack([run.seconds, run.ego_to_world[:, :3, 3], headings, run.speed, run.steering])
+        doubtful = np.flatnonzero([view.validity < BELIEVABLE for view in views])
+        expected = [view.expected_psnr for view in views]
+        return {
+            "seed": self.episode.seed,
+            "ended": self.episode.ended,
+            "failed": self.episode.failed,
+            "scores": run_scores(run).summary,
+            "believable_s": float(run.seconds[doubtful[0]] - run.seconds[0]) if len(doubtful) else None,
+            "validity": [round(view.validity, 3) for view in views],
+            "expected_psnr": [None if value is None else round(value, 2) for value in expected],
+            "path_columns": ["seconds", "x", "y", "z", "yaw", "speed", "steering"],
+            "path": np.round(path, 4).tolist(),
+        }

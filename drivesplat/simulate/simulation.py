@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64
 
 from drivesplat.drive.cameras import PoseableCamera
@@ -19,9 +18,11 @@ from drivesplat.model.road import RoadPart
 from drivesplat.model.states import IMAGE, SCAN
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.simulate import SimulationSettings
+from drivesplat.simulate.drivable import drivable_strip
 from drivesplat.simulate.driven_run import Drivable, DrivenRun, OtherObject
 from drivesplat.simulate.footprints import ego_boxes, overlapping, upright_boxes
 from drivesplat.simulate.traffic import MovingBox, Traffic
+from drivesplat.simulate.validity import ViewKnowledge, ViewValidity
 from drivesplat.simulate.vehicle import (
     RecordedGround,
     VehicleState,
@@ -114,17 +115,10 @@ class Simulation:
 
     @cached_property
     def drivable(self) -> Drivable | None:
-        """The surface of the road, cut at kerbs, where the model has one; None where no drivable area is known."""
-        roads = [part for part in self.drive.model.parts if isinstance(part, RoadPart)]
-        if not roads:
-            return None
-        surface = roads[0].surface
-
-        def on_road(places: np.ndarray) -> np.ndarray:
-            wanted = torch.from_numpy(np.asarray(places, dtype=np.float32)).to(surface.heights.device)
-            return surface.covers(wanted).cpu().numpy()
-
-        return on_road
+        """The road beside the recorded path, as wide as the surface of the model's road is known there; None for a
+        model without a road."""
+        roads = [part.surface for part in self.drive.model.parts if isinstance(part, RoadPart)]
+        return drivable_strip(self._route[1], next(iter(roads), None))
 
     # ---- from step to step
 
@@ -272,7 +266,7 @@ class Simulation:
         kept = np.flatnonzero(np.diff(np.floor(np.cumsum(steps) / 0.1), prepend=-1.0))
         places, forward = places[kept], self._recorded[1][-1, :2, 0]
         far = self.settings.route_step * (self.settings.route_points + 2)
-        places = np.concatenate([places, places[-1:] + np.linspace(1.0, far, max(2, int(far)))[:, None] * forward])
+        places = np.concatenate([places, places[-1:] + np.arange(0.1, far, 0.1)[:, None] * forward])
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
         return lengths, places
 
@@ -303,7 +297,12 @@ class Simulation:
         """The drive as it now is, to be rendered from anywhere."""
         within = self.time <= self.drive.duration
         placements = None if self.traffic.as_recorded and within else self.traffic.placements()
-        return self.drive.state(min(self.time, self.drive.duration), placements=placements)
+        return self.drive.state(self._model_time, placements=placements)
+
+    @property
+    def _model_time(self) -> float:
+        """The time at which the model is shown: beyond the recording its end."""
+        return min(self.time, self.drive.duration)
 
     @property
     def place(self) -> dict[str, Any]:
@@ -333,11 +332,26 @@ class Simulation:
             found["lidar"] = {name: own.astype(np.float32) for name, own in values.items()}
         return found
 
+    @cached_property
+    def knowledge(self) -> ViewKnowledge:
+        """What the training images tell of other images. Rendering them takes some seconds."""
+        return ViewKnowledge.of_drive(self.drive)
+
+    def validity(self, camera: PoseableCamera | None = None) -> ViewValidity:
+        """How far the image of a camera, by default the first one, can be trusted now. Raises RequestError without
+        cameras."""
+        seen = next(iter(self.cameras.values()), None) if camera is None else camera
+        if seen is None:
+            raise RequestError("the validity is that of an image: the simulation has no camera")
+        return self.knowledge.validity(self.world(), self.drive.view(seen, self._model_time, **self.place))
+
     def facts(self) -> dict[str, Any]:
         """What is known beside the observation: the time of the drive, the pose of the ego vehicle, the ids of the
-        objects in the rows of `boxes`, those that it touches, metres from the recorded path, and whether it follows
-        the recording."""
+        objects in the rows of `boxes`, those that it touches, metres from the recorded path, and whether it follows the
+        recording; with the setting `validity` also how far the image of the first camera can be trusted, 0 to 1."""
+        trusted = {"validity": self.validity().validity} if self.settings.validity else {}
         return {
+            **trusted,
             "time": self.time,
             "ego_to_world": self.ego_to_world.copy(),
             "objects": self.boxes()[0],

@@ -1,0 +1,65 @@
+"""The drivable area beside a recorded path: as wide as the road's surface is known there."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from scipy.ndimage import maximum_filter1d
+from scipy.spatial import cKDTree
+
+from drivesplat.model.height_field import HeightField
+
+ON_PATH = 2.0
+"""Metres beside the recorded path that are drivable, since the recorded vehicle drove there."""
+REACH = 20.0
+"""Metres beside the path up to which the surface counts."""
+ALONG = 8.0
+"""Metres along the path, before and behind, whose widest place counts: next to the vehicle no sensor sees the road."""
+
+
+class DrivableStrip:
+    """Called with places (k, 2) in world metres, tells which are drivable: those that are no farther to the left or
+    right of the nearest place of a recorded path than the road's surface, cut at kerbs, is known there, or than
+    ON_PATH. Where nothing is known, as before the first image and after the last, the nearest known width holds."""
+
+    def __init__(self, path: Float64[np.ndarray, "p 2"], surface: HeightField):
+        """`path` in equal steps."""
+        self._path, self._tree = path, cKDTree(path)
+        step = float(np.linalg.norm(path[1] - path[0]))
+        directions = np.gradient(path, axis=0)
+        self._left = np.stack([-directions[:, 1], directions[:, 0]], axis=1)
+        self._left /= np.maximum(np.linalg.norm(self._left, axis=1, keepdims=True), 1e-9)
+        cells = surface.covered.nonzero().cpu().numpy() + 0.5
+        places = surface.lower.cpu().numpy() + surface.edge * cells
+        self._widths = [self._width(side, places, step) for side in (1.0, -1.0)]
+
+    def __call__(self, places: Float64[np.ndarray, "k 2"]) -> Bool[np.ndarray, " k"]:
+        nearest, aside = self._beside(places)
+        left, right = self._widths
+        return (aside <= left[nearest]) & (-aside <= right[nearest])
+
+    def _beside(self, places: Float64[np.ndarray, "k 2"]) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest places of the path, and the metres to the left of them."""
+        nearest = self._tree.query(places)[1]
+        return nearest, ((places - self._path[nearest]) * self._left[nearest]).sum(axis=1)
+
+    def _width(self, side: float, places: Float64[np.ndarray, "c 2"], step: float) -> Float64[np.ndarray, " p"]:
+        """The metres to one side up to which the surface is known, at each place of the path."""
+        width = np.full(len(self._path), -np.inf)
+        if len(places):
+            nearest, aside = self._beside(places)
+            aside = side * aside
+            counts = (aside > 0.0) & (aside < REACH)
+            np.maximum.at(width, nearest[counts], aside[counts])
+        width = maximum_filter1d(width, 2 * max(1, round(ALONG / step)) + 1)
+        known = np.flatnonzero(np.isfinite(width))
+        if len(known):
+            every = np.arange(len(width))
+            after = known[np.searchsorted(known, every).clip(max=len(known) - 1)]
+            before = known[(np.searchsorted(known, every, side="right") - 1).clip(min=0)]
+            width = width[np.where(np.abs(every - before) <= np.abs(after - every), before, after)]
+        return np.maximum(width, ON_PATH)
+
+
+def drivable_strip(path: Float64[np.ndarray, "p 2"], surface: HeightField | None) -> DrivableStrip | None:
+    """The drivable area of a path on a road with this surface; None where no surface is known."""
+    return None if surface is None or not bool(torch.any(surface.covered)) else DrivableStrip(path, surface)
