@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 from drivesplat.drive.live_controls import LiveControls
 from drivesplat.drive.live_view import EditSession, FreeCamera, LiveView, describe, wxyz_of
 from drivesplat.drive.pictures import name_colors, with_rest
-from drivesplat.drive.recorded_drive import model_file
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.drive.world_actor import WorldActor
 from drivesplat.errors import DriveSplatError, RequestError
+from drivesplat.model.checkpoint import model_file
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.tracks import UNIT_CORNERS
 

@@ -16,7 +16,6 @@ from drivesplat.editing.sensor_path import EgoPoses, recorded_ego
 from drivesplat.errors import RequestError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import SensorPoses
-from drivesplat.model.checkpoint import STATE
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan import ScanRays
@@ -36,18 +35,6 @@ COLUMNS = [
     "id", "class", "category", "length", "width", "height", "first", "last", "speed", "editable", "why_not",
 ]  # fmt: skip
 """The columns of `object_table`."""
-
-
-def model_file(folder: Path) -> Path:
-    """The file of a method's model: its checkpoint, or the last state of a training that runs or was interrupted.
-    Raises RequestError where there is neither."""
-    for file in (folder / "checkpoint.npz", folder / "resume" / STATE):
-        if file.is_file():
-            return file
-    raise RequestError(
-        f"{folder} has no checkpoint.npz: name the folder of a method that has been trained, such as "
-        "results/demo/street; a training that runs saves its first state after a minute"
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from drivesplat.drive.cameras import (
 )
 from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.lidars import PoseableLidar
-from drivesplat.drive.recorded_drive import RecordedDrive, model_file, object_table
+from drivesplat.drive.recorded_drive import RecordedDrive, object_table
 from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
 from drivesplat.editing.actors import EditedModel, edited_model, other_objects, trained_actors
 from drivesplat.editing.assets.library import read_inserts
@@ -32,7 +32,7 @@ from drivesplat.errors import RequestError
 from drivesplat.io.storage import Provenance
 from drivesplat.lidar.moved_sensor import moved, steady_motion
 from drivesplat.lidar.scans import SensorPoses
-from drivesplat.model.checkpoint import open_model, read_checkpoint, read_snapshot
+from drivesplat.model.checkpoint import model_file, open_model, read_checkpoint, read_snapshot
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View

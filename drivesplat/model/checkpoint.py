@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from drivesplat.errors import ResultError
+from drivesplat.errors import RequestError, ResultError
 from drivesplat.io.array_file import read_arrays, write_arrays
 from drivesplat.io.storage import Provenance, unreadable
 from drivesplat.io.typed_record import require_finite, typed_record
@@ -121,3 +121,15 @@ def open_model(checkpoint: TrainedCheckpoint, device_settings: DeviceSettings) -
     model = trained_model(checkpoint)
     with explain_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device
+
+
+def model_file(folder: Path) -> Path:
+    """The file of a method's model: its checkpoint, or the last state of a training that runs or was interrupted.
+    Raises RequestError where there is neither."""
+    for file in (folder / "checkpoint.npz", folder / "resume" / STATE):
+        if file.is_file():
+            return file
+    raise RequestError(
+        f"{folder} has no checkpoint.npz: name the folder of a method that has been trained, such as "
+        "results/demo/street; a training that runs saves its first state after a minute"
+    )

@@ -5,14 +5,9 @@ trusted.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from drivesplat.simulate.env import DriveEnv, vector_env
-    from drivesplat.simulate.simulation import Simulation
+from typing import Any
 
 _MODULES = {"DriveEnv": "env", "vector_env": "env", "Simulation": "simulation"}
-__all__ = ["DriveEnv", "Simulation", "vector_env"]
 
 
 def __getattr__(name: str) -> Any:

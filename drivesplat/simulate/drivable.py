@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
@@ -12,7 +12,7 @@ ON_PATH = 2.0
 """Metres beside the recorded path that are drivable, since the recorded vehicle drove there."""
 REACH = 20.0
 """Metres beside the path up to which the surface counts."""
-ALONG = 8.0
+ALONG = 6.0
 """Metres along the path, before and behind, whose widest place counts: next to the vehicle no sensor sees the road."""
 
 
@@ -30,7 +30,12 @@ class DrivableStrip:
         self._left /= np.maximum(np.linalg.norm(self._left, axis=1, keepdims=True), 1e-9)
         cells = surface.covered.nonzero().cpu().numpy() + 0.5
         places = surface.lower.cpu().numpy() + surface.edge * cells
-        self._widths = [self._width(side, places, step) for side in (1.0, -1.0)]
+        nearest, aside = self._beside(places)
+        away = np.linalg.norm(places - path[nearest], axis=1)
+        beside = np.abs(aside) > 0.9 * away  # not before the begin of the path or behind its end
+        known = nearest[beside], aside[beside]
+        widths = (self._width(*known, side, step) + 0.5 * surface.edge for side in (1.0, -1.0))
+        self._widths = [np.maximum(width, ON_PATH) for width in widths]
 
     def __call__(self, places: Float64[np.ndarray, "k 2"]) -> Bool[np.ndarray, " k"]:
         nearest, aside = self._beside(places)
@@ -42,22 +47,25 @@ class DrivableStrip:
         nearest = self._tree.query(places)[1]
         return nearest, ((places - self._path[nearest]) * self._left[nearest]).sum(axis=1)
 
-    def _width(self, side: float, places: Float64[np.ndarray, "c 2"], step: float) -> Float64[np.ndarray, " p"]:
-        """The metres to one side up to which the surface is known, at each place of the path."""
+    def _width(
+        self, nearest: Int[np.ndarray, " c"], aside: Float64[np.ndarray, " c"], side: float, step: float
+    ) -> Float64[np.ndarray, " p"]:
+        """The metres to one side up to which the surface is known, at each place of the path, by the cells' nearest
+        places and how far they are to the left."""
         width = np.full(len(self._path), -np.inf)
-        if len(places):
-            nearest, aside = self._beside(places)
-            aside = side * aside
-            counts = (aside > 0.0) & (aside < REACH)
-            np.maximum.at(width, nearest[counts], aside[counts])
-        width = maximum_filter1d(width, 2 * max(1, round(ALONG / step)) + 1)
+        counts = (side * aside > 0.0) & (side * aside < REACH)
+        np.maximum.at(width, nearest[counts], side * aside[counts])
+        window = 2 * max(1, round(ALONG / step)) + 1
+        width = maximum_filter1d(width, window)
         known = np.flatnonzero(np.isfinite(width))
         if len(known):
             every = np.arange(len(width))
             after = known[np.searchsorted(known, every).clip(max=len(known) - 1)]
             before = known[(np.searchsorted(known, every, side="right") - 1).clip(min=0)]
-            width = width[np.where(np.abs(every - before) <= np.abs(after - every), before, after)]
-        return np.maximum(width, ON_PATH)
+            nearer = np.where(every - before <= after - every, before, after)
+            around = maximum_filter1d(width, window)  # the last known place has few cells
+            width = np.where(np.isfinite(width), width, around[nearer])
+        return width
 
 
 def drivable_strip(path: Float64[np.ndarray, "p 2"], surface: HeightField | None) -> DrivableStrip | None:

@@ -12,6 +12,7 @@ from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.errors import RequestError
 from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.simulation import BOX_COLUMNS, EGO_COLUMNS, Observation, Simulation
+from drivesplat.simulate.validity import ViewKnowledge
 
 
 class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -52,6 +53,10 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
         self.simulation = Simulation(
             opened if not edits else opened.edited(edits), SimulationSettings.model_validate(settings)
         )
+        if self.simulation.settings.validity:
+            known = ViewKnowledge.of_drive(self.simulation.drive)
+            run = self.simulation
+            run.trust = lambda: known.validity(run.world(), run.view()).validity
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise RequestError(f"there is no render mode {render_mode!r}; there is: rgb_array")
         self.render_mode, self.settings = render_mode, self.simulation.settings

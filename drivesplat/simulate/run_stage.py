@@ -1,23 +1,32 @@
-"""The stage `run`: a policy drives in a trained drive, into figures and a film."""
+"""The stage `run`: a policy drives in a trained drive, into figures, and a film of what the camera sees and of the
+street from above."""
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import Float64, UInt8
 
+from drivesplat.drive.cameras import PoseableCamera
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
 from drivesplat.io.video import write_video
 from drivesplat.settings.simulate import RunJob, SimulationSettings
 from drivesplat.simulate.episodes import Episode, driven_episode
 from drivesplat.simulate.policies import Policy, policy_of
-from drivesplat.simulate.run_film import RunFilm
 from drivesplat.simulate.scores import run_scores
 from drivesplat.simulate.simulation import Simulation
-from drivesplat.simulate.validity import ViewValidity
+from drivesplat.simulate.validity import ViewKnowledge, ViewValidity
 
 BELIEVABLE = 0.5
 """The validity below which an image is not believed: 6 dB worse than held-out images, or half of it never seen."""
+METRES_AHEAD, METRES_BEHIND = 45.0, 15.0
+"""What the view from above shows along the heading of the ego vehicle."""
+GROUND, PATH, EGO, OTHER, TOUCHED = (38, 40, 44), (90, 150, 230), (80, 200, 120), (190, 190, 195), (235, 80, 70)
+"""Colours."""
 
 
 def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
@@ -35,13 +44,17 @@ def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
         policy, refused = None, str(error)
     simulation = Simulation(edited, _settings(run.simulation, policy))
     pictures = RunFilm(simulation, run.film_width)
+    known = None if pictures.camera is None else ViewKnowledge.of_drive(edited)
+    if known is not None and run.simulation.validity:
+        simulation.trust = lambda: known.validity(simulation.world(), simulation.view()).validity
     rate = max(1, round(run.simulation.rate_hz))
     driven: list[_Driven] = []
     if policy is None:
         write_video(film, [pictures.frame(simulation, "no policy")], pictures.size, rate, job.crf)
     else:
         driven = [
-            _Driven(simulation, policy, seed, run.timeout_s, pictures, n == 0) for n, seed in enumerate(run.seeds)
+            _Driven(simulation, policy, seed, run.timeout_s, pictures, known, n == 0)
+            for n, seed in enumerate(run.seeds)
         ]
         write_video(film, driven[0].frames, pictures.size, rate, job.crf)
     failures = (own.episode.failed for own in driven)
@@ -61,23 +74,109 @@ def _settings(settings: SimulationSettings, policy: Policy | None) -> Simulation
     return settings
 
 
+class RunFilm:
+    """Frames of a film: the image of a camera beside the street from above, and lines of text below."""
+
+    def __init__(self, simulation: Simulation, width: int):
+        drive = simulation.drive
+        self.camera: PoseableCamera | None = None
+        height = 2 * round(width * 9 / 32)
+        if drive.cameras:
+            camera = drive.camera(next(iter(simulation.cameras), drive.cameras[0]))
+            self.camera = camera.resized(width - width % 2)
+            height = self.camera.height + self.camera.height % 2
+        self._height = height
+        self._scale = height / (METRES_AHEAD + METRES_BEHIND)
+        self._above = 2 * (height // 3)
+        self._text = 2 * max(12, round(0.03 * height))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        beside = 0 if self.camera is None else self.camera.width
+        return beside + self._above, self._height + self._text
+
+    def frame(
+        self, simulation: Simulation, note: str = "", validity: float | None = None
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """The frame of a run as it now is, with a `note` and a bar of the image's `validity` (0 to 1; None: no bar)."""
+        width, height = self.size
+        frame = np.zeros((height, width, 3), dtype=np.uint8)
+        frame[: self._height, width - self._above :] = self._from_above(simulation)
+        if self.camera is not None:
+            image = simulation.world().render(self.camera, **simulation.place).image
+            frame[: self.camera.height, : self.camera.width] = image
+            if validity is not None:
+                self._bar(frame, validity)
+        ego = simulation.ego
+        text = f"{simulation.time:.1f} s   {3.6 * ego.speed:.0f} km/h   {simulation.offset:.1f} m from the path"
+        size = 0.5 * self._text / 24.0
+        for words, line in ((text, 1), (note, 2)):
+            place = (self._text // 4, self._height + line * self._text // 2 - self._text // 10)
+            cv2.putText(frame, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)
+        return frame
+
+    def _bar(self, frame: np.ndarray, validity: float) -> None:
+        """A bar at the lower edge of the camera's image: green where it can be trusted, red where not."""
+        assert self.camera is not None
+        thick, wide = max(3, self._height // 60), round(self.camera.width * min(max(validity, 0.0), 1.0))
+        color = (round(230 * (1.0 - validity)), round(200 * validity), 60)
+        frame[self.camera.height - thick : self.camera.height, : self.camera.width] //= 3
+        frame[self.camera.height - thick : self.camera.height, :wide] = color
+
+    def _from_above(self, simulation: Simulation) -> UInt8[np.ndarray, "h w 3"]:
+        """The street from above, the heading of the ego vehicle upwards."""
+        picture = np.full((self._height, self._above, 3), GROUND, dtype=np.uint8)
+        route = np.concatenate([np.zeros((1, 2)), simulation.route()[:, :2]]).astype(np.float64)
+        cv2.polylines(picture, [self._pixels(route)], False, PATH, max(1, self._height // 200), cv2.LINE_AA)
+        touched, shape = set(simulation.contacts()), simulation.settings.vehicle
+        ids, boxes = simulation.boxes()
+        for id, (x, y, _, length, width, _, yaw, _) in zip(ids, boxes.tolist(), strict=True):
+            self._box(picture, x, y, yaw, length, width, TOUCHED if id in touched else OTHER)
+        self._box(picture, 0.5 * shape.length - shape.rear_overhang, 0.0, 0.0, shape.length, shape.width, EGO)
+        return picture
+
+    def _box(
+        self, picture: np.ndarray, x: float, y: float, yaw: float, length: float, width: float, color: Sequence[int]
+    ) -> None:
+        forward, left = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+        signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+        corners = np.array([x, y]) + 0.5 * signs[:, :1] * length * forward + 0.5 * signs[:, 1:] * width * left
+        cv2.fillPoly(picture, [self._pixels(corners)], tuple(color), cv2.LINE_AA)
+        nose = np.array([[x, y], [x, y] + 0.5 * length * forward])
+        cv2.polylines(picture, [self._pixels(nose)], False, GROUND, 1, cv2.LINE_AA)
+
+    def _pixels(self, places: Float64[np.ndarray, "k 2"]) -> np.ndarray:
+        """Places in the frame of the ego vehicle, x upwards in the picture."""
+        across = 0.5 * self._above - self._scale * places[:, 1]
+        down = self._scale * (METRES_AHEAD - places[:, 0])
+        return np.stack([across, down], axis=1).clip(-1e5, 1e5).round().astype(np.int32)
+
+
 class _Driven:
     """An episode with the validity of its images, and with `frames` of its film if it is `filmed`."""
 
     def __init__(
-        self, simulation: Simulation, policy: Policy, seed: int, timeout_s: float, pictures: RunFilm, filmed: bool
+        self,
+        simulation: Simulation,
+        policy: Policy,
+        seed: int,
+        timeout_s: float,
+        pictures: RunFilm,
+        known: ViewKnowledge | None,
+        filmed: bool,
     ):
         self.frames: list[np.ndarray] = []
         self._views: list[ViewValidity] = []
 
         def look(now: Simulation) -> None:
-            known = None if pictures.camera is None else now.validity(pictures.camera)
-            if known is not None:
-                self._views.append(known)
+            own = None if known is None else known.validity(now.world(), now.view(pictures.camera))
+            if own is not None:
+                self._views.append(own)
             if filmed:
                 touched = now.contacts()
                 note = f"contact with {', '.join(touched)}" if touched else ""
-                self.frames.append(pictures.frame(now, note, None if known is None else known.validity))
+                self.frames.append(pictures.frame(now, note, None if own is None else own.validity))
 
         self.episode: Episode = driven_episode(simulation, policy, seed, timeout_s, look)
 

@@ -1,7 +1,7 @@
 """A trained drive in which a policy drives: its state from step to step, what it sees, and what it leaves."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -16,13 +16,13 @@ from drivesplat.drive.world_state import WorldState
 from drivesplat.errors import RequestError
 from drivesplat.model.road import RoadPart
 from drivesplat.model.states import IMAGE, SCAN
+from drivesplat.model.view import View
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.drivable import drivable_strip
 from drivesplat.simulate.driven_run import Drivable, DrivenRun, OtherObject
 from drivesplat.simulate.footprints import ego_boxes, overlapping, upright_boxes
 from drivesplat.simulate.traffic import MovingBox, Traffic
-from drivesplat.simulate.validity import ViewKnowledge, ViewValidity
 from drivesplat.simulate.vehicle import (
     RecordedGround,
     VehicleState,
@@ -67,6 +67,7 @@ class Simulation:
             )
         self.cameras = {name: self._camera(name) for name in self._camera_names}
         self.lidar = None if self.settings.lidar is None else drive.lidar(self.settings.lidar, self.settings.start)
+        self.trust: Callable[[], float] | None = None
         self._shape = shape_of(self.settings.vehicle)
         self._precompute()
         self.reset()
@@ -332,24 +333,18 @@ class Simulation:
             found["lidar"] = {name: own.astype(np.float32) for name, own in values.items()}
         return found
 
-    @cached_property
-    def knowledge(self) -> ViewKnowledge:
-        """What the training images tell of other images. Rendering them takes some seconds."""
-        return ViewKnowledge.of_drive(self.drive)
-
-    def validity(self, camera: PoseableCamera | None = None) -> ViewValidity:
-        """How far the image of a camera, by default the first one, can be trusted now. Raises RequestError without
-        cameras."""
+    def view(self, camera: PoseableCamera | None = None) -> View:
+        """A camera, by default the first one, where it now is. Raises RequestError without cameras."""
         seen = next(iter(self.cameras.values()), None) if camera is None else camera
         if seen is None:
-            raise RequestError("the validity is that of an image: the simulation has no camera")
-        return self.knowledge.validity(self.world(), self.drive.view(seen, self._model_time, **self.place))
+            raise RequestError("the simulation has no camera")
+        return self.drive.view(seen, self._model_time, **self.place)
 
     def facts(self) -> dict[str, Any]:
         """What is known beside the observation: the time of the drive, the pose of the ego vehicle, the ids of the
         objects in the rows of `boxes`, those that it touches, metres from the recorded path, and whether it follows the
-        recording; with the setting `validity` also how far the image of the first camera can be trusted, 0 to 1."""
-        trusted = {"validity": self.validity().validity} if self.settings.validity else {}
+        recording; where `trust` is set, as `validity` how far the image of the first camera can be trusted, 0 to 1."""
+        trusted = {} if self.trust is None else {"validity": self.trust()}
         return {
             **trusted,
             "time": self.time,

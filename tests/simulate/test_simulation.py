@@ -20,6 +20,7 @@ from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.env import DriveEnv, vector_env
 from drivesplat.simulate.policies import policy_of
 from drivesplat.simulate.simulation import BOX_COLUMNS, Simulation
+from drivesplat.simulate.validity import ViewKnowledge
 
 pytestmark = pytest.mark.workflow
 CAMERA = "CAM_FRONT"
@@ -157,6 +158,29 @@ def test_objects_that_are_moved_are_rendered_where_they_are(drive):
     np.testing.assert_allclose(world.actors[CAR].pose, run.traffic.poses[number], atol=1e-9)
     recorded = drive.state(run.time, outside="clamp").actors[CAR].pose
     assert np.linalg.norm((world.actors[CAR].pose - recorded)[:3, 3]) > 0.3
+
+
+def test_a_policy_is_told_how_far_it_can_trust_the_image(drive):
+    env = DriveEnv(drive, cameras=(CAMERA,), width=64, validity=True, end_on_collision=False)
+    on_path = env.reset(seed=0)[1]["validity"]
+    for _ in range(15):
+        aside = env.step(np.array([0.5, 0.0], dtype=np.float32))[4]["validity"]
+    assert 0.0 <= aside < on_path <= 1.0
+    run = env.simulation
+    view = drive.view(run.cameras[CAMERA], run.time, ego_to_world=run.ego_to_world)
+    assert aside == ViewKnowledge.of_drive(drive).validity(run.world(), view).validity
+    assert "validity" not in simulated(drive).facts()
+    with pytest.raises(RequestError, match="the simulation has no camera"):
+        simulated(drive).view()
+
+
+def test_the_road_of_a_model_is_what_is_drivable(drive):
+    run = simulated(drive)
+    roads = [part for part in drive.model.parts if part.name == "road"]
+    assert (run.drivable is None) == (not roads)
+    if roads:
+        assert run.drivable(run.ego_to_world[None, :2, 3]).tolist() == [True]
+        assert run.drivable(run.ego_to_world[None, :2, 3] + 60.0 * run.ego_to_world[:2, 1]).tolist() == [False]
 
 
 # ---- as an environment

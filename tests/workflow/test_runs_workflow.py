@@ -38,6 +38,8 @@ def test_runs_are_made_of_their_methods_and_again_only_where_something_changed(c
     assert record["schema"] == 1 and record["failed"] is None and record["edit"]["steps"]
     (episode,) = record["episodes"]
     assert len(episode["path"]) == 7 and episode["scores"]["duration_s"] == pytest.approx(0.6)
+    assert len(episode["validity"]) == len(episode["expected_psnr"]) == 7
+    assert all(0.0 <= value <= 1.0 for value in episode["validity"])
     assert read_footage(copy.folder / BRAKES.replace(".json", ".mp4")).frames == 7
     assert copy.read(OWN)["failed"] is None
     assert (copy.folder / "results/0001/vanilla/runs/elsewhere.mp4").is_file()

@@ -9,14 +9,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.cache import kernel
-from drivesplat.kernels.numba.layout import CONIC_XX, CONIC_XY, CONIC_YY, MOMENTS, OPACITY, NumbaTileLists
+from drivesplat.kernels.numba.layout import CHUNK, CONIC_XX, CONIC_XY, CONIC_YY, MOMENTS, OPACITY, NumbaTileLists
 from drivesplat.kernels.numba.pixels import composite_tiles, composite_tiles_backward
 from drivesplat.kernels.numba.projection import arrays
 from drivesplat.kernels.numba.threads import parallel_for
 from drivesplat.kernels.numba.tiles import Splats, front_to_back, grid, tile_lists
-
-CHUNK = 8
-"""Tiles per chunk: few, so that threads finish at the same time."""
 
 
 class Compositing(torch.autograd.Function):

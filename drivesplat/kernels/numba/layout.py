@@ -7,6 +7,8 @@ import numpy as np
 TILE_WIDTH = 16
 TILE_HEIGHT = 16
 """Size of a tile in pixels."""
+CHUNK = 8
+"""Tiles per chunk: few, so that threads finish at the same time."""
 MIN_ALPHA = 1.0 / 255.0
 """Minimum alpha: smaller contributions are not drawn."""
 SLACK = 0.02

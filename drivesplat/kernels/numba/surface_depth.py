@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.kernels.cache import fast_callee, kernel
 from drivesplat.kernels.numba import layout
-from drivesplat.kernels.numba.compositing import CHUNK
+from drivesplat.kernels.numba.layout import CHUNK
 from drivesplat.kernels.numba.pixels import (
     CHECK_EVERY,
     OUT,
