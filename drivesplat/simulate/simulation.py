@@ -207,6 +207,7 @@ class Simulation:
         """Keeps where everything is after a step."""
         self.ego_to_world = self._ego_pose()
         self._objects = self._seen_from_ego()
+        self._touched = self._met()
         self._log.append((self.ego, self.ego_to_world, self.traffic.poses, self.traffic.present))
 
     # ---- where everything is
@@ -288,6 +289,9 @@ class Simulation:
 
     def contacts(self) -> list[str]:
         """The ids of the objects that the body of the ego vehicle touches."""
+        return list(self._touched)
+
+    def _met(self) -> list[str]:
         traffic, ego = self.traffic, ego_boxes(self.ego_to_world[None], self._shape)
         touched = traffic.present & overlapping(ego, upright_boxes(traffic.poses, traffic.sizes))
         return [traffic.actors[i].id for i in np.flatnonzero(touched)]

@@ -193,12 +193,14 @@ class Traffic:
     def _gap(self, i: int, ego: "MovingBox") -> tuple[float, float]:
         """The metres of free path ahead of a driver, and how much faster (m/s) he is than what is there; infinite and 0
         where nothing is. While he drives as recorded, others who do so are not in his way."""
-        table, start = self.tables, self.tables.at(self.tables.path, self.clocks)[i]
-        ahead = (table.path[i] > start + 0.05) & (table.path[i] < start + LOOK_AHEAD) & table.present[i]
         others = np.flatnonzero(self.present & (self.reacting if not self.reacting[i] else True))
         others = others[others != i]
         centres = np.concatenate([self.poses[others, :2, 3], ego.centre[None]])
         near = np.linalg.norm(centres - self.poses[i, :2, 3], axis=1) < LOOK_AHEAD + 10.0
+        if not near.any():
+            return np.inf, 0.0
+        table, start = self.tables, self.tables.at(self.tables.path, self.clocks)[i]
+        ahead = (table.path[i] > start + 0.05) & (table.path[i] < start + LOOK_AHEAD) & table.present[i]
         headings = np.concatenate([self.poses[others, :2, 0], ego.forward[None]])
         sizes = np.concatenate([self.sizes[others, :2], [[ego.length, ego.width]]])
         path = np.concatenate([self.poses[i, :2, 3][None], table.places[i, ahead, :2]])
