@@ -201,7 +201,7 @@ class Simulation:
         span = max(ends[1] - ends[0], 1e-6)
         speed = math.copysign(float(np.linalg.norm(moved[:3, 3])), moved[0, 3]) / span
         yaw_rate = math.atan2(moved[1, 0], moved[0, 0]) / span
-        return state_of(now, speed, yaw_rate, self.settings.vehicle.wheelbase)
+        return state_of(now, speed, yaw_rate, self._shape.wheelbase)
 
     def _note(self) -> None:
         """Keeps where everything is after a step."""
@@ -229,7 +229,7 @@ class Simulation:
     def ego_values(self) -> Float32[np.ndarray, " e"]:
         """The ego vehicle, by EGO_COLUMNS."""
         ego = self.ego
-        rate = ego.yaw_rate(self.settings.vehicle.wheelbase)
+        rate = ego.yaw_rate(self._shape.wheelbase)
         return np.array([ego.speed, ego.acceleration, ego.steering, rate, self.seconds], dtype=np.float32)
 
     def route(self) -> Float32[np.ndarray, "r 3"]:
@@ -314,7 +314,7 @@ class Simulation:
         """Where `WorldState.render` and `scan` place the sensors: nothing while the vehicle follows the recording."""
         if self.follows:
             return {}
-        rate = self.ego.yaw_rate(self.settings.vehicle.wheelbase)
+        rate = self.ego.yaw_rate(self._shape.wheelbase)
         velocity = np.array([self.ego.speed, 0.0, 0.0, 0.0, 0.0, rate])
         return {"ego_to_world": self.ego_to_world, "velocity": velocity}
 
