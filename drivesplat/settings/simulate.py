@@ -68,7 +68,8 @@ class SimulationSettings(Settings):
     recorded_until: Seconds = 0.0
     """Seconds after the start up to which the ego vehicle follows the recorded path, whatever the policy does."""
     beyond: Literal["end", "go_on"] = "end"
-    """What happens at the end of the recording: the run ends, or goes on with the scene as it was last seen."""
+    """What happens at the end of the recording: the run ends, or goes on in the street as it was last seen, without the
+    objects whose recording has ended."""
     actions: Literal["control", "poses"] = "control"
     """What a policy gives: 'control', the angle of the front wheels (radians) and the acceleration (m/s²); 'poses', x,
     y and heading of the next `horizon` steps in the frame of the vehicle."""
