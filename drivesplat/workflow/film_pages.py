@@ -13,6 +13,7 @@ from drivesplat.settings.report import FilmPageJob, FilmSection, ShownFile
 from drivesplat.workflow.film_names import EDITS, FILM_PAGE, QUAD, scene_edits
 from drivesplat.workflow.outputs import COMPARE_FILM, LIDAR, PARTS_FILM, TRUTH_FILM, Outputs
 from drivesplat.workflow.report_plan import EVERYTHING, REPORT_FILES
+from drivesplat.workflow.runs_file import RUNS, runs_of
 from drivesplat.workflow.without_cameras import has_cameras, scene_methods
 
 REPORT_PAGE = REPORT_FILES[0]
@@ -82,7 +83,8 @@ class FilmPages:
                 )
 
     def _films(self, scene: str, method: str) -> list[ShownFile]:
-        """The films that a method may have: along the recorded path, along other paths, of parts, and of edits."""
+        """The films that a method may have: along the recorded path, along other paths, of parts, of edits, and of runs
+        in the closed loop."""
         of_scans = ShownFile(path=f"{method}/{LIDAR}.mp4", words="LiDAR scans: recorded, rendered, and the error")
         if not has_cameras(self._plan.config, scene):
             return [of_scans]
@@ -98,6 +100,10 @@ class FilmPages:
             found.append(ShownFile(path=f"{file}.mp4", words=f"edit {name}: {steps}", poster=f"{file}.png"))
             four = f"recorded images, their reconstruction, the smooth drive, and the edit {name}"
             found.append(ShownFile(path=f"{method}/{QUAD}/{name}.mp4", words=four))
+        for name, run in runs_of(self._plan.config, scene, method).items():
+            where = "" if run.edit is None else f" after the edit {run.edit}"
+            words = f"run {name}: {run.policy} drives{where}; the camera, and the street from above"
+            found.append(ShownFile(path=f"{method}/{RUNS}/{name}.mp4", words=words))
         return found
 
     def _planned(self, scene: str) -> set[str]:
@@ -108,6 +114,7 @@ class FilmPages:
         made: dict[str, Callable[[], list[str]]] = {
             "films": lambda: plan.films(scenes=[scene]),
             "edits": lambda: plan.edits(scenes=[scene]),
+            "runs": lambda: [path.replace(".json", ".mp4") for path in plan.runs(scenes=[scene])],
             "looks": plan.looks,
             "exports": plan.exports,
             "metrics": plan.metrics,

@@ -44,6 +44,9 @@ def test_runs_are_made_of_their_methods_and_again_only_where_something_changed(c
     assert copy.read(OWN)["failed"] is None
     assert (copy.folder / "results/0001/vanilla/runs/elsewhere.mp4").is_file()
     assert "run" not in copy.planned("runs")
+    done = copy.run("results/0001/index.html")
+    page = (copy.folder / "results/0001/index.html").read_text()
+    assert done.returncode == 0 and "run brakes: pure_pursuit drives after the edit stop" in page
     write_runs(copy, {**RUNS, "brakes": {**RUNS["brakes"], "seeds": [1]}})
     assert copy.planned("runs") == {"run": 1, "runs": 1}
     write_runs(copy, RUNS)
