@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit
@@ -99,6 +99,12 @@ class SimulationSettings(Settings):
     """Metres between them."""
     vehicle: VehicleSettings = Field(default_factory=VehicleSettings)
     traffic: TrafficSettings = Field(default_factory=TrafficSettings)
+
+    @model_validator(mode="after")
+    def _has_an_image_to_judge(self) -> "SimulationSettings":
+        if self.validity and self.cameras == ():
+            raise ValueError("'validity' is that of an image: name a camera in 'cameras'")
+        return self
 
     @field_validator("cameras", "outputs")
     @classmethod

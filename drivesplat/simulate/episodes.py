@@ -43,7 +43,11 @@ def driven_episode(
         asked.reset(seed)
         each(simulation)
         while not simulation.ended:
-            simulation.step(asked.act(simulation.observation(), simulation.facts()))
+            action = asked.act(simulation.observation(), simulation.facts())
+            try:
+                simulation.step(action)
+            except RequestError as error:
+                raise _PolicyError(str(error)) from None
             each(simulation)
             touched = simulation.contacts()
             if settings.end_on_collision and touched and not simulation.follows:
@@ -52,7 +56,7 @@ def driven_episode(
             if settings.max_offset is not None and simulation.offset > settings.max_offset:
                 ended = f"{simulation.offset:.1f} m from the recorded path"
                 break
-    except (_PolicyError, RequestError) as error:
+    except _PolicyError as error:
         failed = f"at {simulation.time:.2f} s: {error}"
         ended = "a failed policy"
     finally:
@@ -84,7 +88,7 @@ class _Asked:
         action = self._ask("act", lambda: self._policy.act(observation, facts))
         try:
             return np.array(action, dtype=np.float64)
-        except (TypeError, ValueError):
+        except Exception:  # of foreign types
             raise _PolicyError(f"the policy's action is {type(action).__name__}, no array of numbers") from None
 
     def close(self) -> None:

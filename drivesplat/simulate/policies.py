@@ -41,9 +41,8 @@ class RecordedEgo:
 class ConstantSpeed:
     """Follows the recorded path at the speed with which it begins, or at `speed` (m/s), whatever is ahead."""
 
-    def __init__(self, speed: float | None = None, wheelbase: float = VehicleSettings().wheelbase):
-        self._wanted, self._wheelbase = speed, wheelbase
-        self._speed = speed
+    def __init__(self, speed: float | None = None):
+        self._wanted = self._speed = speed
 
     def reset(self, seed: int) -> None:
         """Begins a run."""
@@ -53,22 +52,18 @@ class ConstantSpeed:
         """Pure pursuit of the path."""
         now = float(observation["ego"][0])
         self._speed = now if self._speed is None else self._speed
-        return [pursuit(observation["route"], now, self._wheelbase), 2.0 * (self._speed - now)]
+        return [pursuit(observation["route"], now, _vehicle(facts).wheelbase), 2.0 * (self._speed - now)]
 
 
 class PurePursuit:
     """Follows the recorded path by pure pursuit (Coulter 1992), keeps its distance to what is ahead by the intelligent
     driver model (Treiber et al. 2000) on boxes, and is slow in bends."""
 
-    def __init__(
-        self, speed: float = 10.0, lateral: float = 0.0, width: float = 1.9, front: float = 3.7, **driver: float
-    ):
+    def __init__(self, speed: float = 10.0, lateral: float = 0.0, **driver: float):
         """`speed` (m/s) is what it drives where nothing is ahead; `lateral` are the metres to the left of the recorded
-        path at which it drives; `width` is that of the vehicle, `front` is how far it reaches ahead of its rear axle
-        (metres); `driver` are settings of `TrafficSettings`, such as `time_gap`."""
-        self._speed, self._lateral, self._width, self._front = speed, lateral, width, front
+        path at which it drives; `driver` are settings of `TrafficSettings`, such as `time_gap`."""
+        self._speed, self._lateral = speed, lateral
         self._driver = TrafficSettings.model_validate(driver)
-        self._wheelbase = VehicleSettings().wheelbase
 
     def act(self, observation: Mapping[str, Any], facts: Mapping[str, Any]) -> list[float]:
         """Steering and acceleration."""
@@ -76,7 +71,8 @@ class PurePursuit:
         route[:, 0] -= self._lateral * np.sin(route[:, 2])
         route[:, 1] += self._lateral * np.cos(route[:, 2])
         wanted = max(min(self._speed, bend_speed(route)), 0.1)
-        gap, other = self._ahead(route, observation["boxes"])
+        vehicle = _vehicle(facts)
+        gap, other = _ahead(route, observation["boxes"], vehicle)
         push = driver.acceleration * (1.0 - (now / wanted) ** 4)
         if math.isfinite(gap):
             keep = driver.standstill_gap + max(
@@ -84,19 +80,27 @@ class PurePursuit:
                 0.0,
             )
             push -= driver.acceleration * (keep / max(gap, 0.1)) ** 2
-        return [pursuit(route, now, self._wheelbase), max(push, -8.0)]
+        return [pursuit(route, now, vehicle.wheelbase), max(push, -8.0)]
 
-    def _ahead(self, route: Float32[np.ndarray, "r 3"], boxes: Float32[np.ndarray, "k 8"]) -> tuple[float, float]:
-        """The metres to what is in the way, and its speed (m/s) along the path; infinite and 0 where nothing is."""
-        there = boxes[boxes[:, 3] > 0.0].astype(np.float64)
-        there = there[there[:, 2] - 0.5 * there[:, 5] < 2.0]  # not a bridge
-        path = np.concatenate([np.zeros((1, 2)), route[:, :2]]).astype(np.float64)
-        headings = np.stack([np.cos(there[:, 6]), np.sin(there[:, 6])], axis=1)
-        width = self._width + 2.0 * CORRIDOR
-        found = first_in_the_way(_evenly(path, 0.5), there[:, :2], headings, there[:, 3:5], width)
-        if found is None:
-            return math.inf, 0.0
-        return found.near - self._front, float(there[found.index, 7]) * found.cosine
+
+def _ahead(
+    route: Float32[np.ndarray, "r 3"], boxes: Float32[np.ndarray, "k 8"], vehicle: VehicleSettings
+) -> tuple[float, float]:
+    """The metres to what is in the way, and its speed (m/s) along the path; infinite and 0 where nothing is."""
+    there = boxes[boxes[:, 3] > 0.0].astype(np.float64)
+    there = there[there[:, 2] - 0.5 * there[:, 5] < 2.0]  # not a bridge
+    path = np.concatenate([np.zeros((1, 2)), route[:, :2]]).astype(np.float64)
+    headings = np.stack([np.cos(there[:, 6]), np.sin(there[:, 6])], axis=1)
+    width = vehicle.width + 2.0 * CORRIDOR
+    found = first_in_the_way(_evenly(path, 0.5), there[:, :2], headings, there[:, 3:5], width)
+    if found is None:
+        return math.inf, 0.0
+    return found.near - (vehicle.length - vehicle.rear_overhang), float(there[found.index, 7]) * found.cosine
+
+
+def _vehicle(facts: Mapping[str, Any]) -> VehicleSettings:
+    """The vehicle that a policy drives."""
+    return VehicleSettings.model_validate(facts.get("vehicle", {}))
 
 
 def _evenly(path: Float64[np.ndarray, "p 2"], step: float) -> Float64[np.ndarray, "q 2"]:
@@ -110,7 +114,8 @@ def pursuit(route: Float32[np.ndarray, "r 3"], speed: float, wheelbase: float) -
     """The angle of the front wheels (radians) on the arc through the route's point that is 0.8 s ahead, at least 4 m;
     `speed` in m/s."""
     distance = np.hypot(route[:, 0], route[:, 1])
-    x, y, _ = route[int(np.argmax(distance >= max(4.0, 0.8 * speed)))] if distance.max() >= 4.0 else route[-1]
+    far = distance >= max(4.0, 0.8 * speed)
+    x, y, _ = route[int(far.argmax())] if far.any() else route[-1]
     return math.atan2(2.0 * wheelbase * float(y), max(float(x) ** 2 + float(y) ** 2, 1e-6))
 
 

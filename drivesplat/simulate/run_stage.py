@@ -52,10 +52,9 @@ def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
     if policy is None:
         write_video(film, [pictures.frame(simulation, "no policy")], pictures.size, rate, job.crf)
     else:
-        driven = [
-            _Driven(simulation, policy, seed, run.timeout_s, pictures, known, n == 0)
-            for n, seed in enumerate(run.seeds)
-        ]
+        for number, seed in enumerate(run.seeds):  # a policy of its own for each: one that hangs keeps its thread
+            own = policy if number == 0 else policy_of(run.policy, run.policy_settings)
+            driven.append(_Driven(simulation, own, seed, run.timeout_s, pictures, known, filmed=number == 0))
         write_video(film, driven[0].frames, pictures.size, rate, job.crf)
     failures = (own.episode.failed for own in driven)
     return {
@@ -179,6 +178,8 @@ class _Driven:
                 self.frames.append(pictures.frame(now, note, None if own is None else own.validity))
 
         self.episode: Episode = driven_episode(simulation, policy, seed, timeout_s, look)
+        if filmed and not self.frames:  # it failed before the first step
+            self.frames.append(pictures.frame(simulation, "a failed policy"))
 
     def figures(self) -> dict[str, Any]:
         """The episode as plain data: its scores, the path of the ego vehicle, how far its images can be trusted, and

@@ -22,6 +22,7 @@ from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.drivable import drivable_strip
 from drivesplat.simulate.driven_run import Drivable, DrivenRun, OtherObject
 from drivesplat.simulate.footprints import ego_boxes, overlapping, upright_boxes
+from drivesplat.simulate.route import Route
 from drivesplat.simulate.traffic import MovingBox, Traffic
 from drivesplat.simulate.vehicle import (
     RecordedGround,
@@ -39,8 +40,6 @@ EGO_COLUMNS = ("speed", "acceleration", "steering", "yaw_rate", "seconds")
 """What is known of the ego vehicle: m/s, m/s², radians, radians per second, and seconds since the run began."""
 PATH_S = 0.05
 """Seconds between the places of the recorded path."""
-SEARCH = 300
-"""Places of the route, 0.1 m apart, among which the nearest one is looked for after a step."""
 
 
 Observation = dict[str, Any]
@@ -67,15 +66,17 @@ class Simulation:
             )
         self.cameras = {name: self._camera(name) for name in self._camera_names}
         self.lidar = None if self.settings.lidar is None else drive.lidar(self.settings.lidar, self.settings.start)
+        if not self.step_count:
+            raise RequestError(f"{drive.where}: a run from {self.settings.start:g} s on has no step")
         self.trust: Callable[[], float] | None = None
-        self._shape = shape_of(self.settings.vehicle)
+        self._shape, self._vehicle = shape_of(self.settings.vehicle), self.settings.vehicle.model_dump()
         self._precompute()
         self.reset()
 
     @cached_property
     def _driven_span(self) -> tuple[float, float]:
         """The first and the last second at which the ego vehicle has a place in the drive."""
-        times = np.arange(0.0, self.drive.duration + 1e-9, PATH_S)
+        times = np.append(np.arange(0.0, self.drive.duration, PATH_S), self.drive.duration)
         there = []
         for time in times:
             try:
@@ -90,7 +91,7 @@ class Simulation:
     def _precompute(self) -> None:
         """Computes the states of the model at the times of all steps, which takes hardly longer than of one."""
         times = self.settings.start + self.step_s * np.arange(int(self.length_s * self.settings.rate_hz) + 2)
-        within = np.minimum(times, self.drive.duration).tolist()
+        within = np.unique(np.minimum(times, self.drive.duration)).tolist()
         wanted = ([IMAGE] if self.cameras else []) + ([SCAN] if self.lidar is not None else [])
         for want in wanted:
             self.drive.model.precompute(within, want)
@@ -119,7 +120,7 @@ class Simulation:
         """The road beside the recorded path, as wide as the surface of the model's road is known there; None for a
         model without a road."""
         roads = [part.surface for part in self.drive.model.parts if isinstance(part, RoadPart)]
-        return drivable_strip(self._route[1], next(iter(roads), None))
+        return drivable_strip(self._route.places, next(iter(roads), None))
 
     # ---- from step to step
 
@@ -127,14 +128,13 @@ class Simulation:
         """Begins a run. `seed` draws what the settings vary; None: 0."""
         settings = self.settings
         actors = [*self.drive.edited_actors, *self.drive.static_objects.others]
-        last = self._driven_span[1] if settings.beyond == "end" else self.drive.duration + self.length_s
         self.traffic = Traffic(
-            actors, len(self.drive.edited_actors), settings.traffic, settings.start, last,
+            actors, len(self.drive.edited_actors), settings.traffic, settings.start, self._driven_span[1],
             np.random.default_rng(0 if seed is None else seed),
         )  # fmt: skip
         self.steps, self.follows = 0, True
         self.ego = self._recorded_state(settings.start)
-        self._on_route = self._nearest_on_route(None)
+        self._on_route = self._route.begin(self._place, settings.start)
         self._log: list[tuple[VehicleState, np.ndarray, np.ndarray, np.ndarray]] = []
         self._note()
 
@@ -160,22 +160,28 @@ class Simulation:
     @property
     def ended(self) -> bool:
         """Whether the time of the run is over."""
-        return self.seconds + 0.5 * self.step_s >= self.length_s
+        return self.steps >= self.step_count
+
+    @property
+    def step_count(self) -> int:
+        """The number of steps of a run, the last of which is not beyond its length."""
+        return int(self.length_s * self.settings.rate_hz + 1e-6)
 
     def step(self, action: Any) -> None:
         """Moves on by a step with an action of the settings' kind; values beyond the vehicle's limits are clipped.
-        Raises RequestError for an action that is not finite or has another shape, and after the end."""
+        Raises RequestError after the end, and for an action that is not finite or has another shape, unless the vehicle
+        still follows the recording."""
         if self.ended:
             raise RequestError("the run is over: reset() begins another one")
-        steering, acceleration = self._control(action)
+        self.follows = self.seconds + self.step_s <= self.settings.recorded_until + 1e-9
+        driven = None if self.follows else self._control(action)
         self.traffic.advance(self.time, self.step_s, self.moving_box)
         self.steps += 1
-        if self.seconds <= self.settings.recorded_until + 1e-9:
+        if driven is None:
             self.ego = self._recorded_state(self.time)
         else:
-            self.follows = False
-            self.ego = advanced(self.ego, steering, acceleration, self.step_s, self.settings.vehicle)
-        self._on_route = self._nearest_on_route(self._on_route)
+            self.ego = advanced(self.ego, *driven, self.step_s, self.settings.vehicle)
+        self._on_route = self._route.nearest(self._place, self._on_route.along, abs(self.ego.speed) * self.step_s)
         self._note()
 
     def _control(self, action: Any) -> tuple[float, float]:
@@ -195,13 +201,15 @@ class Simulation:
     def _recorded_state(self, time: float) -> VehicleState:
         """The state of the recorded vehicle."""
         first, last = self._driven_span
-        ends = np.clip(time + np.array([-0.05, 0.05]), first, last)
-        now, before, after = self.drive.ego_path(np.array([np.clip(time, first, last), *ends]))
-        moved = inverse(before) @ after
-        span = max(ends[1] - ends[0], 1e-6)
-        speed = math.copysign(float(np.linalg.norm(moved[:3, 3])), moved[0, 3]) / span
-        yaw_rate = math.atan2(moved[1, 0], moved[0, 0]) / span
-        return state_of(now, speed, yaw_rate, self._shape.wheelbase)
+        times = np.clip(time + np.array([0.0, -PATH_S, PATH_S]), first, last)
+        now, before, after = self.drive.ego_path(times)
+        behind, ahead = (inverse(now) @ pose for pose in (before, after))
+        spans = np.maximum(times[[0, 2]] - times[[1, 0]], 0.0)
+        speeds = [float(x / span) for x, span in zip((-behind[0, 3], ahead[0, 3]), spans, strict=True) if span > 0.0]
+        turned = math.atan2(ahead[1, 0], ahead[0, 0]) - math.atan2(behind[1, 0], behind[0, 0])
+        whole = float(spans.sum())
+        state = state_of(now, sum(speeds) / len(speeds), turned / whole, self._shape.wheelbase)
+        return replace(state, acceleration=(speeds[1] - speeds[0]) / (0.5 * whole) if len(speeds) > 1 else 0.0)
 
     def _note(self) -> None:
         """Keeps where everything is after a step."""
@@ -211,6 +219,10 @@ class Simulation:
         self._log.append((self.ego, self.ego_to_world, self.traffic.poses, self.traffic.present))
 
     # ---- where everything is
+
+    @property
+    def _place(self) -> Float64[np.ndarray, "2"]:
+        return np.array([self.ego.x, self.ego.y])
 
     def _ego_pose(self) -> Float64[np.ndarray, "4 4"]:
         """The pose of the ego vehicle, on the ground."""
@@ -235,42 +247,26 @@ class Simulation:
     def route(self) -> Float32[np.ndarray, "r 3"]:
         """The recorded path ahead: x, y (metres) and heading (radians) in the frame of the ego vehicle at equal steps,
         from the place that is nearest to it. Beyond its end the path goes straight on."""
-        along, places = self._route
-        wanted = along[self._on_route] + self.settings.route_step * np.arange(1, self.settings.route_points + 1)
-        points = np.stack([np.interp(wanted, along, places[:, axis]) for axis in (0, 1)], axis=1)
-        local = self.ego.in_frame(points)
-        ahead = self.ego.in_frame(points + np.gradient(points, axis=0) if len(points) > 1 else points)
-        heading = np.arctan2(*(ahead - local)[:, ::-1].T)
-        return np.column_stack([local, heading]).astype(np.float32)
+        wanted = self.progress + self.settings.route_step * np.arange(1, self.settings.route_points + 1)
+        points, headings = self._route.at(wanted)
+        turned = np.angle(np.exp(1j * (headings - self.ego.yaw)))
+        return np.column_stack([self.ego.in_frame(points), turned]).astype(np.float32)
 
     @property
     def progress(self) -> float:
         """Metres along the recorded path, from where it begins."""
-        return float(self._route[0][self._on_route])
+        return self._on_route.along
 
     @property
     def offset(self) -> float:
         """Metres from the recorded path."""
-        return math.dist(self._route[1][self._on_route], (self.ego.x, self.ego.y))
-
-    def _nearest_on_route(self, before: int | None) -> int:
-        """The place of the route that is nearest to the ego vehicle; not far from that `before`, since a path may cross
-        itself."""
-        places = self._route[1]
-        low, high = (0, len(places)) if before is None else (max(0, before - SEARCH), before + SEARCH)
-        return low + int(np.linalg.norm(places[low:high] - [self.ego.x, self.ego.y], axis=1).argmin())
+        return self._on_route.offset
 
     @cached_property
-    def _route(self) -> tuple[np.ndarray, np.ndarray]:
-        """The recorded path without rests: lengths (p,) and places (p, 2), continued straight on."""
-        places = self._recorded[1][:, :2, 3]
-        steps = np.concatenate([[0.0], np.linalg.norm(np.diff(places, axis=0), axis=1)])
-        kept = np.flatnonzero(np.diff(np.floor(np.cumsum(steps) / 0.1), prepend=-1.0))
-        places, forward = places[kept], self._recorded[1][-1, :2, 0]
-        far = self.settings.route_step * (self.settings.route_points + 2)
-        places = np.concatenate([places, places[-1:] + np.arange(0.1, far, 0.1)[:, None] * forward])
-        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
-        return lengths, places
+    def _route(self) -> Route:
+        seconds, poses = self._recorded
+        beyond = self.settings.route_step * self.settings.route_points + self.settings.vehicle.max_speed * self.length_s
+        return Route.of(poses, seconds, beyond)
 
     def boxes(self) -> tuple[list[str], Float32[np.ndarray, "k 8"]]:
         """The ids of the objects that are there, the nearest first, and what is known of them, by BOX_COLUMNS."""
@@ -346,8 +342,9 @@ class Simulation:
 
     def facts(self) -> dict[str, Any]:
         """What is known beside the observation: the time of the drive, the pose of the ego vehicle, the ids of the
-        objects in the rows of `boxes`, those that it touches, metres from the recorded path, and whether it follows the
-        recording; where `trust` is set, as `validity` how far the image of the first camera can be trusted, 0 to 1."""
+        objects in the rows of `boxes`, those that it touches, metres from the recorded path, whether it follows the
+        recording, and its settings; where `trust` is set, as `validity` how far the image of the first camera can be
+        trusted, 0 to 1."""
         trusted = {} if self.trust is None else {"validity": self.trust()}
         return {
             **trusted,
@@ -357,6 +354,7 @@ class Simulation:
             "contacts": self.contacts(),
             "offset": self.offset,
             "follows_recording": self.follows,
+            "vehicle": self._vehicle.copy(),
         }
 
     def driven(self) -> DrivenRun:

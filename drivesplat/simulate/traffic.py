@@ -30,23 +30,28 @@ INTERACTION = 0.5
 """The deceleration in m/s², beyond that of the recorded motion, at which a driver takes over."""
 HARD_BRAKING = 8.0
 """The largest deceleration of a driver, m/s²."""
+LEAST = 0.2
+"""The least part of a time gap and an acceleration that a draw leaves."""
 WALK_GAP, WALK_S = 1.5, 3.0
 """People wait while the ego vehicle comes this near to them (metres) within so many seconds."""
 
 
 @dataclass(frozen=True)
 class MotionTables:
-    """The motions of a objects at the tabulated times `first` + i TABLE_STEP: `places` (a, t, 3) metres, unit
-    quaternions `turns` (a, t, 4; x, y, z, w), the lengths of their paths `walked` and `path` (a, t), whether they are
-    `present` (a, t), and their horizontal `speeds` (a, t)."""
+    """The motions of a objects at the tabulated times `first` + i TABLE_STEP, of a recording until `last`: `places` (a,
+    t, 3) metres, unit quaternions `turns` (a, t, 4; x, y, z, w), the lengths of their paths `walked` and `path` (a, t),
+    whether they are `present` (a, t), and their horizontal `speeds` (a, t). Those that stand at the last time and are
+    there, stay there afterwards (`stays`)."""
 
     first: float
+    last: float
     places: Float64[np.ndarray, "a t 3"]
     turns: Float64[np.ndarray, "a t 4"]
     walked: Float64[np.ndarray, "a t"]
     path: Float64[np.ndarray, "a t"]
     present: Bool[np.ndarray, "a t"]
     speeds: Float64[np.ndarray, "a t"]
+    stays: Bool[np.ndarray, " a"]
 
     @classmethod
     def of(cls, actors: Sequence[EditedActor], first: float, last: float) -> "MotionTables":
@@ -65,7 +70,7 @@ class MotionTables:
         path = np.concatenate([np.zeros((shape[0], 1)), np.cumsum(steps, axis=1)], axis=1)
         walked = np.stack([actor.walked(times) for actor in actors]) if actors else np.zeros(shape)
         present = np.stack([actor.present(times) for actor in actors]) if actors else np.zeros(shape, dtype=bool)
-        return cls(first, places, turns, walked, path, present, speeds)
+        return cls(first, last, places, turns, walked, path, present, speeds, _stay(present, speeds, times <= last))
 
     def poses(self, clocks: Float64[np.ndarray, " a"]) -> Float64[np.ndarray, "a 4 4"]:
         """The poses of all objects, each at its own time."""
@@ -83,13 +88,19 @@ class MotionTables:
         position = (clocks - self.first) / TABLE_STEP
         nearest = np.rint(position).astype(int).clip(0, self.present.shape[1] - 1)
         inside = (position >= -0.5) & (position <= self.present.shape[1] - 0.5)
-        return self.present[np.arange(len(clocks)), nearest] & inside
+        return (self.present[np.arange(len(clocks)), nearest] & inside) | (self.stays & (clocks >= self.last))
 
     def _between(self, values: np.ndarray, clocks: Float64[np.ndarray, " a"]) -> np.ndarray:
         position = ((clocks - self.first) / TABLE_STEP).clip(0.0, values.shape[1] - 1.0)
         before = np.minimum(position.astype(int), values.shape[1] - 2)
         share, rows = (position - before)[:, None], np.arange(len(clocks))
         return (1.0 - share) * values[rows, before] + share * values[rows, before + 1]
+
+
+def _stay(present: np.ndarray, speeds: np.ndarray, within: np.ndarray) -> Bool[np.ndarray, " a"]:
+    """Which objects are there and stand at the last time that is `within` the recording."""
+    end = int(np.flatnonzero(within)[-1]) if within.any() else 0
+    return present[:, end] & (speeds[:, end] < MOVING)
 
 
 class Traffic:
@@ -114,7 +125,8 @@ class Traffic:
         self.sizes = np.stack([actor.size for actor in actors]) if count else np.zeros((0, 3))
         self._vehicles = np.array([actor.object_class.is_vehicle for actor in actors], dtype=bool)
         self._people = np.array([actor.object_class.is_human for actor in actors], dtype=bool)
-        spread = 1.0 + settings.variation * random.standard_normal((2, count)).clip(-2.0, 2.0)
+        drawn = 1.0 + settings.variation * random.standard_normal((2, count)).clip(-2.0, 2.0)
+        spread = np.maximum(drawn, LEAST)
         self._time_gaps, self._accelerations = np.array([[settings.time_gap], [settings.acceleration]]) * spread
 
     @property

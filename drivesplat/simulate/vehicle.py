@@ -90,12 +90,12 @@ def control_towards(
     ahead = max(MIN_LOOK_AHEAD, LOOK_AHEAD_S * abs(state.speed))
     if along[-1] < 1e-3:
         return state.steering, -state.speed / step_s
+    forward = 1.0 if targets[-1, 0] >= 0.0 else -1.0
     aim = np.array([np.interp(ahead, along, places[:, axis]) for axis in (0, 1)])
     if along[-1] < ahead:  # beyond the last target: straight on
         heading = targets[-1, 2]
-        aim = places[-1] + (ahead - along[-1]) * np.array([math.cos(heading), math.sin(heading)])
+        aim = places[-1] + forward * (ahead - along[-1]) * np.array([math.cos(heading), math.sin(heading)])
     steering = math.atan2(2.0 * limits.wheelbase * aim[1], float(aim @ aim))
-    forward = 1.0 if targets[-1, 0] >= 0.0 else -1.0
     speed = forward * (along[-1] - along[1]) / (step_s * (len(targets) - 1)) if len(targets) > 1 else state.speed
     lag = float(targets[0, 0]) - 0.5 * (state.speed + speed) * step_s
     return steering, 2.0 * (speed - state.speed) / CATCH_UP_S + lag / CATCH_UP_S**2

@@ -47,12 +47,17 @@ def config_runs(config: Config) -> dict[str, RunSettings]:
 
 
 def runs_of(config: Config, scene: str, method: str) -> dict[str, RunSettings]:
-    """The runs of a method on a scene by name. Raises ConfigError where one names a scene or an edit that is not
-    there."""
+    """The runs of a method on a scene by name. Raises ConfigError where one names a scene, a method or an edit that is
+    not there."""
     found = {}
     for name, run in config_runs(config).items():
         for other in run.scenes or ():
             config.dataset_of(other)
+        unknown = [other for other in run.methods if other not in config.all_methods]
+        if unknown:
+            raise ConfigError(
+                f"run {name!r}: there is no method {unknown[0]!r}; there are: {', '.join(config.methods)}"
+            )
         if method not in run.methods or (run.scenes is not None and scene not in run.scenes):
             continue
         edits = scene_edits(config, scene) if run.edit is not None else {}
@@ -78,7 +83,7 @@ def code_of(policy: str) -> str | None:
         return None
     try:
         spec = find_spec(module)
-    except (ImportError, ValueError, AttributeError):
+    except Exception:  # of a package around the module, which is imported
         return None
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         return None
