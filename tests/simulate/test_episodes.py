@@ -1,19 +1,31 @@
 """Episodes of policies, also of those that fail, on a finished workflow."""
 
 import re
+import sys
 import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 import drivesplat
 from drivesplat.drive.trained_drive import TrainedDrive
-from drivesplat.settings.simulate import SimulationSettings
+from drivesplat.io.video import read_footage
+from drivesplat.settings.simulate import RunJob, RunSettings, SimulationSettings
 from drivesplat.simulate.episodes import Episode, driven_episode
+from drivesplat.simulate.run_stage import drive_runs
 from drivesplat.simulate.simulation import Simulation
 
 pytestmark = pytest.mark.workflow
+BROKEN = """
+class Broken:
+    def reset(self, seed):
+        raise ValueError("no weights")
+
+    def act(self, seen, facts):
+        return [0.0, 0.0]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +54,7 @@ def raising(*_):
         (lambda *_: [np.nan, 0.0], "an action is steering and acceleration"),
         (lambda *_: [0.0], "an action is steering and acceleration"),
         (lambda *_: "left", "no array of numbers"),
+        (lambda *_: torch.zeros(2, requires_grad=True), "no array of numbers"),
         (lambda *_: None, "an action is steering and acceleration"),
     ],
 )
@@ -77,6 +90,29 @@ def test_an_episode_ends_with_its_time_at_a_contact_or_too_far_from_the_path(dri
     assert re.fullmatch(r"0\.\d m from the recorded path", aside.ended) and len(aside.run) < 31
     rams = driven(drive, lambda *_: [0.0, 3.0], seconds=4.0, traffic={"vehicles": "replay"})
     assert rams.ended.startswith("a contact with ") or len(rams.run) == 41
+
+
+def test_a_run_whose_policy_fails_at_once_has_a_film(drive, tmp_path, monkeypatch):
+    (tmp_path / "broken_policy.py").write_text(BROKEN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = RunSettings(policy="broken_policy:Broken", film_width=64, seeds=(0, 1))
+    record = drive_runs(drive, RunJob(run=run, edit=None, code=None, crf=20), tmp_path / "run.mp4")
+    assert record["failed"] == "at 0.00 s: the policy's `reset` raised ValueError: no weights"
+    assert len(record["episodes"]) == 2 and read_footage(tmp_path / "run.mp4").frames == 1
+    monkeypatch.delitem(sys.modules, "broken_policy")
+
+
+def test_a_run_of_no_policy_says_so(drive, tmp_path):
+    run = RunSettings(policy="nobody", film_width=64)
+    record = drive_runs(drive, RunJob(run=run, edit=None, code=None, crf=20), tmp_path / "run.mp4")
+    assert record["failed"].startswith("there is no policy 'nobody'") and record["episodes"] == []
+
+
+def test_the_recorded_policy_drives_whatever_actions_are(drive, tmp_path):
+    settings = {"actions": "poses", "seconds": 0.5, "cameras": ()}
+    run = RunSettings(policy="recorded", film_width=64, simulation=settings)
+    (episode,) = drive_runs(drive, RunJob(run=run, edit=None, code=None, crf=20), tmp_path / "run.mp4")["episodes"]
+    assert episode["failed"] is None and episode["scores"]["max_path_offset_m"] < 0.02
 
 
 def test_what_is_done_at_each_step_sees_the_state_of_that_step(drive):

@@ -51,6 +51,21 @@ def test_pursuit_steers_along_the_arc_through_the_point_ahead():
     assert pursuit(STRAIGHT, 10.0, wheelbase) == 0.0
 
 
+def test_pursuit_of_a_short_route_aims_at_its_end():
+    short = np.array([[2.0, 0.0, 0.0], [4.0, 0.2, 0.1], [6.0, 1.0, 0.2]], dtype=np.float32)
+    assert pursuit(short, 20.0, 2.8) == pytest.approx(math.atan2(2.0 * 2.8 * 1.0, 37.0))
+
+
+def test_policies_know_the_vehicle_that_they_drive():
+    long = {"vehicle": {"length": 10.6, "rear_overhang": 0.9, "wheelbase": 6.0}}
+    boxes = [box(40.0)]
+    _, push = PurePursuit().act(seen(boxes=boxes), {})
+    _, sooner = PurePursuit().act(seen(boxes=boxes), long)
+    assert sooner < push - 0.5
+    turned = STRAIGHT + np.array([0, 1, 0], dtype=np.float32)
+    assert ConstantSpeed().act(seen(route=turned), long)[0] > 1.5 * ConstantSpeed().act(seen(route=turned), {})[0]
+
+
 def test_bends_are_taken_with_their_lateral_acceleration():
     angles = np.arange(1, 21) * 2.0 / 20.0
     circle = np.column_stack([20.0 * np.sin(angles), 20.0 * (1 - np.cos(angles)), angles]).astype(np.float32)

@@ -277,6 +277,27 @@ def test_render_gives_the_image_of_the_first_camera(drive):
         blind.render()
 
 
+@pytest.mark.parametrize("rate", [0.7, 3.0, 7.0, 10.0, 30.0])
+def test_no_step_is_beyond_the_recording_and_followed_ones_are_on_the_path(drive, rate):
+    run = simulated(drive, rate_hz=rate, recorded_until=100.0)
+    while not run.ended:
+        run.step(KEPT)
+        assert run.offset < 0.02
+    assert drive.duration - 1.0 / rate - 0.1 < run.time <= drive.duration + 1e-9
+    along = run.route()
+    np.testing.assert_allclose(np.linalg.norm(np.diff(along[:, :2], axis=0), axis=1), 2.0, atol=0.05)
+
+
+def test_the_recorded_acceleration_is_observed(drive):
+    run = simulated(drive, recorded_until=100.0)
+    speeds, pushes = [], []
+    while not run.ended:
+        run.step(KEPT)
+        speeds.append(run.ego.speed)
+        pushes.append(run.ego.acceleration)
+    np.testing.assert_allclose(pushes[2:-2], np.gradient(speeds, 0.1)[2:-2], atol=0.15)
+
+
 # ---- what is refused
 
 
@@ -300,11 +321,17 @@ def test_actions_beyond_the_limits_are_clipped(drive):
         ({"cameras": ("CAM_NOSE",)}, RequestError, "CAM_NOSE"),
         ({"lidar": "LIDAR_ROOF"}, RequestError, "LIDAR_ROOF"),
         ({"start": 99.0}, RequestError, "a run cannot begin at 99 s"),
+        ({"seconds": 0.05}, RequestError, "has no step"),
     ],
 )
 def test_what_the_drive_does_not_have_is_refused(drive, settings, error, message):
     with pytest.raises(error, match=message):
         simulated(drive, **settings)
+
+
+def test_without_a_camera_nothing_can_be_trusted():
+    with pytest.raises(ValueError, match="'validity' is that of an image"):
+        SimulationSettings(cameras=(), validity=True)
 
 
 def test_edits_that_do_not_fit_and_unknown_render_modes_are_refused(drive):

@@ -147,6 +147,35 @@ def test_drivers_vary_by_the_seed_alone():
     assert np.abs(gaps(1) - gaps(2)).max() > 0.05
 
 
+def test_what_stands_at_the_end_of_the_recording_stays_there_and_what_drives_is_gone():
+    stands, drives = moving("stands", 5.0, 3.0, 0.0), moving("drives", 0.0, 0.0, 8.0)
+    made = TrafficSettings(vehicles="replay")
+    traffic = Traffic([stands, drives], 2, made, 0.0, 9.5, np.random.default_rng(0))
+    played(traffic, FAR, 200)
+    assert traffic.present.tolist() == [True, False]
+    np.testing.assert_allclose(traffic.poses[0], stands.poses(np.array([5.0]))[0], atol=1e-6)
+
+
+def test_no_draw_leaves_a_driver_without_time_gap_or_acceleration():
+    class Low(np.random.Generator):
+        def standard_normal(self, shape):
+            return np.full(shape, -2.0)
+
+    car = moving("car", 0.0, 0.0, 8.0, last=40.0)
+    traffic = Traffic([car], 1, TrafficSettings(variation=0.5), 0.0, 40.0, Low(np.random.PCG64(0)))
+    found = played(traffic, standing_at(40.0), 100)
+    assert np.isfinite(found).all() and found[-1, 0, 0] < 37.0
+
+
+def test_a_car_that_accelerates_as_recorded_is_replayed():
+    times = np.linspace(0.0, 10.0, 11)
+    places = np.column_stack([0.5 * 1.5 * times**2, np.zeros(11), np.full(11, 0.75)])
+    motion = Motion(times, rigid(np.tile(np.eye(3), (11, 1, 1)), places), ((0, 10),), 0.25)
+    traffic = traffic_of(EditedActor.recorded("car", ObjectClass.CAR, "it", CAR, motion))
+    played(traffic, FAR, 80)
+    assert traffic.as_recorded
+
+
 def test_no_objects_are_no_fault():
     traffic = traffic_of()
     assert played(traffic, FAR, 3).shape == (3, 0, 2) and traffic.placements() == {}

@@ -78,6 +78,14 @@ def test_the_controller_follows_poses_that_the_vehicle_can_drive(speed, angle, p
     assert now.speed == pytest.approx(wanted[40].speed, abs=0.6)
 
 
+def test_backwards_the_controller_steers_as_forwards():
+    back = LIMITS.model_copy(update={"max_reverse_speed": 3.0})
+    targets = np.column_stack([0.1 * np.arange(1, 6), np.full(5, 0.1), np.zeros(5)])
+    ahead, _ = control_towards(VehicleState(0.0, 0.0, 0.0, 1.0), targets, STEP, back)
+    behind, push = control_towards(VehicleState(0.0, 0.0, 0.0, -1.0), targets * [-1.0, 1.0, 1.0], STEP, back)
+    assert ahead == pytest.approx(behind, rel=1e-6) and push == pytest.approx(0.0, abs=1e-6)
+
+
 def test_the_controller_brakes_where_the_targets_stay_here():
     steering, acceleration = control_towards(VehicleState(0.0, 0.0, 0.0, 3.0, 0.1), np.zeros((5, 3)), STEP, LIMITS)
     assert (steering, acceleration) == (0.1, pytest.approx(-30.0))

@@ -78,6 +78,7 @@ def test_a_run_with_an_unknown_edit_or_scene_is_refused(copy):
     for change, message in (
         ({"edit": "fly", "scenes": ["0001"]}, "no edit called 'fly'"),
         ({"scenes": ["0009"]}, "0009"),
+        ({"methods": ["stret"]}, "no method 'stret'"),
     ):
         write_runs(copy, {**RUNS, "brakes": {**RUNS["brakes"], **change}})
         try:
