@@ -71,8 +71,8 @@ class PurePursuit:
         route[:, 0] -= self._lateral * np.sin(route[:, 2])
         route[:, 1] += self._lateral * np.cos(route[:, 2])
         wanted = max(min(self._speed, bend_speed(route)), 0.1)
-        vehicle = _vehicle(facts)
-        gap, other = _ahead(route, observation["boxes"], vehicle)
+        body = _vehicle(facts)
+        gap, other = _ahead(route, observation["boxes"], body)
         push = driver.acceleration * (1.0 - (now / wanted) ** 4)
         if math.isfinite(gap):
             keep = driver.standstill_gap + max(
@@ -80,22 +80,22 @@ class PurePursuit:
                 0.0,
             )
             push -= driver.acceleration * (keep / max(gap, 0.1)) ** 2
-        return [pursuit(route, now, vehicle.wheelbase), max(push, -8.0)]
+        return [pursuit(route, now, body.wheelbase), max(push, -8.0)]
 
 
 def _ahead(
-    route: Float32[np.ndarray, "r 3"], boxes: Float32[np.ndarray, "k 8"], vehicle: VehicleSettings
+    route: Float32[np.ndarray, "r 3"], boxes: Float32[np.ndarray, "k 8"], body: VehicleSettings
 ) -> tuple[float, float]:
     """The metres to what is in the way, and its speed (m/s) along the path; infinite and 0 where nothing is."""
     there = boxes[boxes[:, 3] > 0.0].astype(np.float64)
     there = there[there[:, 2] - 0.5 * there[:, 5] < 2.0]  # not a bridge
     path = np.concatenate([np.zeros((1, 2)), route[:, :2]]).astype(np.float64)
     headings = np.stack([np.cos(there[:, 6]), np.sin(there[:, 6])], axis=1)
-    width = vehicle.width + 2.0 * CORRIDOR
+    width = body.width + 2.0 * CORRIDOR
     found = first_in_the_way(_evenly(path, 0.5), there[:, :2], headings, there[:, 3:5], width)
     if found is None:
         return math.inf, 0.0
-    return found.near - (vehicle.length - vehicle.rear_overhang), float(there[found.index, 7]) * found.cosine
+    return found.near - (body.length - body.rear_overhang), float(there[found.index, 7]) * found.cosine
 
 
 def _vehicle(facts: Mapping[str, Any]) -> VehicleSettings:

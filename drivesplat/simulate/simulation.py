@@ -69,7 +69,8 @@ class Simulation:
         if not self.step_count:
             raise RequestError(f"{drive.where}: a run from {self.settings.start:g} s on has no step")
         self.trust: Callable[[], float] | None = None
-        self._shape, self._vehicle = shape_of(self.settings.vehicle), self.settings.vehicle.model_dump()
+        limits = self.settings.vehicle
+        self._shape, self._vehicle = shape_of(limits), limits.model_dump()
         self._precompute()
         self.reset()
 
@@ -265,7 +266,7 @@ class Simulation:
     @cached_property
     def _route(self) -> Route:
         seconds, poses = self._recorded
-        beyond = self.settings.route_step * self.settings.route_points + self.settings.vehicle.max_speed * self.length_s
+        beyond = self.settings.route_step * self.settings.route_points + self._vehicle["max_speed"] * self.length_s
         return Route.of(poses, seconds, beyond)
 
     def boxes(self) -> tuple[list[str], Float32[np.ndarray, "k 8"]]:
