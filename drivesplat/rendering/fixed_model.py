@@ -41,9 +41,8 @@ class RenderedImage:
     surface_depth: Float[Tensor, "h w"] | None = None
 
     def copied(self) -> "RenderedImage":
-        """A copy in memory of its own."""
-        depth = self.surface_depth
-        return RenderedImage(self.image.clone(), self.alpha.clone(), None if depth is None else depth.clone())
+        """A copy of image and alpha in memory of their own."""
+        return RenderedImage(self.image.clone(), self.alpha.clone())
 
 
 @dataclass(frozen=True)

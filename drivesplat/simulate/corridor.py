@@ -1,9 +1,11 @@
-"""What is in the way on a path."""
+"""What is in the way on a path, and how drivers brake for it."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
+
+from drivesplat.settings.simulate import TrafficSettings
 
 
 class InTheWay(NamedTuple):
@@ -44,3 +46,17 @@ def first_in_the_way(
     near = position - half_length
     index = int(met[near[met].argmin()])
     return InTheWay(index, float(near[index]), float(signed[index]))
+
+
+def braking_for(
+    gap: float, speed: float, approach: float, time_gap: float, acceleration: float, driver: TrafficSettings
+) -> float:
+    """The deceleration (m/s²) by which the intelligent driver model (Treiber, Hennecke and Helbing 2000) answers what
+    is `gap` metres s ahead and comes nearer by `approach` dv (m/s): a (s* / s)^2, where s* = s0 + max(0, v T + v dv /
+    (2 sqrt(a b))). `time_gap` T and `acceleration` a are the driver's own; s0 and b are those of the settings."""
+    if not np.isfinite(gap):
+        return 0.0
+    wanted = driver.standstill_gap + max(
+        speed * time_gap + speed * approach / (2.0 * np.sqrt(acceleration * driver.braking)), 0.0
+    )
+    return float(acceleration * (wanted / max(gap, 0.1)) ** 2)

@@ -51,10 +51,6 @@ class OtherObject:
                 found[run] = np.gradient(places[run], seconds[run], axis=0)
         return found
 
-    def speeds(self, seconds: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-        """Horizontal speeds in m/s, of `velocities`."""
-        return np.linalg.norm(self.velocities(seconds)[:, :2], axis=1)
-
 
 @dataclass(frozen=True, eq=False)
 class DrivenRun:

@@ -116,12 +116,9 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
             raise RequestError("the episode is over: reset() begins another one")
         before = self.simulation.progress
         self.simulation.step(action)
-        info = self.simulation.facts()
-        far = self.settings.max_offset is not None and self.simulation.offset > self.settings.max_offset
-        touches = self.settings.end_on_collision and bool(info["contacts"]) and not self.simulation.follows
-        terminated, truncated = far or touches, self.simulation.ended
-        self._over = terminated or truncated
-        return self._observed(), self.simulation.progress - before, terminated, truncated, info
+        terminated, truncated = self.simulation.outcome is not None, self.simulation.ended
+        self._over, reward = terminated or truncated, self.simulation.progress - before
+        return self._observed(), reward, terminated, truncated, self.simulation.facts()
 
     def render(self) -> np.ndarray | None:
         """The last image of the first camera, if `render_mode` is 'rgb_array'."""

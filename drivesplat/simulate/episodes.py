@@ -37,7 +37,7 @@ def driven_episode(
     says so in one sentence.
     """
     simulation.reset(seed)
-    settings, failed, ended = simulation.settings, None, "the end of its time"
+    failed, ended = None, "the end of its time"
     asked = _Asked(policy, timeout_s)
     try:
         asked.reset(seed)
@@ -49,12 +49,8 @@ def driven_episode(
             except RequestError as error:
                 raise _PolicyError(str(error)) from None
             each(simulation)
-            touched = simulation.contacts()
-            if settings.end_on_collision and touched and not simulation.follows:
-                ended = f"a contact with {touched[0]}"
-                break
-            if settings.max_offset is not None and simulation.offset > settings.max_offset:
-                ended = f"{simulation.offset:.1f} m from the recorded path"
+            if simulation.outcome is not None:
+                ended = simulation.outcome
                 break
     except _PolicyError as error:
         failed = f"at {simulation.time:.2f} s: {error}"

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 
 from drivesplat.errors import RequestError
 from drivesplat.settings.simulate import TrafficSettings, VehicleSettings
-from drivesplat.simulate.corridor import first_in_the_way
+from drivesplat.simulate.corridor import braking_for, first_in_the_way
 
 CORRIDOR = 0.4
 """Metres beside the bodies within which something ahead is in the way."""
@@ -74,12 +74,7 @@ class PurePursuit:
         body = _vehicle(facts)
         gap, other = _ahead(route, observation["boxes"], body)
         push = driver.acceleration * (1.0 - (now / wanted) ** 4)
-        if math.isfinite(gap):
-            keep = driver.standstill_gap + max(
-                now * driver.time_gap + now * (now - other) / (2.0 * math.sqrt(driver.acceleration * driver.braking)),
-                0.0,
-            )
-            push -= driver.acceleration * (keep / max(gap, 0.1)) ** 2
+        push -= braking_for(gap, now, now - other, driver.time_gap, driver.acceleration, driver)
         return [pursuit(route, now, body.wheelbase), max(push, -8.0)]
 
 

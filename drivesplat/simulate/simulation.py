@@ -22,7 +22,6 @@ from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.drivable import drivable_strip
 from drivesplat.simulate.driven_run import Drivable, DrivenRun, OtherObject
 from drivesplat.simulate.footprints import ego_boxes, overlapping, upright_boxes
-from drivesplat.simulate.route import Route
 from drivesplat.simulate.traffic import MovingBox, Traffic
 from drivesplat.simulate.vehicle import (
     RecordedGround,
@@ -32,6 +31,7 @@ from drivesplat.simulate.vehicle import (
     shape_of,
     state_of,
 )  # fmt: skip
+from drivesplat.trajectories.reference_path import ReferencePath
 
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw", "speed")
 """What is known of an object: its place (metres) and heading (radians) in the frame of the ego vehicle at the centre of
@@ -121,7 +121,7 @@ class Simulation:
         """The road beside the recorded path, as wide as the surface of the model's road is known there; None for a
         model without a road."""
         roads = [part.surface for part in self.drive.model.parts if isinstance(part, RoadPart)]
-        return drivable_strip(self._route.places, next(iter(roads), None))
+        return drivable_strip(self._route, next(iter(roads), None))
 
     # ---- from step to step
 
@@ -135,7 +135,7 @@ class Simulation:
         )  # fmt: skip
         self.steps, self.follows = 0, True
         self.ego = self._recorded_state(settings.start)
-        self._on_route = self._route.begin(self._place, settings.start)
+        self.progress, self._aside = self._route.follow(self._place, self._route.begin(settings.start), 0.0)
         self._log: list[tuple[VehicleState, np.ndarray, np.ndarray, np.ndarray]] = []
         self._note()
 
@@ -182,7 +182,8 @@ class Simulation:
             self.ego = self._recorded_state(self.time)
         else:
             self.ego = advanced(self.ego, *driven, self.step_s, self.settings.vehicle)
-        self._on_route = self._route.nearest(self._place, self._on_route.along, abs(self.ego.speed) * self.step_s)
+        driven_m = abs(self.ego.speed) * self.step_s
+        self.progress, self._aside = self._route.follow(self._place, self.progress, driven_m)
         self._note()
 
     def _control(self, action: Any) -> tuple[float, float]:
@@ -190,7 +191,7 @@ class Simulation:
         shape = (self.settings.horizon, 3) if poses else (2,)
         try:
             values = np.array(action, dtype=np.float64)
-        except (TypeError, ValueError):
+        except Exception:  # of foreign types, such as tensors with gradients
             values = np.full(shape, np.nan)
         if values.shape != shape or not np.isfinite(values).all():
             what = "x, y and heading of each step" if poses else "steering and acceleration"
@@ -249,25 +250,28 @@ class Simulation:
         """The recorded path ahead: x, y (metres) and heading (radians) in the frame of the ego vehicle at equal steps,
         from the place that is nearest to it. Beyond its end the path goes straight on."""
         wanted = self.progress + self.settings.route_step * np.arange(1, self.settings.route_points + 1)
-        points, headings = self._route.at(wanted)
-        turned = np.angle(np.exp(1j * (headings - self.ego.yaw)))
+        points, directions = self._route.at(wanted)
+        turned = np.angle(np.exp(1j * (np.arctan2(directions[:, 1], directions[:, 0]) - self.ego.yaw)))
         return np.column_stack([self.ego.in_frame(points), turned]).astype(np.float32)
-
-    @property
-    def progress(self) -> float:
-        """Metres along the recorded path, from where it begins."""
-        return self._on_route.along
 
     @property
     def offset(self) -> float:
         """Metres from the recorded path."""
-        return self._on_route.offset
+        return abs(self._aside)
+
+    @property
+    def outcome(self) -> str | None:
+        """Why an episode ends here, though its time is not over, in words; None: it goes on."""
+        if self.settings.end_on_collision and self._touched and not self.follows:
+            return f"a contact with {self._touched[0]}"
+        if self.settings.max_offset is not None and self.offset > self.settings.max_offset:
+            return f"{self.offset:.1f} m from the recorded path"
+        return None
 
     @cached_property
-    def _route(self) -> Route:
+    def _route(self) -> ReferencePath:
         seconds, poses = self._recorded
-        beyond = self.settings.route_step * self.settings.route_points + self._vehicle["max_speed"] * self.length_s
-        return Route.of(poses, seconds, beyond)
+        return ReferencePath(poses, seconds)
 
     def boxes(self) -> tuple[list[str], Float32[np.ndarray, "k 8"]]:
         """The ids of the objects that are there, the nearest first, and what is known of them, by BOX_COLUMNS."""

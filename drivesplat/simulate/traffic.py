@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.model.states import ActorPlacement
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.simulate import TrafficSettings
-from drivesplat.simulate.corridor import first_in_the_way
+from drivesplat.simulate.corridor import braking_for, first_in_the_way
 from drivesplat.trajectories.edited_actors import EditedActor
 from drivesplat.trajectories.motion import HALF_STEP
 
@@ -179,17 +179,13 @@ class Traffic:
             if not self.reacting[i] and recorded[i] < MOVING:
                 continue  # it stands, or waits as recorded
             gap, approach = self._gap(i, ego)
-            if not np.isfinite(gap):
-                interaction = 0.0
-            else:
-                wanted = self._settings.standstill_gap + self.speeds[i] * self._time_gaps[i]
-                wanted += self.speeds[i] * approach / (2.0 * np.sqrt(self._accelerations[i] * self._settings.braking))
-                interaction = self._accelerations[i] * (max(wanted, 0.0) / max(gap, 0.1)) ** 2
+            own = (float(values[i]) for values in (self._time_gaps, self._accelerations))
+            interaction = braking_for(gap, float(self.speeds[i]), approach, *own, self._settings)
             brakes = max(float(recorded[i] - later[i]) / seconds, 0.0)
             if not self.reacting[i] and interaction < INTERACTION + brakes:
                 continue
             self.reacting[i] = True
-            rates[i] = self._rate(i, float(interaction), float(recorded[i]), seconds)
+            rates[i] = self._rate(i, interaction, float(recorded[i]), seconds)
         return rates
 
     def _rate(self, i: int, interaction: float, recorded: float, seconds: float) -> float:

@@ -58,6 +58,18 @@ class ReferencePath:
         """Where to begin to `track`: how far along the path the recorded vehicle was, metres."""
         return float(np.interp(second, self._seconds, self._recorded_arcs))
 
+    def at(self, arcs: Float64[np.ndarray, " n"]) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
+        """The places at metres along the path, and its directions there."""
+        segments = (np.searchsorted(self._arcs, arcs, side="right") - 1).clip(min=0)
+        directions = self._directions[segments]
+        return self._starts[segments] + (arcs - self._arcs[segments])[:, None] * directions, directions
+
+    def follow(self, place: Float64[np.ndarray, "2"], arc: float, driven: float) -> tuple[float, float]:
+        """How far along the path (metres) a place is, and how far beside it (positive to the left), that was reached
+        from `arc` metres along it after `driven` metres: see `track`."""
+        arcs, offsets, _ = self._nearest(place[None], arc, driven + WINDOW)
+        return float(arcs[0]), float(offsets[0])
+
     def track(self, places: Float64[np.ndarray, "n 2"], begin: float) -> PathPlaces:
         """The projections of successive places, of which the first is near `begin` metres along the path.
 

@@ -69,10 +69,10 @@ class Plan(JobResources):
         """The function of wildcards that gives a stage's settings as canonical JSON."""
 
         def settings_of(wildcards: Any) -> str:
-            named = (getattr(wildcards, name, None) for name in ("method", "trajectory", "edit", "run"))
-            method, *films = named
+            names = ("method", "trajectory", "edit", "run")
+            method, trajectory, edit, run = (getattr(wildcards, name, None) for name in names)
             folder = f"{wildcards.kind}/{wildcards.drive}" if hasattr(wildcards, "drive") else None
-            return self.stage_settings(stage, wildcards.scene, method, next(filter(None, films), folder))
+            return self.stage_settings(stage, wildcards.scene, method, trajectory or edit or run or folder)
 
         return settings_of
 

@@ -4,10 +4,19 @@ import numpy as np
 import torch
 
 from drivesplat.model.height_field import HeightField
+from drivesplat.scene.rigid import rigid
 from drivesplat.simulate.drivable import DrivableStrip, drivable_strip
+from drivesplat.trajectories.reference_path import ReferencePath
 
 EDGE = 0.5
-PATH = np.column_stack([np.arange(0.0, 40.0, 0.1), np.zeros(400)])
+
+
+def path_of(places: np.ndarray) -> ReferencePath:
+    poses = rigid(np.tile(np.eye(3), (len(places), 1, 1)), np.column_stack([places, np.zeros(len(places))]))
+    return ReferencePath(poses, np.arange(float(len(places))))
+
+
+PATH = path_of(np.column_stack([np.arange(0.0, 40.0, 0.1), np.zeros(400)]))
 
 
 def surface(covered: np.ndarray) -> HeightField:
@@ -57,7 +66,7 @@ def test_a_bent_path_has_its_road_with_it():
     bend = 20.0 * np.column_stack([np.sin(angles), 1 - np.cos(angles)])
     x, y = np.meshgrid(-10.0 + EDGE * (np.arange(120) + 0.5), -10.0 + EDGE * (np.arange(80) + 0.5), indexing="ij")
     radius = np.hypot(x, y - 20.0)
-    strip = DrivableStrip(bend, surface((radius > 16.0) & (radius < 23.0)))
+    strip = DrivableStrip(path_of(bend), surface((radius > 16.0) & (radius < 23.0)))
     middle = np.array([np.sin(np.pi / 4), 1 - np.cos(np.pi / 4)])
     outward = np.array([np.sin(np.pi / 4), -np.cos(np.pi / 4)])
     places = [20.0 * middle + shift * outward for shift in (2.5, 4.0, -3.5, -5.0)]
