@@ -51,6 +51,7 @@ from drivesplat.model.states import IMAGE, SCAN, ActorPlacement, Want
 from drivesplat.model.view import RollingShutter, View
 from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.rendering import fixed_model
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.shutter import Shutter
@@ -441,7 +442,24 @@ def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film
     monkeypatch.setattr(SplatModel, "render", waiting)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     (record,) = caplog.records
-    assert record.message.startswith("rendered images cannot be captured as a CUDA graph")
+    assert record.message.startswith("renderings cannot be captured as a CUDA graph")
+
+
+def test_scans_of_a_fixed_model_replay_one_graph(captures, monkeypatch):
+    """Scans with the same rays, and with others of as many; their results are their own."""
+    model = untrained_street(settings_of(), (0.3, 0.9)).to(GPU)
+    model.requires_grad_(False)
+    monkeypatch.setattr(capacity, "MARGIN", 4.0)
+    fixed, rays = FixedModel(model), scan_of_a_wall().scan
+    same = [replace(scan_of_a_wall(x), seconds=x, scan=rays) for x in (0.2, 0.6, 1.0)]
+    views = [fixed.scan_view(scan, (3e-4, 3e-4)) for scan in [*same, scan_of_a_wall(1.4)]]
+    found = [fixed.scan(view, fixed.sample(view.time, SCAN)) for view in views]
+    assert len(captures) == 1 and captures[0] is not None
+    for view, picture in zip(views, found, strict=True):
+        alone = model.scan(view)
+        assert float(alone.alpha.max()) > 0.5
+        for name in ("range", "returned", "intensity", "alpha"):
+            torch.testing.assert_close(getattr(picture, name), getattr(alone, name), atol=1e-4, rtol=1e-4)
 
 
 def rolling(view: View) -> View:

@@ -20,7 +20,6 @@ from drivesplat.editing.placed_model import PlacedModel, actor_placements
 from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_objects
 from drivesplat.errors import RequestError
 from drivesplat.machine.device import explain_out_of_memory
-from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
@@ -124,7 +123,7 @@ class SampledWorld:
 
     def scan(self, sensor: RecordedScan, beam_spread: tuple[float, float], with_instance: bool) -> DriveScan:
         """What the rays of a scan return. `beam_spread` in radians."""
-        view = view_of_scan(sensor, beam_spread, self.device)
+        view = self.placed.fixed.scan_view(sensor, beam_spread)
         picture = self.placed.scan(view)
         measured = torch.from_numpy(sensor.measured).to(self.device)
         returned = (picture.returned > 0.5) & (picture.range > 0.0) & measured

@@ -76,7 +76,7 @@ class PlacedModel:
 
     def scan(self, view: ScanView) -> ScanPicture:
         """What a LiDAR measures. Raises ResultError for a model that was trained without LiDAR."""
-        return self.model.scan(view, gaussians=self.sets_in(view))
+        return self.fixed.scan(view, self.sets_in(view))
 
     def objects_met(self, view: ScanView) -> Int16[Tensor, "b a"]:
         """The index of the placement that each ray meets; -1 where it meets no object."""

@@ -41,13 +41,13 @@ def write_scan_folder(
     the disk is full.
     """
     what = " ".join(f"{key} {value}" for key, value in source.items())
-    model, device = open_model(checkpoint, device_settings)
+    model, _ = open_model(checkpoint, device_settings)
     drive = scan_render_plan(scene, model, records.scans, job, what, inserts)
     objects, folder, listed = drive.objects(), path.parent, []
     _remove_scans(folder)
     try:
         with explain_out_of_memory(lambda: len(model)):
-            for found in drive.simulated(checkpoint.job.train.scans.beam_spread_rad, device):
+            for found in drive.simulated(checkpoint.job.train.scans.beam_spread_rad):
                 values = (found.rendered.ranges, found.rendered.drops, found.rendered.intensities)
                 if not all(np.isfinite(array).all() for array in values):
                     raise ResultError(

@@ -18,7 +18,6 @@ from drivesplat.editing.shown_objects import parts_that_may_show
 from drivesplat.errors import ConfigError
 from drivesplat.lidar.moved_sensor import places_of_returns
 from drivesplat.lidar.objects_met import TrackedBoxes
-from drivesplat.model.scans import view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
@@ -72,13 +71,13 @@ class ScanRenderPlan:
         ]  # fmt: skip
 
     @torch.no_grad()
-    def simulated(self, beam_spread: tuple[float, float], device: torch.device) -> Iterator[SimulatedScan]:
+    def simulated(self, beam_spread: tuple[float, float]) -> Iterator[SimulatedScan]:
         """The scans in order. `beam_spread` in radians."""
         of_boxes = np.full(max([*self.boxes.indices, -1]) + 2, NO_OBJECT)  # the last is what NO_OBJECT finds
         of_boxes[self.boxes.indices] = len(self.actors) + np.arange(len(self.others))
         times = np.array([sensor.seconds for sensor in self.sensors])
         for sensor, placed in zip(self.sensors, placed_models(self.model, self.actors, times), strict=True):
-            view, now = view_of_scan(sensor, beam_spread, device), np.array([sensor.seconds])
+            view, now = placed.fixed.scan_view(sensor, beam_spread), np.array([sensor.seconds])
             rendered = placed.scan(view).rendered()
             objects = np.full(rendered.ranges.shape, NO_OBJECT, dtype=np.int16)
             found = SimulatedScan(sensor, rendered, objects)

@@ -30,10 +30,11 @@ def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence
     matrices = np.stack([np.eye(4) if pose is None else pose for pose in edited])
     turned = Rotation.from_matrix(matrices[:, :3, :3]).as_quat(scalar_first=True)
     scales, is_edited = [placement.scale for placement in placements], [pose is not None for pose in edited]
-    values = np.column_stack([turned, matrices[:, :3, 3], scales, is_edited])
+    numbers = [ids.index(placement.source) for placement in placements]
+    values = np.column_stack([turned, matrices[:, :3, 3], scales, is_edited, numbers])
     given = torch.from_numpy(values).to(poses.quats)  # one copy to the device
-    rows = torch.tensor([ids.index(placement.source) for placement in placements], device=given.device)
-    moved = given[:, 8:] > 0.0
+    rows = given[:, 9].long()
+    moved = given[:, 8:9] > 0.0
     return ObjectPoses(
         poses.quats.index_copy(0, rows, torch.where(moved, given[:, :4], poses.quats[rows])),
         poses.translations.index_copy(0, rows, torch.where(moved, given[:, 4:7], poses.translations[rows])),

@@ -54,18 +54,26 @@ class ScanPicture:
     alpha: Float[Tensor, "b a"]
     alpha_before: Float[Tensor, "b a"] | None
 
+    def copied(self) -> "ScanPicture":
+        """A copy of what the rays measure in memory of its own."""
+        tensors = (self.range, self.returned, self.intensity, self.alpha)
+        before = None if self.alpha_before is None else self.alpha_before.clone()
+        return ScanPicture(self.sets, *(values.clone() for values in tensors), before)
+
     def rendered(self) -> RenderedScan:
         """The same as arrays."""
         tensors = (self.range, 1.0 - self.returned, self.intensity)
         return RenderedScan(*(values.detach().cpu().numpy() for values in tensors))
 
 
-def view_of_scan(recorded: RecordedScan, beam_spread: tuple[float, float], device: torch.device) -> ScanView:
-    """A recorded scan as a view. `beam_spread` in radians."""
+def view_of_scan(
+    recorded: RecordedScan, beam_spread: tuple[float, float], device: torch.device, rays: RayGrid | None = None
+) -> ScanView:
+    """A recorded scan as a view. `beam_spread` in radians; `rays`, where they are known, are those of the scan."""
     arrays = recorded.sensor_to_world, recorded.linear, recorded.angular
     pose, linear, angular = (torch.from_numpy(array).float().to(device) for array in arrays)
     blocked = torch.from_numpy(recorded.blocked).to(device) if recorded.blocked.any() else None
-    rays = RayGrid.of(recorded.scan.rays, pose)
+    rays = rays or RayGrid.of(recorded.scan.rays, pose)
     return ScanView(pose, rays, linear, angular, recorded.seconds, beam_spread, blocked)
 
 

@@ -1,12 +1,14 @@
-"""A trained model from which many images are rendered, on a GPU by replaying CUDA graphs.
+"""A trained model from which many images and LiDAR scans are rendered, on a GPU by replaying CUDA graphs.
 
-Python takes 2 to 4 ms to launch the hundred kernels of an image, longer than the GPU takes to run them. A replay costs
-a few copies: of the camera, and of the Gaussians that move.
+Python takes 2 to 4 ms to launch the hundred kernels of an image, longer than the GPU takes to run them; for a scan, 7
+ms. A replay costs a few copies: of the sensor, and of the Gaussians that move.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -23,12 +25,17 @@ from drivesplat.kernels.cuda_graphs import (
     retry_without_graphs,
 )
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import IMAGE, Want, want_of
 from drivesplat.model.view import View
+from drivesplat.rasterization.scans import RayGrid
+from drivesplat.scene.scan import ScanRays
+from drivesplat.scene.scan_record import RecordedScan
 
-MAX_GRAPHS = 4
-"""The kinds of images whose graphs are kept: a kind is a size, a camera with an exposure of its own, ..."""
+MAX_GRAPHS = 5
+"""The kinds of renderings whose graphs are kept: a kind is a size, a camera with an exposure of its own, the rays of a
+LiDAR, ..."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +52,21 @@ class RenderedImage:
         return RenderedImage(self.image.clone(), self.alpha.clone())
 
 
-@dataclass(frozen=True)
-class PendingImage:
-    """An image that the device is rendering. The next image may overwrite `rendered`: work that reads it must be
-    submitted before. `needed` are the numbers of entries that its lists of Gaussians needed, of their `capacities`;
-    where one is exceeded, Gaussians are missing, and `retry` renders the image with exact capacities."""
+Shown = TypeVar("Shown", RenderedImage, ScanPicture)
+Sensor = TypeVar("Sensor", View, ScanView)
+Rendering = Callable[[Sensor, Sequence[Gaussians]], Shown]
 
-    rendered: RenderedImage
+
+@dataclass(frozen=True)
+class Pending(Generic[Shown]):
+    """An image or a scan that the device is rendering. The next one may overwrite `rendered`: work that reads it must
+    be submitted before. `needed` are the numbers of entries that its lists of Gaussians needed, of their `capacities`;
+    where one is exceeded, Gaussians are missing, and `retry` renders it with exact capacities."""
+
+    rendered: Shown
     needed: Int[Tensor, " lists"]
     capacities: Sequence[int]
-    retry: Callable[[], "PendingImage"]
+    retry: Callable[[], "Pending[Shown]"]
 
 
 def overflowed(needed: Sequence[int], capacities: Sequence[int]) -> bool:
@@ -65,9 +77,9 @@ def overflowed(needed: Sequence[int], capacities: Sequence[int]) -> bool:
 class FixedModel:
     """A `model` whose parameters do not change any more.
 
-    Gaussians that are the same at all times are sampled once. On a GPU, the first image of a kind measures the entries
-    that its lists of Gaussians need; later ones get capacities of that and a margin. The second one is captured as a
-    CUDA graph, which is replayed for those that follow.
+    Gaussians that are the same at all times are sampled once. On a GPU, the first image or scan of a kind measures the
+    entries that its lists of Gaussians need; later ones get capacities of that and a margin. The second one is captured
+    as a CUDA graph, which is replayed for those that follow.
 
     >>> fixed = FixedModel(model)
     >>> image = fixed.render(view, fixed.sample(view.time)).image
@@ -76,8 +88,9 @@ class FixedModel:
     def __init__(self, model: SplatModel):
         self.model = model
         self._same: dict[tuple[bool, bool], dict[int, Gaussians]] = {}  # by what is wanted, then by number of the part
-        self._kinds: list[_ImageKind] = []  # the one used last is the last
+        self._kinds: list[_Kind] = []  # the one used last is the last
         self._pool: MemoryPool | None = None
+        self._grids: list[tuple[ScanRays, RayGrid]] = []  # the one used last is the last
         self._captures = graphs_supported(model.parts[0].params["means"].device)
 
     @torch.no_grad()
@@ -103,46 +116,71 @@ class FixedModel:
     def render(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool = False) -> RenderedImage:
         """Renders a set of Gaussians of each part. Waits for a GPU, so that no Gaussian is missing. The depth of
         surfaces is rendered without a graph, since it waits for the device."""
-        if with_surface_depth or not self._captures:
-            return self._rendered(view, sets, with_surface_depth)
-        pending = self.submit(view, sets)
+        if with_surface_depth:
+            picture = self.model.render(view, gaussians=sets, with_surface_depth=True)
+            return RenderedImage(picture.image, picture.alpha, picture.surface_depth)
+        return self._finished(view, sets, self._image)
+
+    def scan_view(self, sensor: RecordedScan, beam_spread: tuple[float, float]) -> ScanView:
+        """The rays of a recorded scan as a view of the model. `beam_spread` in radians. What follows from rays alone is
+        kept for further scans with the same."""
+        rays, device = sensor.scan.rays, self.model.parts[0].params["means"].device
+        known = next((grid for own, grid in self._grids if own is rays), None)
+        view = view_of_scan(sensor, beam_spread, device, known)
+        others = [pair for pair in self._grids if pair[0] is not rays]
+        self._grids = [*others[1 - MAX_GRAPHS :], (rays, view.rays)]
+        return view
+
+    @torch.no_grad()
+    def scan(self, view: ScanView, sets: Sequence[Gaussians]) -> ScanPicture:
+        """What a LiDAR measures of a set of Gaussians of each part. Waits for a GPU. Raises ResultError for Gaussians
+        of a model that was trained without LiDAR."""
+        return self._finished(view, sets, self._scan)
+
+    @torch.no_grad()
+    def submit(self, view: View, sets: Sequence[Gaussians]) -> Pending[RenderedImage]:
+        """Starts rendering an image on a GPU."""
+        return self._without_graphs_if_full(partial(self._planned, view, sets, self._image))
+
+    def _image(self, view: View, sets: Sequence[Gaussians]) -> RenderedImage:
+        picture = self.model.render(view, gaussians=sets)
+        return RenderedImage(picture.image, picture.alpha)
+
+    def _scan(self, view: ScanView, sets: Sequence[Gaussians]) -> ScanPicture:
+        return self.model.scan(view, gaussians=sets)
+
+    def _finished(self, view: Sensor, sets: Sequence[Gaussians], render: Rendering[Sensor, Shown]) -> Shown:
+        if not self._captures:
+            return render(view, sets)
+        pending = self._without_graphs_if_full(partial(self._planned, view, sets, render))
         while overflowed(pending.needed.tolist(), pending.capacities):
             pending = pending.retry()
         return pending.rendered.copied()
 
-    @torch.no_grad()
-    def submit(self, view: View, sets: Sequence[Gaussians]) -> PendingImage:
-        """Starts rendering on a GPU."""
-        return self._without_graphs_if_full(partial(self._planned, view, sets))
-
-    def _rendered(self, view: View, sets: Sequence[Gaussians], with_surface_depth: bool = False) -> RenderedImage:
-        picture = self.model.render(view, gaussians=sets, with_surface_depth=with_surface_depth)
-        return RenderedImage(picture.image, picture.alpha, picture.surface_depth)
-
-    def _planned(self, view: View, sets: Sequence[Gaussians]) -> PendingImage:
-        """An image with planned capacities, by the entries that earlier ones of its kind needed."""
-        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets))
+    def _planned(self, view: Sensor, sets: Sequence[Gaussians], render: Rendering[Sensor, Shown]) -> Pending[Shown]:
+        """A rendering with planned capacities, by the entries that earlier ones of its kind needed."""
+        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets, render))
         kind = self._kind_of(view, sets)
         if kind is None:
-            return self._measured(view, sets)
+            return self._measured(view, sets, render)
         self._kinds.sort(key=lambda other: other is kind)
         if kind.graph is None and self._captures:
-            kind.graph = self._captured(kind)
+            kind.graph = self._captured(kind, render)
             self._captures = kind.graph is not None  # not where the GPU or its driver refuses
         if kind.graph is not None:
             kind.replay(view, sets)
-            return PendingImage(kind.graph.result, kind.graph.needed, kind.graph.capacities, retry)
+            return Pending(kind.graph.result, kind.graph.needed, kind.graph.capacities, retry)
         with capacity.planned(kind.needs) as lists:
-            rendered = self._rendered(view, sets)
+            rendered = render(view, sets)
         needs = [needed.int() for needed, _ in lists]
         needed = torch.stack(needs) if needs else torch.empty(0, dtype=torch.int32)
-        return PendingImage(rendered, needed, [available for _, available in lists], retry)
+        return Pending(rendered, needed, [available for _, available in lists], retry)
 
-    def _measured(self, view: View, sets: Sequence[Gaussians]) -> PendingImage:
-        """An image with exact capacities, which later ones of its kind get too. Waits for the device."""
-        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets))
+    def _measured(self, view: Sensor, sets: Sequence[Gaussians], render: Rendering[Sensor, Shown]) -> Pending[Shown]:
+        """A rendering with exact capacities, which later ones of its kind get too. Waits for the device."""
+        retry = partial(self._without_graphs_if_full, partial(self._measured, view, sets, render))
         with capacity.exact() as needs:
-            rendered = self._rendered(view, sets)
+            rendered = render(view, sets)
         kind = self._kind_of(view, sets)
         if kind is not None:
             kind.needs = [max(pair) for pair in zip(needs, kind.needs, strict=True)]
@@ -150,25 +188,26 @@ class FixedModel:
                 kind.graph = None
         else:
             shared = [own for same in self._same.values() for own in same.values()]
-            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _ImageKind(view, sets, needs, shared)]
-        return PendingImage(rendered, torch.empty(0, dtype=torch.int32), [], retry)
+            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _Kind(view, sets, needs, shared)]
+        return Pending(rendered, torch.empty(0, dtype=torch.int32), [], retry)
 
-    def _kind_of(self, view: View, sets: Sequence[Gaussians]) -> "_ImageKind | None":
-        """The known kind that an image is of; that to which the fewest Gaussians are copied."""
-        known = [kind for kind in self._kinds if kind.has(view, sets)]
+    def _kind_of(self, view: View | ScanView, sets: Sequence[Gaussians]) -> "_Kind | None":
+        """The known kind of a rendering; that to which the fewest Gaussians are copied."""
+        form = _form(view)
+        known = [kind for kind in self._kinds if kind.has(form, sets)]
         return max(known, key=lambda kind: sum(kind.same), default=None)
 
-    def _captured(self, kind: "_ImageKind") -> CudaGraph[RenderedImage] | None:
-        """A graph of images of a kind; None where the GPU or its driver refuses. Graphs are replayed one after the
+    def _captured(self, kind: "_Kind", render: Rendering[Any, Shown]) -> CudaGraph[Shown] | None:
+        """A graph of renderings of a kind; None where the GPU or its driver refuses. Graphs are replayed one after the
         other and their results copied before, so that they can share memory."""
-        device = kind.view.K.device
+        device = _inputs(kind.view)[0].device
         if self._pool is None:
             self._pool = new_pool()
         with capture_stream(device):  # a second thread may encode a film meanwhile
-            work = partial(self._rendered, replace(kind.view), kind.sets)
-            return capture(work, kind.needs, self._pool, device, "rendered images", errors="thread_local")
+            work = partial(render, replace(kind.view), kind.sets)
+            return capture(work, kind.needs, self._pool, device, "renderings", errors="thread_local")
 
-    def _without_graphs_if_full(self, render: Callable[[], PendingImage]) -> PendingImage:
+    def _without_graphs_if_full(self, render: Callable[[], Pending[Shown]]) -> Pending[Shown]:
         """Runs `render`; where memory runs out, again without graphs, and none is captured any more."""
         return retry_without_graphs(torch.no_grad()(render), self._drop_graphs)
 
@@ -180,35 +219,24 @@ class FixedModel:
         return dropped
 
 
-class _ImageKind:
-    """Images that one graph renders: its inputs, into which those of other images are copied. `needs` are the most
-    entries that each of their lists needed. Sets that are among `shared` are the same in all of them."""
+class _Kind:
+    """Renderings of one graph: its inputs, into which those of others are copied. `needs` are the most entries that
+    each of their lists needed. Sets that are among `shared` are the same in all of them."""
 
-    def __init__(
-        self,
-        view: View,
-        sets: Sequence[Gaussians],
-        needs: list[int],
-        shared: Sequence[Gaussians],
-    ):
-        shutter = view.shutter
-        if shutter is not None:
-            shutter = replace(shutter, readout_s=shutter.readout_s.clone(), motion=shutter.motion.clone())
-        own = {"K": view.K.clone(), "camera_to_world": view.camera_to_world.clone(), "seconds": view.moment.clone()}
-        self.view = replace(view, **own, shutter=shutter)
+    def __init__(self, view: View | ScanView, sets: Sequence[Gaussians], needs: list[int], shared: Sequence[Gaussians]):
+        self.view, self.form = _copied(view), _form(view)
         self.same = [any(one is other for other in shared) for one in sets]
         self.sets = [
             one if same else Gaussians(**{name: values.clone() for name, values in one.tensors.items()})
             for one, same in zip(sets, self.same, strict=True)
         ]
         self.needs = needs
-        self.graph: CudaGraph[RenderedImage] | None = None
+        self.graph: CudaGraph[Any] | None = None
 
-    def has(self, view: View, sets: Sequence[Gaussians]) -> bool:
-        """Whether an image is of this kind."""
+    def has(self, form: Hashable, sets: Sequence[Gaussians]) -> bool:
+        """Whether a rendering of a view with this `_form` is of this kind."""
         return (
-            (view.width, view.height, view.camera) == (self.view.width, self.view.height, self.view.camera)
-            and (view.shutter is None) == (self.view.shutter is None)
+            form == self.form
             and len(sets) == len(self.sets)
             and all(
                 one is own if same else _shapes(one) == _shapes(own)
@@ -216,20 +244,40 @@ class _ImageKind:
             )
         )
 
-    def replay(self, view: View, sets: Sequence[Gaussians]) -> None:
-        """Replays the graph with the inputs of an image."""
-        assert self.graph is not None and self.view.seconds is not None
-        self.view.K.copy_(view.K)
-        self.view.camera_to_world.copy_(view.camera_to_world)
-        self.view.seconds.fill_(view.time)
-        if view.shutter is not None and self.view.shutter is not None:
-            self.view.shutter.readout_s.copy_(view.shutter.readout_s)
-            self.view.shutter.motion.copy_(view.shutter.motion)
+    def replay(self, view: View | ScanView, sets: Sequence[Gaussians]) -> None:
+        """Replays the graph with the inputs of a rendering."""
+        assert self.graph is not None
+        for values, own in zip(_inputs(view), _inputs(self.view), strict=True):
+            own.copy_(values)
+        if isinstance(self.view, View) and self.view.seconds is not None:
+            self.view.seconds.fill_(view.time)
         for one, own, same in zip(sets, self.sets, self.same, strict=True):
             if not same:
                 for name, values in one.tensors.items():
                     own.tensors[name].copy_(values)
         self.graph.replay()
+
+
+def _inputs(view: View | ScanView) -> list[Tensor]:
+    """The tensors of a sensor that a rendering reads, but for the time of an image, in a fixed order."""
+    if isinstance(view, ScanView):
+        return view.tensors
+    shutter = [] if view.shutter is None else [view.shutter.readout_s, view.shutter.motion]
+    return [view.K, view.camera_to_world, *shutter]
+
+
+def _copied(view: View | ScanView) -> View | ScanView:
+    """A copy with tensors of its own, among them all that follow from a scan's rays."""
+    own: View | ScanView = deepcopy(view)
+    _inputs(own)
+    return own if isinstance(own, ScanView) else replace(own, seconds=own.moment.clone())
+
+
+def _form(view: View | ScanView) -> Hashable:
+    """Equal for views that one graph can render."""
+    if isinstance(view, ScanView):
+        return view.beam_spread, *((values.shape, values.dtype) for values in view.tensors)
+    return view.width, view.height, view.camera, view.shutter is None
 
 
 def _shapes(gaussians: Gaussians) -> dict[str, torch.Size]:

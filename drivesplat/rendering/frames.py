@@ -18,7 +18,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.color_bytes import NOT_FINITE, to_host, to_uint8, uint8_image
-from drivesplat.rendering.fixed_model import FixedModel, PendingImage, overflowed
+from drivesplat.rendering.fixed_model import FixedModel, Pending, RenderedImage, overflowed
 
 T = TypeVar("T")
 FrameInput = tuple[View, Gaussians | Sequence[Gaussians] | None]
@@ -62,7 +62,7 @@ def _sets(fixed: FixedModel, view: View, gaussians: Gaussians | Sequence[Gaussia
 
 
 @torch.no_grad()
-def _on_its_way(pending: PendingImage) -> PendingFrame:
+def _on_its_way(pending: Pending[RenderedImage]) -> PendingFrame:
     """The frame of an image, with its copies into main memory submitted."""
     copied, image = torch.cuda.Event(), pending.rendered.image
     pixels, finite = to_host(to_uint8(image)), to_host(torch.isfinite(image).all())

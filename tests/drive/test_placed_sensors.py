@@ -219,7 +219,7 @@ def test_a_scan_at_a_recorded_time_is_that_of_scan_folders(drive):
     sweep = drive.recording.nearest_scan(LIDAR, TIME)
     job = ScanFolderJob.model_validate({"eval_camera": CAMERA, "formats": ["npz"]})
     plan = scan_render_plan(drive.scene, drive.model, [sweep], job, "a test")
-    (expected,) = plan.simulated(drive.beam_spread, torch.device("cpu"))
+    (expected,) = plan.simulated(drive.beam_spread)
     found = drive.scan(LIDAR, sweep.seconds)
     arrays = found.arrays()
     np.testing.assert_array_equal(arrays["returned"], expected.returned)

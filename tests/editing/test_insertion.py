@@ -410,7 +410,7 @@ def test_scans_meet_the_inserted_object_and_name_it(scene):
     assert objects[number] == {
         "id": "new", "track": IT, "category": "vehicle.car", "class": "car", "size": [4.0, 2.0, 1.5]
     }  # fmt: skip
-    (found,) = plan.simulated((3e-4, 3e-4), torch.device("cpu"))
+    (found,) = plan.simulated((3e-4, 3e-4))
     met = found.places()[0][found.objects[found.returned] == number]
     assert len(met) > 5
     ahead = (met - ego_of(scene)[:3, 3]) @ ego_of(scene)[:3, :3]

@@ -64,7 +64,7 @@ def simulated(
 ) -> tuple[SimulatedScan, list[str]]:
     """One scan, and the ids of the objects that it may meet."""
     drive = driven(scene, model, replace(records, scans=records.scans[number : number + 1]), job)
-    (found,) = drive.simulated(SPREAD, CPU)
+    (found,) = drive.simulated(SPREAD)
     return found, [item["id"] for item in drive.objects()]
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers.hand_made import looking_at, round_gaussians
 from helpers.hand_made_street import street_model
+from helpers.trainings import scan_of_a_wall
 
 from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph
@@ -18,6 +19,7 @@ from drivesplat.rendering import fixed_model
 from drivesplat.rendering.fixed_model import FixedModel, RenderedImage, overflowed
 
 RENDERED, REPLAYED = 0.0, 1.0
+SPREAD = (3e-4, 3e-4)
 
 
 class FakeGpu:
@@ -32,10 +34,10 @@ class FakeGpu:
             monkeypatch.setattr(fixed_model, name, fake)
         monkeypatch.setattr(torch.cuda, "empty_cache", int)
         monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
-        monkeypatch.setattr(FixedModel, "_rendered", self.rendered)
+        monkeypatch.setattr(FixedModel, "_image", lambda _, view, sets: self.rendered(view, sets))
         self.model = FixedModel(SplatModel([round_gaussians([[0.0, 0.0, 0.0]])], None))
 
-    def rendered(self, view, sets, with_surface_depth=False):
+    def rendered(self, view, sets):
         capacity.capacity_for(torch.tensor(int(view.time)))
         return RenderedImage(torch.full((1, 1, 3), RENDERED), torch.ones(1, 1))
 
@@ -73,7 +75,8 @@ def test_all_images_of_a_kind_but_the_first_replay_one_graph(gpu):
     assert gpu.captured == [[100]]
 
 
-def test_every_kind_of_image_has_a_graph_of_its_own(gpu):
+def test_every_kind_of_image_has_a_graph_of_its_own(gpu, monkeypatch):
+    monkeypatch.setattr(fixed_model, "MAX_GRAPHS", 4)
     view = needing(100)
     rolling = RollingShutter(torch.tensor([0.0, 0.02, 0.0]), torch.eye(3, 4))
     kinds = [
@@ -128,3 +131,13 @@ def test_what_is_the_same_at_all_times_is_sampled_once():
     for found, own in zip(fixed.sample(1.0), fixed.model.sample(fixed.model.states(1.0)), strict=True):
         assert all(torch.equal(found.tensors[name], own.tensors[name]) for name in own.tensors)
     assert fixed.sample(1.0, IMAGE)[0] is static
+
+
+def test_what_follows_from_the_rays_of_a_scan_is_computed_once():
+    fixed = FixedModel(street_model())
+    scan = scan_of_a_wall(1.0)
+    first, again = fixed.scan_view(scan, SPREAD), fixed.scan_view(replace(scan, seconds=2.0), SPREAD)
+    assert again.rays is first.rays and (first.time, again.time) == (scan.seconds, 2.0)
+    other = fixed.scan_view(scan_of_a_wall(1.0), SPREAD)
+    assert other.rays is not first.rays and torch.equal(other.rays.azimuths, first.rays.azimuths)
+    assert fixed.scan_view(scan, SPREAD).rays is first.rays
