@@ -94,7 +94,7 @@ def origin_shift(drive: Drive, ego: EgoPath, time: int) -> np.ndarray:
         assert sweep.lidar_to_world is not None
         mount = matrix_of(drive.lidars[sweep.lidar].sensor_to_ego)
         return (matrix_of(sweep.lidar_to_world) @ inverse(mount))[:3, 3].copy()
-    return _ego_of(drive, min(drive.frames, key=lambda frame: frame.timestamp), ego)[:3, 3].copy()
+    return ego_of(drive, min(drive.frames, key=lambda frame: frame.timestamp), ego)[:3, 3].copy()
 
 
 def nominal_rate(times: np.ndarray) -> float:
@@ -200,7 +200,7 @@ def visibility_level(share: float | None) -> int:
     return 0 if share is None else 1 + sum(share >= limit for limit in VISIBILITY_LEVELS)
 
 
-def _ego_of(drive: Drive, frame: DriveFrame, ego: EgoPath) -> np.ndarray:
+def ego_of(drive: Drive, frame: DriveFrame, ego: EgoPath) -> np.ndarray:
     """Ego to world (4, 4) at an image's time, in the drive's world."""
     if frame.ego_to_world is not None:
         return matrix_of(frame.ego_to_world)
@@ -227,7 +227,7 @@ class _DriveReading:
         times, marked = [frame.timestamp for frame in records], [frame.key_frame for frame in records]
         for number, index, is_key_frame in chosen_recordings(times, marked, self.key_times, between):
             frame = records[number]
-            ego_to_world = self._shifted(_ego_of(self.drive, frame, self.ego))
+            ego_to_world = self._shifted(ego_of(self.drive, frame, self.ego))
             camera_to_world = ego_to_world @ sensor_to_ego
             if frame.camera_to_world is not None:
                 camera_to_world = self._shifted(matrix_of(frame.camera_to_world))
