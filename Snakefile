@@ -5,6 +5,7 @@
 #   snakemake --cores 4 metrics                       the figures alone; `films`, `edits`, `looks`, `exports` likewise
 #   snakemake --cores 4 drives                        rendered drives as datasets, of every edit and trajectory
 #   snakemake --cores 4 runs                          policies that drive in the drives, of the runs file
+#   snakemake --cores 4 mcap                          the drives as rendered, edits and runs as MCAP files for ROS 2
 #   snakemake --cores 4 assets                        the actors of every method as assets, to insert into other drives
 #   snakemake --cores 1 report                        results/gap_report.html of what has been measured
 #   snakemake --cores 1 results/0061/ablation.csv     the contribution of each component of `street`, with three seeds
@@ -49,6 +50,7 @@ include: "rules/look.smk"
 include: "rules/edit.smk"
 include: "rules/run.smk"
 include: "rules/export.smk"
+include: "rules/mcap.smk"
 include: "rules/report.smk"
 include: "rules/ablation.smk"
 
@@ -82,6 +84,11 @@ rule assets:
 rule runs:
     input:
         plan.runs,
+
+
+rule mcap:
+    input:
+        plan.mcap_files,
 
 
 rule looks:

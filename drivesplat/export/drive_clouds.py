@@ -87,7 +87,7 @@ def _of_file(sweep: Sweep, path: PosesAt) -> Cloud:
         raise DatasetError(f"{sweep_fault(sweep)}; restore it, or take it out of drive.json")
     offsets, begin = returns.offsets_s, 0
     if offsets is not None and len(offsets):
-        begin = min(0, int(np.floor(offsets.min() * 1e6)))
+        begin = _begin(sweep.timestamp, float(offsets.min()))
     now, first = path(np.array([sweep.timestamp, sweep.timestamp + begin]))
     return Cloud(
         sweep.timestamp + begin,
@@ -126,7 +126,7 @@ def _of_rays(file: Path, timestamp: int, pose: np.ndarray) -> Cloud:
     except Exception as error:  # of zipfile, zlib and NumPy
         raise ResultError(f"{file}: not a readable scan ({error}); delete scans.json beside it and rerun") from error
     rays = ScanRays(values["azimuths"], values["elevations"], values["offsets_s"])
-    returned, begin = values["returned"], int(np.floor(float(rays.offsets_s.min()) * 1e6))
+    returned, begin = values["returned"], _begin(timestamp, float(rays.offsets_s.min()))
     motion: SensorPoses = steady_motion(pose, values["linear"], values["angular"])
     offsets = rays.offsets_s[returned].astype(np.float64)
     poses = motion(offsets)
@@ -139,6 +139,12 @@ def _of_rays(file: Path, timestamp: int, pose: np.ndarray) -> Cloud:
         np.nonzero(returned)[0].astype(np.uint16),
         _nanoseconds(offsets, begin),
     )
+
+
+def _begin(timestamp: int, first_s: float) -> int:
+    """The microseconds from a sweep's timestamp to its begin, 0 or less, by the offset of its first point in seconds.
+    ROS knows no time before 0."""
+    return max(-timestamp, min(0, int(np.floor(first_s * 1e6))))
 
 
 def _nanoseconds(offsets_s: np.ndarray, begin: int) -> np.ndarray:

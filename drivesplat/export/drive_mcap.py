@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
 from drivesplat.export import ros_messages as ros
-from drivesplat.export.drive_clouds import Cloud, TimedSweep, recorded_sweeps, rendered_sweeps
+from drivesplat.export.drive_clouds import TimedSweep, recorded_sweeps, rendered_sweeps
 from drivesplat.export.mcap_file import LATCHED, mcap_file
 from drivesplat.io.storage import Provenance
 from drivesplat.io.unique_names import unique_names
@@ -230,24 +230,14 @@ class DriveMessages:
     def _clouds(self, lidar: str) -> Iterator[Timed]:
         """Point clouds, each with the pose of the ego vehicle at its stamp."""
         name, mount = self.names[lidar], self._lidar_mounts[lidar]
-        last = -1
-        for sweep in self.sweeps:
-            if sweep.lidar != lidar:
-                continue
-            cloud = sweep.load()
-            stamp = max(cloud.stamp, 0)
-            if stamp <= last:
-                continue  # it begins no later than the one before
-            last = stamp
+        for cloud in (sweep.load() for sweep in self.sweeps if sweep.lidar == lidar):
+            stamp = cloud.stamp
             if stamp not in self._published:
                 self._published[stamp] = cloud.sensor_to_map @ inverse(mount)
                 yield stamp, "/tf", ros.transforms(stamp, ros.MAP, {ros.BASE: self._published[stamp]})
-            yield stamp, f"/{name}/points", self._cloud(cloud, name, stamp, mount)
-
-    def _cloud(self, cloud: Cloud, name: str, stamp: int, mount: np.ndarray) -> Any:
-        map_to_sensor = inverse(self._published[stamp] @ mount)
-        points = apply(map_to_sensor, cloud.points).astype(np.float32)
-        return ros.point_cloud(stamp, name, points, cloud.intensity, cloud.ring, cloud.t)
+            points = apply(inverse(self._published[stamp] @ mount), cloud.points).astype(np.float32)
+            message = ros.point_cloud(stamp, name, points, cloud.intensity, cloud.ring, cloud.t)
+            yield stamp, f"/{name}/points", message
 
     def _boxes(self) -> Iterator[Timed]:
         """The boxes at the times of their poses; an object without a pose at one of them is interpolated."""

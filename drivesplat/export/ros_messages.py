@@ -85,9 +85,9 @@ def ros_types() -> Any:
     return types
 
 
-def _of(name: str, **fields: Any) -> Any:
+def _of(kind: str, /, **fields: Any) -> Any:
     """A message of the type `package/Name`."""
-    return ros_types().types[name.replace("/", "/msg/")](**fields)
+    return ros_types().types[kind.replace("/", "/msg/")](**fields)
 
 
 def _header(stamp: int, frame: str) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from drivesplat.errors import RequestError
-from drivesplat.settings.simulate import TrafficSettings, VehicleSettings
+from drivesplat.settings.simulate import SimulationSettings, TrafficSettings, VehicleSettings
 from drivesplat.simulate.corridor import braking_for, first_in_the_way
 
 CORRIDOR = 0.4
@@ -124,6 +124,13 @@ def bend_speed(route: Float32[np.ndarray, "r 3"]) -> float:
 
 
 BUILT_IN = {"recorded": RecordedEgo, "constant_speed": ConstantSpeed, "pure_pursuit": PurePursuit}
+
+
+def settings_for(settings: SimulationSettings, policy: Policy | None) -> SimulationSettings:
+    """The settings of a run whose policy may follow the recording."""
+    if getattr(policy, "follows_recording", False):
+        return settings.model_copy(update={"recorded_until": 36000.0})
+    return settings
 
 
 def policy_of(name: str, settings: Mapping[str, Any]) -> Policy:

@@ -14,9 +14,9 @@ from drivesplat.drive.cameras import PoseableCamera
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
 from drivesplat.io.video import write_video
-from drivesplat.settings.simulate import RunJob, SimulationSettings
+from drivesplat.settings.simulate import RunJob
 from drivesplat.simulate.episodes import Episode, driven_episode
-from drivesplat.simulate.policies import Policy, policy_of
+from drivesplat.simulate.policies import Policy, policy_of, settings_for
 from drivesplat.simulate.scores import run_scores
 from drivesplat.simulate.simulation import Simulation
 from drivesplat.simulate.validity import ViewKnowledge, ViewValidity
@@ -42,7 +42,7 @@ def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
         refused = None
     except RequestError as error:
         policy, refused = None, str(error)
-    simulation = Simulation(edited, _settings(run.simulation, policy))
+    simulation = Simulation(edited, settings_for(run.simulation, policy))
     pictures = RunFilm(simulation, run.film_width)
     known = None if pictures.camera is None else ViewKnowledge.of_drive(edited)
     if known is not None and run.simulation.validity:
@@ -64,13 +64,6 @@ def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
         "failed": refused or next(filter(None, failures), None),
         "episodes": [own.figures() for own in driven],
     }
-
-
-def _settings(settings: SimulationSettings, policy: Policy | None) -> SimulationSettings:
-    """The settings of a run whose policy may follow the recording."""
-    if getattr(policy, "follows_recording", False):
-        return settings.model_copy(update={"recorded_until": 36000.0})
-    return settings
 
 
 class RunFilm:

@@ -46,7 +46,7 @@ def track_references(
     pairs = (pair for path in files for pair in pairwise(path.with_suffix("").parts))
     films = {name for folder, name in pairs if folder in (EDITS, QUAD)}
     films |= set(for_scene(config, scene).render.quad if "films" in chosen else ())
-    every_edit = everything or bool({"edits", "drives"} & chosen)
+    every_edit = everything or bool({"edits", "drives", "mcap"} & chosen)
     pictured = everything or "looks" in chosen or any(path.stem in FILES_OF_SUBJECT for path in files)
     editable = any(method.object_parts and method.tracks == tracks for method in config.methods.values())
     edits = fitting_edits(config, scene, tracks) if editable else {}

@@ -11,6 +11,7 @@ from drivesplat.provenance.code.code_digest import code_digest
 from drivesplat.settings.asset_references import FOLDER, INDEX, LIGHT, asset_names, asset_of_results, files_of_asset
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
+from drivesplat.settings.render import TrajectorySettings
 from drivesplat.settings.tracks import TRACK_FOLDERS
 from drivesplat.workflow.film_names import EDITS, QUAD, TRAJECTORIES, no_such_edit, scene_edits
 from drivesplat.workflow.inputs import Inputs
@@ -46,6 +47,8 @@ PARTS_FILM = "parts"
 """The film of a method's parts."""
 TRUTH_FILM = "truth"
 """The film of a method beside the truth of a synthetic world. It is made on request."""
+MCAP = "drive.mcap"
+"""The file of a drive for ROS 2. It is made on request."""
 COMPARE_FILM = "compare.mp4"
 """The film of all methods of a scene."""
 
@@ -145,6 +148,40 @@ class Outputs(Inputs):
     def runs(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
         """The records of the runs in `scenes`, by default the batch's."""
         return self.of_methods(lambda *at: [f"{RUNS}/{name}.json" for name in runs_of(self.config, *at)], scenes)
+
+    def mcap_files(self, _: Any = None) -> list[str]:
+        """The MCAP files of the batch's scenes and methods: of the recorded path, of every edit and of every run."""
+
+        def names(scene: str, method: str) -> list[str]:
+            edits = [f"{EDITS}/{name}/" for name in self._edit_names(scene, method)]
+            runs = [f"{RUNS}/{name}/" for name in runs_of(self.config, scene, method)]
+            return [f"{place}{MCAP}" for place in ("", *edits, *runs)]
+
+        return self.of_methods(names)
+
+    def drive_of_mcap(self, wildcards: Any) -> str:
+        """The drive folder of an MCAP file. Raises ConfigError where the one of the recorded path has no trajectory."""
+        return f"{self._place_of_mcap(wildcards)}drive/drive.json"
+
+    def scans_of_mcap(self, wildcards: Any) -> list[str]:
+        """The rendered scans of an MCAP file, of a method that renders LiDAR. The drive folder of a run has its own."""
+        if wildcards.at.startswith(RUNS) or not self.renders_lidar(wildcards.scene, wildcards.method):
+            return []
+        return [f"{self._place_of_mcap(wildcards)}scans/scans.json"]
+
+    def _place_of_mcap(self, wildcards: Any) -> str:
+        """The folder in which the drive folder of an MCAP file lies, with its slash."""
+        at = wildcards.at
+        if not at:
+            trajectories = for_scene(self.config, wildcards.scene).render.trajectories
+            recorded = [name for name, trajectory in trajectories.items() if trajectory == TrajectorySettings()]
+            if not recorded:
+                raise ConfigError(
+                    f"scene {wildcards.scene}: {MCAP} is of the recorded path, which no trajectory follows; add "
+                    "render: {trajectories: {original: {}}}"
+                )
+            at = f"{TRAJECTORIES}/{recorded[0]}/"
+        return f"{self.config.results_dir}/{wildcards.scene}/{wildcards.method}/{at}"
 
     def inserts(self, wildcards: Any) -> list[str]:
         """The files of the assets that the edit of a job inserts, and of the light of its scene. Raises ConfigError for

@@ -142,8 +142,8 @@ class Plan(JobResources):
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
-        if len(path) == 2 and path[0] == RUNS:
-            runs, name = runs_of(self.config, scene, method), path[1].rpartition(".")[0]
+        if len(path) > 1 and path[0] == RUNS:
+            runs, name = runs_of(self.config, scene, method), path[1].rpartition(".")[0] if len(path) == 2 else path[1]
             if name not in runs:
                 raise ConfigError(no_such_run(scene, method, name, runs))
             return

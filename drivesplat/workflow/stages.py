@@ -54,7 +54,7 @@ SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
     WORLD, "extract", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
-    "scan_folder", "run",
+    "scan_folder", "run", "run_folder",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
@@ -369,6 +369,8 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "drive_folder": (DriveJob, _drive_folder),
     "scan_folder": (ScanFolderJob, _scan_folder),
     "run": (RunJob, _run),
+    "run_folder": (RunJob, _run),
+    "drive_mcap": (Settings, _nothing),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

@@ -72,7 +72,8 @@ def refuse_image_results(config: Config, scene: str, path: Sequence[str], films:
         )
     shown = {*IMAGE_RESULTS_OF_METHODS, *(f"{film}{end}" for film in films for end in (".mp4", ".cameras.json"))}
     edit = rest[:1] == ["edits"] and rest[-1].endswith((".mp4", ".png", "scans.json"))
-    if name in IMAGE_RESULTS or (rest and (rest[0] in shown or edit or rest[-1] == "drive.json")):
+    of_images = rest[-1:] in (["drive.json"], ["drive.mcap"]) and rest[0] != "runs"
+    if name in IMAGE_RESULTS or (rest and (rest[0] in shown or edit or of_images)):
         raise ConfigError(f"{no_camera(scene)}: {'/'.join(path)} needs images; {HOW}")
 
 

@@ -164,14 +164,19 @@ class Rendered(DriveRecord):
     edit: str | None = None
     """The name of the edit; null: the drive is unedited."""
     trajectory: str | None = None
-    """The name of the trajectory; null: the recorded one, or that of the edit."""
+    """The name of the trajectory; null: the recorded one, or that of the edit or the run."""
+    run: str | None = None
+    """The name of the run in the closed loop; null: the ego vehicle drives as recorded or edited."""
+    seed: int | None = None
+    """The seed of the run."""
     steps: tuple[dict[str, Any], ...] | None = None
     """The steps of the edit."""
     trained_until: Timestamp | None = None
     """Time of the last training image of the evaluated camera: later images are extrapolated."""
     shown_by: dict[str, str] = {}
     """What shows each object, by its id: 'own', Gaussians of its own; the name of a part, such as 'background'; or
-    'none': it moves and has no Gaussians of its own, or no image of a key frame shows it. It has no boxes then."""
+    'none': it moves and has no Gaussians of its own, or no image of a key frame shows it. It has no boxes then, except
+    in a run, whose policy is told of it."""
     instances: dict[str, int] | None = None
     """The number of each object in the images of the folder `instances`. null: the drive has none."""
     provenance: dict[str, Any] = {}

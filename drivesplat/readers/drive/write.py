@@ -13,7 +13,7 @@ from drivesplat.readers.drive.format import FILE, Drive
 from drivesplat.readers.files import link_or_copy
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track
-from drivesplat.scene.sensors import Camera
+from drivesplat.scene.sensors import Camera, LidarReturns
 
 log = logging.getLogger(__name__)
 
@@ -58,20 +58,29 @@ def write_drive(scene: Scene, folder: Path, licence: str = "") -> Path:
     for frame, name in frames:
         link_or_copy(Path(frame.image_path), folder / name)
     for sweep, name in sweeps:
-        returns = read_returns(sweep)
-        columns = dict(zip("xyz", returns.points.astype(np.float32).T, strict=True))
-        columns |= {name: values for field, name in OPTIONAL.items() if (values := getattr(returns, field)) is not None}
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(folder / name, **columns)
+        write_sweep(folder / name, read_returns(sweep))
     path = folder / FILE
     _write_checked(path, drive_record(scene, frames, sweeps, licence))
     return path
 
 
 def write_record(path: Path, scene: Scene, rendered: dict[str, Any]) -> None:
-    """Writes the drive.json of a scene without LiDAR whose images lie in the folder of `path`, marked as `rendered`."""
-    frames = [(frame, Path(frame.image_path).relative_to(path.parent).as_posix()) for frame in scene.frames]
-    _write_checked(path, {**drive_record(scene, frames, (), ""), "rendered": rendered})
+    """Writes the drive.json of a scene whose images and sweeps lie in the folder of `path`, marked as `rendered`."""
+
+    def inside(file: str) -> str:
+        return Path(file).relative_to(path.parent).as_posix()
+
+    frames = [(frame, inside(frame.image_path)) for frame in scene.frames]
+    sweeps = [(sweep, inside(sweep.path)) for sweep in scene.sweeps]
+    _write_checked(path, {**drive_record(scene, frames, sweeps, ""), "rendered": rendered})
+
+
+def write_sweep(path: Path, returns: LidarReturns) -> None:
+    """Writes the returns of a sweep as .npz."""
+    columns = dict(zip("xyz", returns.points.astype(np.float32).T, strict=True))
+    columns |= {name: values for field, name in OPTIONAL.items() if (values := getattr(returns, field)) is not None}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **columns)
 
 
 def _write_checked(path: Path, record: dict[str, Any]) -> None:

@@ -42,7 +42,7 @@ class JobId:
         for stage in (FILM, EDIT, QUAD, DRIVE, SCANS):
             if method and name.startswith(f"{stage}_") and name != FILM_PARTS:
                 return cls(stage, scene, method, name.removeprefix(f"{stage}_"))
-        return cls(RENAMED.get(name, name), scene, method)
+        return cls(RENAMED.get(name, name), scene, method, "/".join(place[2:]))
 
     @property
     def name(self) -> str:

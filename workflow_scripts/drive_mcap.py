@@ -1,0 +1,14 @@
+"""A drive folder, with scans, as an MCAP file."""
+
+from pathlib import Path
+
+from drivesplat.workflow.job import job
+from drivesplat.export.drive_mcap import write_mcap
+from drivesplat.io.storage import no_provenance
+from drivesplat.readers.drive.format import read_drive
+
+with job(snakemake) as current:
+    folder, scans = Path(current.input.drive).parent, current.input.scans
+    rendered = read_drive(folder).rendered
+    provenance = current.provenance(no_provenance() if rendered is None else rendered.provenance)
+    write_mcap(folder, Path(current.output.mcap), Path(scans) if scans else None, provenance)
