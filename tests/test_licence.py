@@ -16,7 +16,9 @@ APACHE_2_0 = "cfc7749b96f63bd31c3c42b5c471bf756814053e847c10f3eb003417bc523d30"
 PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
 NOTICES = (REPOSITORY / "THIRD_PARTY_NOTICES.md").read_text(encoding="utf-8")
 LISTED = dict(re.findall(r"^\| ([\w.*-]+) \| ([^|]+?) \|", NOTICES, re.M))
-PERMISSIVE = re.compile(r"MIT|BSD|Apache|ISC\b|PSF|Python Software Foundation|Kiwi|Public Domain|TOST", re.IGNORECASE)
+PERMISSIVE = re.compile(
+    r"MIT|BSD|Apache|ISC\b|PSF|Python Software Foundation|Kiwi|Public Domain|TOST|any-OSI", re.IGNORECASE
+)
 CONDITIONS = re.compile(r"GPL|General Public|Mozilla|MPL|Proprietary|EULA|non-commercial|CC.BY.NC", re.IGNORECASE)
 
 

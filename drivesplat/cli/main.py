@@ -84,6 +84,11 @@ def _parser(program: str) -> argparse.ArgumentParser:
 
     assets.add_parser(commands)
 
+    mcap = commands.add_parser("mcap", help="write a drive folder as an MCAP file for ROS 2 (docs/mcap.md)")
+    mcap.add_argument("folder", type=Path, help="with drive.json, recorded or rendered")
+    mcap.add_argument("--out", type=Path, required=True, help="the file, such as drive.mcap")
+    mcap.add_argument("--scans", type=Path, help="scans.json of rendered LiDAR scans of the same drive")
+
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
 
@@ -127,6 +132,12 @@ def run_command(parsed: argparse.Namespace) -> int:
         return 0
     if parsed.command == assets.COMMAND:
         return assets.run_assets(parsed)
+    if parsed.command == "mcap":
+        from drivesplat.export.drive_mcap import write_mcap
+
+        counts = write_mcap(parsed.folder, parsed.out, parsed.scans)
+        print(f"{parsed.out}: {sum(counts.values())} messages on {', '.join(counts)}")
+        return 0
     if parsed.command == "view":
         drives = [drivesplat.open(folder, parsed.device) for folder in parsed.folders]
         server = drivesplat.LiveServer(drives, parsed.host, parsed.port, parsed.edits)

@@ -1,5 +1,5 @@
-"""The LiDAR sweeps of a drive folder, and rendered scans beside it, as clouds for ROS: with a time for each point, which
-counts from the first one."""
+"""The LiDAR sweeps of a drive folder, and rendered scans of the same drive, as clouds whose times count from the begin of
+the revolution, as in ROS."""
 
 import logging
 from collections.abc import Callable
@@ -32,7 +32,7 @@ NEEDED = ("azimuths", "elevations", "offsets_s", "ranges", "intensities", "retur
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class SweepCloud:
     """The n returns of a revolution: `stamp` (microseconds) is the time at which it begins, `sensor_to_map` the pose
     of the LiDAR at that time, `points` are in the map. None if unknown: `intensity` in [0, 1], `ring` (index of the
     beam), `t` (nanoseconds after the stamp)."""
@@ -53,12 +53,10 @@ class TimedSweep:
     lidar: str
     timestamp: int
     pose: Float64[np.ndarray, "4 4"] | None
-    load: Callable[[], Cloud]
+    load: Callable[[], SweepCloud]
 
 
-def recorded_sweeps(
-    drive: Drive, folder: Path, path: PosesAt, origin: Float64[np.ndarray, "3"]
-) -> list[TimedSweep]:
+def recorded_sweeps(drive: Drive, folder: Path, path: PosesAt, origin: Float64[np.ndarray, "3"]) -> list[TimedSweep]:
     """The sweeps of a drive folder in order of time. `path` gives the poses of the ego vehicle in the map, whose origin
     is at `origin` in the drive's world. Sweeps that cannot be motion-compensated at the ends of the drive are left out
     with a warning."""
@@ -80,7 +78,7 @@ def recorded_sweeps(
     return found
 
 
-def _of_file(sweep: Sweep, path: PosesAt) -> Cloud:
+def _of_file(sweep: Sweep, path: PosesAt) -> SweepCloud:
     """The cloud of a sweep's file. The LiDAR moves during the revolution as the vehicle does."""
     returns = sound_returns(sweep)
     if returns is None:
@@ -89,7 +87,7 @@ def _of_file(sweep: Sweep, path: PosesAt) -> Cloud:
     if offsets is not None and len(offsets):
         begin = _begin(sweep.timestamp, float(offsets.min()))
     now, first = path(np.array([sweep.timestamp, sweep.timestamp + begin]))
-    return Cloud(
+    return SweepCloud(
         sweep.timestamp + begin,
         first @ inverse(now) @ sweep.sensor_to_world,
         apply(sweep.sensor_to_world, returns.points),
@@ -119,7 +117,7 @@ def rendered_sweeps(index: Path) -> list[TimedSweep]:
     return found
 
 
-def _of_rays(file: Path, timestamp: int, pose: np.ndarray) -> Cloud:
+def _of_rays(file: Path, timestamp: int, pose: np.ndarray) -> SweepCloud:
     try:
         with np.load(file, allow_pickle=False) as arrays:
             values = {name: arrays[name] for name in NEEDED}
@@ -131,7 +129,7 @@ def _of_rays(file: Path, timestamp: int, pose: np.ndarray) -> Cloud:
     offsets = rays.offsets_s[returned].astype(np.float64)
     poses = motion(offsets)
     seen = (rays.directions() * values["ranges"][..., None])[returned].astype(np.float64)
-    return Cloud(
+    return SweepCloud(
         timestamp + begin,
         motion(np.array([begin * 1e-6]))[0],
         np.einsum("nij,nj->ni", poses[:, :3, :3], seen) + poses[:, :3, 3],

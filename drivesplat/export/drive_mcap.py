@@ -7,7 +7,7 @@ of their stamps.
 import heapq
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
@@ -42,8 +42,8 @@ HALF_SPAN = 0.05
 RIGID_M = 1e-4
 """Metres and radians by which the mount of a camera may vary and still be static."""
 MIN_KNOT_INTERVAL = 40_000
-"""Least time in microseconds between the poses of the ego vehicle through which its smooth path leads: images of several
-cameras follow each other within milliseconds, and differ by millimetres once their poses are refined."""
+"""Least time in microseconds between the poses of the ego vehicle through which its smooth path leads: images of
+several cameras follow each other within milliseconds, and differ by millimetres once their poses are refined."""
 MIN_BOX_INTERVAL = 20_000
 """Least time in microseconds between messages of boxes."""
 MIN_LIFETIME_S, INTERVALS = 0.15, 1.5

@@ -35,9 +35,7 @@ class McapFile:
             self._connections[topic] = self._writer.add_connection(
                 topic, message.__msgtype__, typestore=types, offered_qos_profiles=[_quality(topic == LATCHED)]
             )
-        self._writer.write(
-            self._connections[topic], 1000 * stamp, types.serialize_cdr(message, message.__msgtype__)
-        )
+        self._writer.write(self._connections[topic], 1000 * stamp, types.serialize_cdr(message, message.__msgtype__))
         self.counts[topic] = self.counts.get(topic, 0) + 1
 
 

@@ -1,5 +1,5 @@
-"""The stage `run_folder`: a run in the closed loop as a drive folder: what the sensors of its policy measured, and where
-everything was."""
+"""The stage `run_folder`: a run in the closed loop as a drive folder, with what the sensors of its policy measured and
+where everything was."""
 
 import logging
 import shutil
@@ -43,13 +43,13 @@ def write_run_drive(
     record: Mapping[str, Any],
     provenance: Provenance,
 ) -> None:
-    """Drives the first episode of a run again, and writes it into the folder of `path`, its drive.json: an image of each
-    camera of the policy and a sweep of its LiDAR at every step, the path of the ego vehicle, and the boxes of all
+    """Drives the first episode of a run again, and writes it into the folder of `path`, its drive.json: an image of
+    each camera of the policy and a sweep of its LiDAR at every step, the path of the ego vehicle, and the boxes of all
     objects.
 
-    `source` names the `scene`, the `method` and the `run`; `record` is what the run has written. Warns where the vehicle
-    drives elsewhere than in `record`, as policies may that see images of a GPU. Raises RequestError for a run without
-    sensors, and where its policy fails before the first step; what `Simulation` raises.
+    `source` names the `scene`, the `method` and the `run`; `record` is what the run has written. Warns where the
+    vehicle drives elsewhere than in `record`, as policies may that see images of a GPU. Raises RequestError for a run
+    without sensors, and where its policy cannot be made or fails before the first step; what `Simulation` raises.
     """
     run, where = job.run, f"run {source['run']}"
     edited = drive if job.edit is None else drive.edited(job.edit)
@@ -105,12 +105,11 @@ class _Recorder:
         pose, mount = now.ego_to_world, camera.camera_to_ego
         assert mount is not None
         seen_from = now.drive.camera_to_world(name, now.time) if now.follows else pose @ mount
-        self._frames.append(
-            Frame(
-                name, time, str(file), camera.width, camera.height, camera.lens.intrinsics, seen_from, pose, True,
-                len(self.times) - 1, f"{name}/{time}",
-            )  # fmt: skip
-        )
+        frame = Frame(
+            name, time, str(file), camera.width, camera.height, camera.lens.intrinsics, seen_from, pose, True,
+            len(self.times) - 1, f"{name}/{time}",
+        )  # fmt: skip
+        self._frames.append(frame)
 
     def _sweep(self, lidar: PoseableLidar) -> None:
         now, time, name = self._simulation, self.times[-1], self._simulation.settings.lidar
@@ -163,9 +162,7 @@ class _Recorder:
                 poses = other.object_to_world[at]
                 unknown = np.zeros(len(at), dtype=np.int64)
                 category = categories[other.id]
-                found.append(
-                    Track(other.id, other.object_class, category, other.size, stamps[at], at, poses, unknown)
-                )
+                found.append(Track(other.id, other.object_class, category, other.size, stamps[at], at, poses, unknown))
         return found
 
 
