@@ -76,3 +76,4 @@ wildcard_constraints:
     tracks=plan.known(["", *plan.other_tracks]),
     trajectory=plan.known(plan.all_trajectories),
     edit="[A-Za-z0-9_][A-Za-z0-9_.-]*",
+    run="[A-Za-z0-9_][A-Za-z0-9_.-]*",

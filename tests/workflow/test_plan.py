@@ -247,6 +247,31 @@ def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(wit
             made.refuse_unknown([f"elsewhere/a1/{target}"])
 
 
+def test_mcap_files_are_of_the_recorded_path_and_of_edits_with_scans_where_there_are_some(with_edit):
+    made = plan(**with_edit, methods={"vanilla": {}, "moving": {"parts": ACTORS, "overrides": LIDAR}})
+    wanted = {path.split("/", 1)[1] for path in made.mcap_files() if "/a1/" in path}
+    assert wanted == {"a1/moving/drive.mcap", "a1/moving/edits/gone/drive.mcap", "a1/vanilla/drive.mcap"}
+    made.refuse_unknown([*made.mcap_files(), "elsewhere/a1/vanilla/trajectories/original/drive.mcap"])
+
+    def inputs(method: str, at: str) -> list[str]:
+        job = SimpleNamespace(scene="a1", method=method, at=at)
+        return [path.removeprefix("elsewhere/a1/") for path in (made.drive_of_mcap(job), *made.scans_of_mcap(job))]
+
+    original, gone = "moving/trajectories/original", "moving/edits/gone"
+    assert inputs("moving", "") == [f"{original}/drive/drive.json", f"{original}/scans/scans.json"]
+    assert inputs("moving", "edits/gone/") == [f"{gone}/drive/drive.json", f"{gone}/scans/scans.json"]
+    assert inputs("moving", "runs/fast/") == ["moving/runs/fast/drive/drive.json"]
+    assert inputs("vanilla", "") == ["vanilla/trajectories/original/drive/drive.json"]
+    for target, message in {
+        "moving/edits/halt/drive.mcap": "no edit called 'halt'",
+        "vanilla/edits/gone/drive.mcap": "'vanilla' knows no actors",
+        "moving/trajectories/nowhere/drive.mcap": "no film called 'nowhere'",
+        "moving/trajectories/objects/drive.mcap": "shows the moving parts alone",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            made.refuse_unknown([f"elsewhere/a1/{target}"])
+
+
 def test_scans_are_of_edits_and_trajectories_of_methods_that_render_lidar(with_edit):
     lidar = {"overrides": LIDAR}
     made = plan(**with_edit, methods={"vanilla": {}, "static": lidar, "moving": {"parts": ACTORS, **lidar}})
