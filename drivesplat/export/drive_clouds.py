@@ -1,5 +1,5 @@
-"""The LiDAR sweeps of a drive folder, and rendered scans of the same drive, as clouds whose times count from the begin of
-the revolution, as in ROS."""
+"""The LiDAR sweeps of a drive folder, and rendered scans of the same drive, as clouds whose times count from the begin
+of the revolution, as in ROS."""
 
 import logging
 from collections.abc import Callable

@@ -5,7 +5,7 @@ vision_msgs is none of rosbags' own packages: its definitions, those of version 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,11 @@ class PlacedBox:
     size: Float64[np.ndarray, "3"]
     object_to_map: Float64[np.ndarray, "4 4"]
 
+    @cached_property
+    def pose(self) -> Any:
+        """The pose as a message."""
+        return _pose(self.object_to_map)
+
 
 @cache
 def ros_types() -> Any:
@@ -111,8 +116,9 @@ def _pose(matrix: np.ndarray) -> Any:
     return _of("geometry_msgs/Pose", position=_vector(matrix[:3, 3], "Point"), orientation=orientation)
 
 
-def _pose_with_covariance(matrix: np.ndarray) -> Any:
-    return _of("geometry_msgs/PoseWithCovariance", pose=_pose(matrix), covariance=np.zeros(36))
+def _uncertain(pose: Any) -> Any:
+    """A pose with covariances of 0: unknown."""
+    return _of("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
 
 
 def transforms(stamp: int, parent: str, children: Mapping[str, np.ndarray]) -> Any:
@@ -134,7 +140,7 @@ def odometry(stamp: int, ego_to_map: Float64[np.ndarray, "4 4"], velocity: Float
     own axes. Covariances are 0: unknown."""
     twist = _of("geometry_msgs/Twist", linear=_vector(velocity[:3]), angular=_vector(velocity[3:]))
     return _of(
-        "nav_msgs/Odometry", header=_header(stamp, MAP), child_frame_id=BASE, pose=_pose_with_covariance(ego_to_map),
+        "nav_msgs/Odometry", header=_header(stamp, MAP), child_frame_id=BASE, pose=_uncertain(_pose(ego_to_map)),
         twist=_of("geometry_msgs/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
     )  # fmt: skip
 
@@ -199,22 +205,22 @@ def markers(stamp: int, boxes: Sequence[PlacedBox], lifetime_s: float) -> Any:
     later message replaces vanishes after `lifetime_s` seconds."""
     whole = int(lifetime_s)
     lifetime = _of("builtin_interfaces/Duration", sec=whole, nanosec=round((lifetime_s - whole) * 1e9))
-    found = [_marker(stamp, "", 0, DELETE_ALL, np.eye(4), np.zeros(3), OTHERS, lifetime)]
+    found = [_marker(stamp, "", 0, DELETE_ALL, _pose(np.eye(4)), np.zeros(3), OTHERS, lifetime)]
     for box in boxes:
         color = COLORS.get(box.object_class, VEHICLES)
         of_class = box.object_class.value
-        found.append(_marker(stamp, of_class, box.number, ADD, box.object_to_map, box.size, color, lifetime))
+        found.append(_marker(stamp, of_class, box.number, ADD, box.pose, box.size, color, lifetime))
     return _of("visualization_msgs/MarkerArray", markers=found)
 
 
 def _marker(
-    stamp: int, namespace: str, number: int, action: int, pose: np.ndarray, size: np.ndarray,
+    stamp: int, namespace: str, number: int, action: int, pose: Any, size: np.ndarray,
     color: tuple[float, float, float], lifetime: Any,
 ) -> Any:  # fmt: skip
     none = np.zeros(0, dtype=np.uint8)
     return _of(
         "visualization_msgs/Marker", header=_header(stamp, MAP), ns=namespace, id=number, type=CUBE, action=action,
-        pose=_pose(pose), scale=_vector(size),
+        pose=pose, scale=_vector(size),
         color=_of("std_msgs/ColorRGBA", **dict(zip("rgba", (*color, OPACITY), strict=True))), lifetime=lifetime,
         frame_locked=False, points=[], colors=[], texture_resource="",
         texture=_of("sensor_msgs/CompressedImage", header=_header(0, ""), format="", data=none), uv_coordinates=[],
@@ -229,8 +235,7 @@ def detections(stamp: int, boxes: Sequence[PlacedBox]) -> Any:
     found = []
     for box in boxes:
         certain = _of("vision_msgs/ObjectHypothesis", class_id=box.object_class.value, score=1.0)
-        pose = _pose_with_covariance(box.object_to_map)
-        result = _of("vision_msgs/ObjectHypothesisWithPose", hypothesis=certain, pose=pose)
-        bounds = _of("vision_msgs/BoundingBox3D", center=_pose(box.object_to_map), size=_vector(box.size))
+        result = _of("vision_msgs/ObjectHypothesisWithPose", hypothesis=certain, pose=_uncertain(box.pose))
+        bounds = _of("vision_msgs/BoundingBox3D", center=box.pose, size=_vector(box.size))
         found.append(_of("vision_msgs/Detection3D", header=header, results=[result], bbox=bounds, id=box.id))
     return _of("vision_msgs/Detection3DArray", header=header, detections=found)

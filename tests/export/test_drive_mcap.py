@@ -23,9 +23,11 @@ from drivesplat.editing.drive_folder import write_rendered_drive
 from drivesplat.editing.scan_folder import write_scan_folder
 from drivesplat.errors import DatasetError, DriveSplatError, RequestError, ResultError
 from drivesplat.export import ros_messages
-from drivesplat.export.drive_mcap import write_mcap
+from drivesplat.export.drive_clouds import rendered_sweeps
+from drivesplat.export.drive_mcap import DriveMessages, EgoTimeline, write_mcap
 from drivesplat.export.ros_messages import camera_info
 from drivesplat.io.storage import no_provenance
+from drivesplat.readers.drive.format import read_drive
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.rigid import apply
@@ -276,6 +278,22 @@ def test_a_run_that_cannot_be_recorded_leaves_nothing(drive, tmp_path):
     with pytest.raises(RequestError, match="there is no policy 'nobody'"):
         written(policy="nobody")
     assert not list(tmp_path.glob("drive/*"))
+
+
+def test_messages_are_made_as_they_are_written(folder, monkeypatch):
+    """Of a sensor no more than one message is ahead of those that are written, however long the drive."""
+    drive = read_drive(folder / "drive")
+    timeline, made = EgoTimeline.of(drive), []
+    for name in ("jpeg_image", "point_cloud"):
+        make = getattr(ros_messages, name)
+        monkeypatch.setattr(ros_messages, name, lambda *given, make=make, name=name: made.append(name) or make(*given))
+    sweeps = rendered_sweeps(folder / "scans/scans.json")
+    written = []
+    for _, topic, _ in DriveMessages(drive, folder / "drive", timeline, sweeps).in_order():
+        written.append(topic)
+        assert made.count("jpeg_image") <= written.count(IMAGES) + 1
+        assert made.count("point_cloud") <= written.count(CLOUDS) + 1
+    assert written.count(IMAGES) == len(drive.frames) and written.count(CLOUDS) == len(sweeps)
 
 
 # ---- the container

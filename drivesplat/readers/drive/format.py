@@ -176,7 +176,7 @@ class Rendered(DriveRecord):
     shown_by: dict[str, str] = {}
     """What shows each object, by its id: 'own', Gaussians of its own; the name of a part, such as 'background'; or
     'none': it moves and has no Gaussians of its own, or no image of a key frame shows it. It has no boxes then, except
-    in a run, whose policy is told of it."""
+    in a run, whose policy knows the boxes of all objects."""
     instances: dict[str, int] | None = None
     """The number of each object in the images of the folder `instances`. null: the drive has none."""
     provenance: dict[str, Any] = {}
