@@ -109,6 +109,8 @@ def test_the_folder_has_no_faults_and_says_that_it_was_rendered(busy, scene):
     assert drive.rendered.model_dump(exclude={"steps", "trained_until", "shown_by", "provenance"}) == {
         **SOURCE,
         "trajectory": None,
+        "run": None,
+        "seed": None,
         "instances": None,
     }
     assert [list(step) for step in drive.rendered.steps] == [["shift"], ["duplicate"], ["remove"], ["rescale"]]
