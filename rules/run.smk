@@ -55,6 +55,8 @@ rule run_folder:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         parser=plan.of_tracks("parser.npz"),
+        # what its held-out images say of others
+        evaluation="<results>/{scene}/{method}/eval.json",
         scans=plan.training_input("scans"),
         inserts=plan.inserts,
         # what was driven before

@@ -87,7 +87,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     mcap = commands.add_parser("mcap", help="write a drive folder as an MCAP file for ROS 2 (docs/mcap.md)")
     mcap.add_argument("folder", type=Path, help="with drive.json, recorded or rendered")
     mcap.add_argument("--out", type=Path, required=True, help="the file, such as drive.mcap")
-    mcap.add_argument("--scans", type=Path, help="scans.json of rendered LiDAR scans of the same drive")
+    mcap.add_argument("--scans", type=Path, help="scans.json of rendered LiDAR scans, in place of the folder's own")
 
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")

@@ -4,6 +4,7 @@ of the revolution, as in ROS."""
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,7 @@ def recorded_sweeps(drive: Drive, folder: Path, path: PosesAt, origin: Float64[n
         if motion is not None and (fault := beyond_poses(sweep, reach_us(lidar.revolution_s))):
             log.warning("%s: LiDAR file %s %s; left out", folder, file, fault)
             continue
-        found.append(TimedSweep(record.lidar, record.timestamp, stated, lambda sweep=sweep: _of_file(sweep, path)))
+        found.append(TimedSweep(record.lidar, record.timestamp, stated, partial(_of_file, sweep, path)))
     return found
 
 
@@ -110,7 +111,7 @@ def rendered_sweeps(index: Path) -> list[TimedSweep]:
                     "export.scan_formats and make it again"
                 )
             file, pose = index.parent / scan["files"][RAYS], np.array(scan["sensor_to_world"], dtype=np.float64)
-            load = lambda file=file, time=scan["timestamp"], pose=pose: _of_rays(file, time, pose)  # noqa: E731
+            load = partial(_of_rays, file, scan["timestamp"], pose)
             found.append(TimedSweep(scan["lidar"], scan["timestamp"], pose, load))
     except (KeyError, TypeError, ValueError) as error:
         raise ResultError(f"{index}: not what the rule 'scan_folder' writes ({error}); delete it and rerun") from None

@@ -39,6 +39,8 @@ ORIENTATION = 0x0112
 """The EXIF tag of how to turn an image, which ROS's decoders follow and drive folders do not."""
 HALF_SPAN = 0.05
 """Half the time in seconds between the two poses that give a velocity."""
+END_OF_TIME = 2**31 * 1_000_000
+"""Microseconds after 1970 that the seconds of a ROS message cannot hold."""
 RIGID_M = 1e-4
 """Metres and radians by which the mount of a camera may vary and still be static."""
 MIN_KNOT_INTERVAL = 40_000
@@ -60,7 +62,7 @@ def write_mcap(
 
     Args:
         folder: a drive folder (docs/own_data.md), recorded or rendered.
-        scans: the scans.json of rendered LiDAR scans of the same drive; None: the sweeps of the drive folder alone.
+        scans: the scans.json of rendered LiDAR scans of the same drive; None: the sweeps of the drive folder.
         provenance: where the file comes from; it is written into it.
 
     Raises DatasetError for a drive with faults, without poses, or whose files are missing or damaged; ResultError for
@@ -76,8 +78,10 @@ def write_mcap(
     if is_unposed(drive):
         raise DatasetError(f"{folder / FILE}: there are no poses, without which ROS has no transforms; add ego_poses")
     timeline = EgoTimeline.of(drive)
-    sweeps = recorded_sweeps(drive, folder, timeline.path, timeline.origin)
-    sweeps += [] if scans is None else rendered_sweeps(scans)
+    if timeline.stamps[-1] >= END_OF_TIME:
+        raise DatasetError(f"{folder / FILE}: its times are later than 2038, which ROS cannot state; move them back")
+    own = scans is None
+    sweeps = recorded_sweeps(drive, folder, timeline.path, timeline.origin) if own else rendered_sweeps(scans)
     source = {} if drive.rendered is None else drive.rendered.model_dump(mode="json", exclude={"provenance"})
     notes = {"description": drive.description, "licence": drive.licence, "rendered": json.dumps(source)}
     notes |= {} if provenance is None else {"provenance": json.dumps(provenance)}
@@ -149,12 +153,11 @@ class DriveMessages:
         made ahead."""
         mounts = {self.names[lidar]: mount for lidar, mount in self._lidar_mounts.items()}
         mounts |= {_optical(self.names[camera]): mount for camera, mount in self._camera_mounts.items()}
-        # the first message of a LiDAR may begin before the first pose
         clouds = [self._clouds(lidar) for lidar in self._lidar_mounts]
         cameras = [self._images(camera) for camera in self.drive.cameras]
         rest = heapq.merge(self._ego(), *clouds, *cameras, self._boxes(), key=lambda timed: timed[0])
         for i, timed in enumerate(rest):
-            if i == 0 and mounts:
+            if i == 0 and mounts:  # at the stamp of what begins first
                 yield timed[0], LATCHED, ros.transforms(timed[0], ros.BASE, mounts)
             yield timed
 

@@ -510,9 +510,21 @@ def wrong_rate(content: dict[str, Any]) -> None:
     content["frames"][1]["timestamp"] = content["frames"][0]["timestamp"]
 
 
+def late(content: dict[str, Any]) -> None:
+    later = 10**15  # 31 years
+    for one in (
+        *content["frames"],
+        *content["sweeps"],
+        *(pose for track in content["tracks"] for pose in track["poses"]),
+    ):
+        one["timestamp"] += later
+    content["key_frames"] = [time + later for time in content["key_frames"]]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (late, "its times are later than 2038, which ROS cannot state"),
         (no_poses, "there are no poses, without which ROS has no transforms; add ego_poses"),
         (missing_image, r"image .*none\.jpg cannot be read"),
         (missing_sweep, r"none\.npz is missing; restore it, or take it out of drive\.json"),

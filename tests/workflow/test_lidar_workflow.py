@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.mcap_files import Recording
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from drivesplat.io.video import read_footage
@@ -79,6 +80,13 @@ def test_scans_from_beside_the_path_come_as_files_and_a_changed_format_makes_the
     copy.config["export"] = {"scan_formats": ["npz"]}
     copy.write_config()
     assert copy.planned(target) == {"scan_folder": 1}
+
+
+def test_an_mcap_file_has_the_rendered_scans(copy):
+    target = "results/0001/with_lidar/drive.mcap"
+    done = copy.run(target)
+    assert done.returncode == 0, done.stdout
+    assert len(Recording.of(copy.folder / target).all("/LIDAR_TOP/points")) == 10
 
 
 def test_a_changed_weight_of_scans_trains_that_method_alone_again(copy):

@@ -9,7 +9,7 @@ pytestmark = pytest.mark.workflow
 RUNS = {
     "brakes": {
         "policy": "pure_pursuit", "edit": "stop", "film_width": 64,
-        "simulation": {"seconds": 0.4, "cameras": ["CAM_FRONT"], "width": 64},
+        "simulation": {"seconds": 0.4, "cameras": ["CAM_FRONT"], "width": 64, "validity": True},
     }
 }  # fmt: skip
 STREET = "results/0001/street"
