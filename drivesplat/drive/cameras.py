@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
-from drivesplat.drive.lenses import LensFace, faces_of
+from drivesplat.drive.lenses import BANDS, LensFace, faces_of
 from drivesplat.errors import DatasetError, RequestError
 from drivesplat.model.view import View, rolling_shutter_of
 from drivesplat.readers.checks import checked_intrinsics, checked_size, checked_transform
 from drivesplat.scene.ego_mask import Outline, enclosed
-from drivesplat.scene.lens import coefficients_fault, lens_fault
+from drivesplat.scene.lens import POLYNOMIALS, coefficients_fault, lens_fault
 from drivesplat.scene.sensors import Camera, DistortionModel
 from drivesplat.scene.shutter import Shutter
 
@@ -37,8 +37,9 @@ class PoseableCamera:
 
     `readout_s` are the seconds from the left edge to the right one and from the top edge to the bottom one at which
     lines are read, negative if read the other way, and from the image's time to the middle of the readout; zeros: a
-    global shutter. `distortion` are the coefficients of `distortion_model` (`drivesplat.scene.lens`); a distorted
-    camera has a global shutter. `covered` are outlines, in fractions of width and height, of the vehicle's own body.
+    global shutter. `distortion` are the coefficients of `distortion_model` (`drivesplat.scene.lens`), of whose
+    polynomials K may shear the image; directions farther than `max_angle` radians from the optical axis have no pixel.
+    `covered` are outlines, in fractions of width and height, of the vehicle's own body.
 
     Raises RequestError for an invalid size, lens or mount.
 
@@ -55,6 +56,7 @@ class PoseableCamera:
     readout_s: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     distortion: Float64[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
     distortion_model: DistortionModel = "none"
+    max_angle: float | None = None
     covered: tuple[Outline, ...] = ()
 
     def __post_init__(self) -> None:
@@ -64,7 +66,8 @@ class PoseableCamera:
             raise RequestError(str(error)) from None
         object.__setattr__(self, "width", width)
         object.__setattr__(self, "height", height)
-        object.__setattr__(self, "K", _checked(checked_intrinsics, self.K, "the camera"))
+        check = checked_sheared_intrinsics if self.distortion_model in POLYNOMIALS else checked_intrinsics
+        object.__setattr__(self, "K", _checked(check, self.K, "the camera"))
         object.__setattr__(self, "readout_s", require_vector(self.readout_s, 3, "the camera's readout_s"))
         object.__setattr__(self, "distortion", require_vector(self.distortion, None, "the camera's distortion"))
         if self.camera_to_ego is not None:
@@ -75,8 +78,10 @@ class PoseableCamera:
         fault = coefficients_fault(self.distortion_model, len(self.distortion))
         if self.distorted:
             fault = fault or lens_fault(self.lens)
-            if self.readout_s.any():
-                fault = fault or "a distorted camera is rendered with a global shutter: leave out readout_s"
+        elif self.max_angle is not None:
+            fault = "max_angle is that of a lens: leave it out for a pinhole camera"
+        if self.max_angle is not None and not 0.0 < self.max_angle <= math.pi:
+            fault = f"a max_angle of {self.max_angle:g} is no angle in radians, above 0 and up to 3.14"
         if fault is not None:
             raise RequestError(f"the camera: {fault}")
 
@@ -106,16 +111,21 @@ class PoseableCamera:
     @cached_property
     def faces(self) -> list[LensFace]:
         """The pinhole images that a distorted image is resampled from."""
-        faces = faces_of(self.lens)
+        faces = faces_of(self.lens, self.max_angle, self._bands)
         if not faces:
             raise RequestError("the camera: its lens images no direction within its image")
         return faces
+
+    @property
+    def _bands(self) -> tuple[int, int]:
+        """The numbers of columns and rows of parts of a distorted image that are read at times of their own."""
+        return BANDS if self.readout_s[0] else 1, BANDS if self.readout_s[1] else 1
 
     def resized(self, width: int) -> "PoseableCamera":
         """The same field of view in images of another width."""
         height = max(1, round(self.height * width / self.width))
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
-        if self.distortion_model in ("angle_to_radius", "radius_to_angle"):
+        if self.distortion_model in POLYNOMIALS:
             raise RequestError(f"distortion {self.distortion_model!r} is in pixels: its camera cannot be resized")
         return replace(self, width=width, height=height, K=self.K * scale)
 
@@ -173,6 +183,19 @@ class GivenPose:
 
 
 AS_DRIVEN = GivenPose()
+
+
+def checked_sheared_intrinsics(matrix: np.ndarray, record: str) -> np.ndarray:
+    """The K (3, 3) of a lens that may shear the image; otherwise as `checked_intrinsics`."""
+    if matrix.shape != (3, 3) or matrix.dtype.kind != "f":
+        return checked_intrinsics(matrix, record)
+    shear, plain = matrix[[0, 1], [1, 0]], matrix.copy()
+    plain[[0, 1], [1, 0]] = 0.0
+    checked = checked_intrinsics(plain, record)
+    checked[[0, 1], [1, 0]] = shear
+    if not np.isfinite(shear).all() or np.linalg.det(checked) <= 0.0:
+        raise DatasetError(f"{record}: its camera matrix is singular or mirrors the image")
+    return checked
 
 
 def require_pose(pose: Matrix, of: str) -> Float64[np.ndarray, "4 4"]:

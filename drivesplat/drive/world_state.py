@@ -292,11 +292,18 @@ class WorldState:
         if several and camera_to_world is not None:
             raise RequestError("several cameras are placed by one ego_to_world: camera_to_world is for one camera")
         at = GivenPose.checked("the camera", ego_to_world, camera_to_world, velocity)
-        placed = [self._sensors.placed_camera(one, self.time, at) for one in cameras]
+        views = self.render_placed([self._sensors.placed_camera(one, self.time, at) for one in cameras], outputs)
+        return views if several else views[0]
+
+    @torch.no_grad()
+    def render_placed(self, cameras: Sequence[PlacedCamera], outputs: Sequence[str] = ("rgb",)) -> list[DriveView]:
+        """What cameras see, each at a pose and a velocity of its own. Their time must be this world's; the Gaussians
+        are placed once for all of them. Raises as `render`."""
+        if other := [camera.time for camera in cameras if camera.time != self.time]:
+            raise RequestError(f"a camera at {other[0]:g} s cannot show a world at {self.time:g} s")
         world = self._sampled()
         with explain_out_of_memory(lambda: len(self._fixed.model)):
-            views = [world.image(one, outputs) for one in placed]
-        return views if several else views[0]
+            return [world.image(one, outputs) for one in cameras]
 
     @torch.no_grad()
     def scan(

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,6 +26,12 @@ class RollingShutter:
     def angular_velocity(self) -> Float[Tensor, "3"]:
         """That of the camera, radians per second along its own axes."""
         return torch.stack([-self.motion[2, 1], self.motion[2, 0], -self.motion[1, 0]])
+
+
+def turned_motion(motion: Float[Tensor, "3 4"], turn: np.ndarray) -> Float[Tensor, "3 4"]:
+    """The `RollingShutter.motion` of a camera at the same place whose axes `turn` (3, 3) rotates to this one's."""
+    rotation = torch.from_numpy(turn).to(motion)
+    return torch.cat([rotation.T @ motion[:, :3] @ rotation, rotation.T @ motion[:, 3:]], dim=1)
 
 
 def inverse(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -1,5 +1,7 @@
 """Colours as 8-bit integers."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -17,12 +19,17 @@ def to_uint8(colors: Float[Tensor, "*n 3"]) -> UInt8[Tensor, "*n 3"]:
 
 def uint8_image(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     """Colours in [0, 1] as the nearest uint8, in main memory. Raises ResultError where one is NaN or Inf."""
-    finite, pixels = (to_host(values) for values in (torch.isfinite(image).all(), to_uint8(image)))
-    if image.is_cuda:
-        torch.cuda.current_stream(image.device).synchronize()
-    if not finite:
+    return uint8_images([image])[0]
+
+
+def uint8_images(images: Sequence[Float[Tensor, "_ _ 3"]]) -> list[np.ndarray]:
+    """Images of one device, each as `uint8_image` gives it; a GPU is waited for once for all of them."""
+    copies = [(to_host(torch.isfinite(image).all()), to_host(to_uint8(image))) for image in images]
+    if images and images[0].is_cuda:
+        torch.cuda.current_stream(images[0].device).synchronize()
+    if not all(finite for finite, _ in copies):
         raise ResultError(NOT_FINITE)
-    return pixels.numpy()
+    return [pixels.numpy() for _, pixels in copies]
 
 
 def to_host(values: Tensor) -> Tensor:

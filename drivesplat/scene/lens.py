@@ -9,7 +9,8 @@
 - radius_to_angle: c1, c2, …: angle c1 r + c2 r² + … in radians at the radius r in pixels ("pixel distance to angle").
 - mei: xi, k1, k2, p1, p2 of Mei and Rives (2007), as cv2.omnidir and KITTI-360's fisheyes.
 
-Radii of the two polynomials are measured along x; K scales y by fy / fx.
+Radii of the two polynomials are measured along x; K scales y by fy / fx. For these two K may also shear the image:
+K[0, 1] / fx and K[1, 0] / fx are pixels along x and y for each pixel of the radius along y and x.
 """
 
 import cv2
@@ -47,6 +48,12 @@ def central_intrinsics(camera: Camera) -> Float[np.ndarray, "3 3"]:
     return k
 
 
+def image_axes(intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "2 2"]:
+    """The matrix that maps the offset of a pixel from the principal point, in units of the pixels along x, to that in
+    the image: the identity for square pixels without shear."""
+    return intrinsics[:2, :2] / intrinsics[0, 0]
+
+
 def pixels_of(camera: Camera, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """The pixels at which a camera images directions (x right, y down, z forward, of any length): OpenCV's, integer at
     pixel centres, also outside the image. NaN where it images none: behind a pinhole, and from the angle on at which
@@ -74,7 +81,7 @@ def pixels_of(camera: Camera, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
     else:
         along = rays[:, :2] / np.maximum(across, 1e-12)[:, None]
         radius = np.interp(angles, tested, radii)
-        pixels = radius[:, None] * along * [1.0, k[1, 1] / k[0, 0]] + k[:2, 2]
+        pixels = (radius[:, None] * along) @ image_axes(k).T + k[:2, 2]
     return np.where(seen[:, None], pixels, np.nan)
 
 
@@ -110,8 +117,7 @@ def _turns(
 ) -> tuple[Float64[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
     """The angles (radians) by which the optical axis is turned to the right and down towards pixels, and whether a
     pixel has such a direction."""
-    k = central_intrinsics(camera)
-    across = (pixels - camera.intrinsics[:2, 2]) / [1.0, k[1, 1] / k[0, 0]]
+    across = np.linalg.solve(image_axes(camera.intrinsics), (pixels - camera.intrinsics[:2, 2]).T).T
     radius = np.linalg.norm(across, axis=1)
     known, radii = radial_profile(camera)
     angles = np.interp(radius, radii, known)

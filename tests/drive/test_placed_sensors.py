@@ -334,7 +334,6 @@ def camera_with(coefficients: list[float], model: str, **lens) -> "drivesplat.Ca
         (lambda _: drivesplat.Lidar.spinning([0.0], 8, beam_spread=(0.3, 0.3)), RequestError, ["beam_spread"]),
         (lambda _: camera_with([0.1], "opencv"), RequestError, ["4 or 5"]),
         (lambda _: camera_with([np.nan] * 4, "fisheye"), RequestError, ["finite"]),
-        (lambda _: camera_with([0.0] * 4, "fisheye", readout_s=[0.0, 0.1, 0.0]), RequestError, ["global shutter"]),
     ],
 )  # fmt: skip
 def test_what_sensors_cannot_be_is_one_sentence(call, error, words, drive):
