@@ -20,6 +20,7 @@ _PUBLIC = {
     "TrainedDrive": ("drivesplat.drive.trained_drive", "TrainedDrive"),
     "Camera": ("drivesplat.drive.cameras", "PoseableCamera"),
     "LiveServer": ("drivesplat.drive.live_server", "LiveServer"),
+    "SensorServer": ("drivesplat.serve.server", "SensorServer"),
     "Lidar": ("drivesplat.drive.lidars", "PoseableLidar"),
 }
 

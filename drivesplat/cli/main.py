@@ -17,7 +17,7 @@ from pathlib import Path
 
 import drivesplat
 from drivesplat import SNAKEFILE, WORKFLOW
-from drivesplat.cli import assets
+from drivesplat.cli import assets, serve
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import default_config, in_this_copy, of_the_workflow
@@ -82,6 +82,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     live.add_argument("--port", type=int, default=8080, help="port to listen at (8080)")
     live.add_argument("--device", default="any", choices=["any", "cuda", "cpu"], help="any: a GPU where there is one")
 
+    serve.add_parser(commands)
     assets.add_parser(commands)
 
     mcap = commands.add_parser("mcap", help="write a drive folder as an MCAP file for ROS 2 (docs/mcap.md)")
@@ -138,6 +139,8 @@ def run_command(parsed: argparse.Namespace) -> int:
         counts = write_mcap(parsed.folder, parsed.out, parsed.scans)
         print(f"{parsed.out}: {sum(counts.values())} messages on {', '.join(counts)}")
         return 0
+    if parsed.command == serve.COMMAND:
+        return serve.run_serve(parsed)
     if parsed.command == "view":
         drives = [drivesplat.open(folder, parsed.device) for folder in parsed.folders]
         server = drivesplat.LiveServer(drives, parsed.host, parsed.port, parsed.edits)

@@ -1,0 +1,59 @@
+"""Images as bytes of a request's format."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from drivesplat.rendering.color_bytes import to_uint8
+from drivesplat.serve.messages import wire
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """A `wire.ImageFormat`, and the quality of a JPEG, 1 to 100."""
+
+    format: int
+    quality: int
+
+
+def _jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    return _by_opencv(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def _png(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    return _by_opencv(".png", image, [])
+
+
+def _planar(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    return np.moveaxis(image, -1, 0).tobytes()
+
+
+def _by_opencv(suffix: str, image: np.ndarray, options: list[int]) -> bytes:
+    return cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)[1].tobytes()
+
+
+FORMATS: dict[int, Callable[[UInt8[np.ndarray, "h w 3"], int], bytes]] = {
+    wire.ImageFormat.PNG: _png,
+    wire.ImageFormat.JPEG: _jpeg,
+    wire.ImageFormat.RGB_UINT8_PLANAR: _planar,
+}
+"""The formats that are served: what encodes an image (h, w, 3), red first, at a quality."""
+
+
+def encoded(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding) -> bytes:
+    """An image in a format. It releases Python's lock for most of its time: images are encoded in threads."""
+    return FORMATS[encoding.format](image, encoding.quality)
+
+
+def jpeg_on_device(image: Float[Tensor, "h w 3"], quality: int) -> bytes:
+    """A JPEG of colours in [0, 1], encoded where they are: on a GPU by nvJPEG, without a copy of the image."""
+    from torchvision.io import encode_jpeg  # here: it takes long to import
+
+    finite = torch.isfinite(image).all()
+    assert finite
+    return encode_jpeg(to_uint8(image).permute(2, 0, 1).contiguous(), quality=quality).cpu().numpy().tobytes()

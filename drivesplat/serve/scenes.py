@@ -1,0 +1,170 @@
+"""The trained drives that are served: which there are, and which are loaded."""
+
+import gc
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from drivesplat.drive.trained_drive import TrainedDrive, open_drive
+from drivesplat.errors import DeviceError, RequestError
+from drivesplat.model.checkpoint import model_file
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
+from drivesplat.serve.faults import ServiceError, as_service_errors
+from drivesplat.serve.poses import FrameTimes
+from drivesplat.trajectories.edited_actors import EditedActor
+
+CHECKPOINT, MASK_FILE = "checkpoint.npz", "own_car.json"
+
+
+@dataclass(frozen=True)
+class DriveSource:
+    """A trained drive that can be opened: the result folder of a `method` of a `scene`."""
+
+    scene: str
+    method: str
+    folder: Path
+
+    @classmethod
+    def of(cls, folder: Path) -> "DriveSource":
+        """The source of a method's result folder."""
+        resolved = folder.resolve()
+        return cls(resolved.parent.name, resolved.name, folder)
+
+    @property
+    def full_name(self) -> str:
+        """Scene and method."""
+        return f"{self.scene}/{self.method}"
+
+    @cached_property
+    def ego_mask(self) -> EgoMask:
+        """The outlines of the vehicle's own body, which are read without the model."""
+        file = self.folder.resolve().parent / MASK_FILE
+        return read_ego_mask(file)[0] if file.is_file() else NO_EGO_MASK
+
+    def open(self, device: str) -> TrainedDrive:
+        """Reads the model onto a device."""
+        return open_drive(self.folder, device)
+
+
+def find_sources(paths: Iterable[Path]) -> dict[str, DriveSource]:
+    """The trained drives of result folders (all trained methods of all scenes below) and of methods' folders, by scene
+    id: the name of the scene, or `scene/method` where several methods of a scene are served.
+
+    Raises RequestError for a path without any, and for two scenes of one name in different folders.
+    """
+    sources = {source.folder.resolve(): source for path in paths for source in _sources_of(path)}
+    methods = Counter(source.scene for source in sources.values())
+    found: dict[str, DriveSource] = {}
+    for source in sources.values():
+        own = source.scene if methods[source.scene] == 1 else source.full_name
+        if own in found:
+            raise RequestError(
+                f"{found[own].folder} and {source.folder} are both the scene {own}: serve one of them, or rename "
+                "a folder"
+            )
+        found[own] = source
+    return found
+
+
+def _sources_of(path: Path) -> Iterator[DriveSource]:
+    """The trained drives of one argument. A scene that comes as a file, as `*.usdz`, is opened here."""
+    if path.is_file():
+        raise RequestError(f"{path} is a file: name a folder of results, such as results, or results/demo/street")
+    folders = [file.parent for depth in ("", "*/", "*/*/") for file in sorted(path.glob(f"{depth}{CHECKPOINT}"))]
+    if not folders:
+        model_file(path)  # a training that runs; raises RequestError for a folder without any
+        folders = [path]
+    yield from map(DriveSource.of, folders)
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedDrive:
+    """A drive in memory, with the actors that requests can place by their ids."""
+
+    drive: TrainedDrive
+    actors: Mapping[str, EditedActor]
+
+    def seconds(self, times: FrameTimes) -> float:
+        """The time of the drive that a frame shows, seconds since its first image. Raises ServiceError (OUT_OF_RANGE)
+        for a time outside of the recording."""
+        scene = self.drive.scene
+        doubled = 2 * times.start_us if times.at_start else times.start_us + times.end_us
+        time = scene.seconds(doubled // 2) + 0.5e-6 * (doubled % 2)
+        if not 0.0 <= time <= self.drive.duration:
+            stamps = self.recorded_us
+            raise ServiceError(
+                "OUT_OF_RANGE",
+                f"{self.drive.where} was recorded from {stamps[0]} to {stamps[1]} us, and the frame is at "
+                f"{doubled / 2:.1f} us",
+            )
+        return time
+
+    @property
+    def recorded_us(self) -> tuple[int, int]:
+        """The first and the last microsecond of the recording."""
+        scene = self.drive.scene
+        stamps = [int(recording.timestamp) for recording in scene.frames or scene.sweeps]
+        return min(stamps), max(stamps)
+
+
+class LoadedDrives:
+    """The drives that are in memory, at most `max_loaded`: the one that has been used longest ago makes place. Only one
+    thread at a time may call `get`."""
+
+    def __init__(self, offered: Mapping[str, DriveSource], device: str, max_loaded: int):
+        """`device` is 'cpu' or 'cuda'."""
+        self.offered, self.max_loaded = offered, max_loaded
+        self._device = device
+        self._aliases = {source.full_name: name for name, source in offered.items()}
+        self._loaded: dict[str, LoadedDrive] = {}  # the one used last is the last
+
+    def name_of(self, scene_id: str) -> str:
+        """The scene id of a request as it is offered; `scene/method` also names a scene of one method. Raises
+        ServiceError (NOT_FOUND) for a scene that is not served."""
+        name = scene_id if scene_id in self.offered else self._aliases.get(scene_id)
+        if name is None:
+            raise ServiceError(
+                "NOT_FOUND", f"there is no scene {scene_id[:80]!r}; there are: {', '.join(self.offered)}"
+            )
+        return name
+
+    @property
+    def names(self) -> list[str]:
+        """The scene ids of the drives in memory."""
+        return list(self._loaded)
+
+    def get(self, scene_id: str) -> LoadedDrive:
+        """A drive, which is loaded if it is not in memory. Raises ServiceError for an unknown scene, a result that
+        cannot be read, and exhausted memory."""
+        name = self.name_of(scene_id)
+        if name not in self._loaded:
+            while len(self._loaded) >= self.max_loaded:
+                self._unload()
+            with as_service_errors():
+                self._loaded[name] = self._opened(name)
+        else:
+            self._loaded[name] = self._loaded.pop(name)
+        return self._loaded[name]
+
+    def _opened(self, name: str) -> LoadedDrive:
+        """Opens a drive; where memory is exhausted, again without any other."""
+        try:
+            drive = self.offered[name].open(self._device)
+        except DeviceError:
+            if not self._loaded:
+                raise
+            while self._loaded:
+                self._unload()
+            drive = self.offered[name].open(self._device)
+        return LoadedDrive(drive, {actor.id: actor for actor in drive.edited_actors})
+
+    def _unload(self) -> None:
+        """Drops the drive that has been used longest ago."""
+        del self._loaded[next(iter(self._loaded))]
+        gc.collect()  # models are parts of reference cycles
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
