@@ -22,7 +22,7 @@ SERVICE = "nre.grpc.protos.sensorsim.SensorsimService"
 """The full name of the service."""
 
 
-def _loaded() -> tuple[DescriptorPool, FileDescriptorSet]:
+def _loaded() -> tuple[Any, Any]:
     pool, files = DescriptorPool(), FileDescriptorSet.FromString(COMPILED.read_bytes())
     for file in files.file:
         pool.AddSerializedFile(file.SerializeToString())

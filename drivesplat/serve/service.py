@@ -164,7 +164,7 @@ class SensorService:
     def _images(self, messages: Sequence[Any], active: IsActive) -> list[Answered[bytes]]:
         """The images of requests; those of one world are rendered together, and all are encoded side by side."""
         reader = RequestReader()
-        read = [_attempt(partial(reader.image, message)) for message in messages]
+        read = [_attempt(partial(self._read, reader, message)) for message in messages]
         require_affordable(read, self.options.max_loaded)
         groups: dict[WorldKey, list[int]] = {}
         for number, one in enumerate(read):
@@ -180,6 +180,11 @@ class SensorService:
                     pictures.update(zip(numbers, each, strict=True))
         waiting = [self._encoders.submit(self._encoded, read[i], pictures[i]) for i in range(len(read))]
         return [_attempt(future.result) for future in waiting]
+
+    def _read(self, reader: RequestReader, message: Any) -> ImageRequest:
+        """A request for an image of a scene that is served."""
+        self._drives.name_of(message.scene_id)
+        return reader.image(message)
 
     def _rendered(self, requests: Sequence[ImageRequest]) -> list[Picture]:
         """The images of requests of one world, rendered by the thread that uses the device."""

@@ -1,0 +1,210 @@
+"""The server: its address, encryption, health, figures, its end, several clients, and a policy that drives by it."""
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import grpc
+import numpy as np
+import pytest
+from carla_driver_interface._proto import common_pb2, egodriver_pb2, sensorsim_pb2
+from carla_driver_interface.driver import BaseDriver
+from carla_driver_interface.geometry import Pose, Trajectory, waypoints_to_proto
+from carla_driver_interface.inprocess import in_process_channel
+from carla_driver_interface.policies.route_follower import RouteFollowerPolicy
+from carla_driver_interface.protocol import EgodriverServiceStub
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from helpers import REPOSITORY
+from helpers.patience import PATIENCE_S, wait_until
+from helpers.served_drives import CAMERA, SERVICE, SensorClient, decoded, image_request, message_of, pose_of, served
+
+import drivesplat
+from drivesplat.cli.main import main
+from drivesplat.errors import RequestError
+from drivesplat.settings.simulate import VehicleSettings
+from drivesplat.simulate.vehicle import RecordedGround, advanced, control_towards, state_of
+
+EMPTY = common_pb2.Empty()
+
+
+@pytest.fixture(scope="module")
+def stamp(street) -> int:
+    return street.scene.frames[2].timestamp
+
+
+@pytest.fixture(scope="module")
+def sound(stamp, street):
+    pose = street.camera_to_world(CAMERA, street.scene.seconds(stamp))
+    return image_request("0002", (stamp, stamp), (pose, pose))
+
+
+def test_two_clients_at_once_get_equal_bytes(results, sound, stamp):
+    """Requests for other scenes and other cameras interleave with theirs."""
+    other = image_request("0001/street", (stamp, stamp), (np.eye(4), np.eye(4)), image_format=sensorsim_pb2.JPEG)
+    with served(results, max_loaded=1) as (running, client), ThreadPoolExecutor(6) as threads:
+        expected = [client.render_rgb(request).image_bytes for request in (sound, other)]
+        clients = [SensorClient(running.address) for _ in range(2)]
+        calls = [(clients[i % 2], (i // 2) % 2) for i in range(12)]
+        found = [*threads.map(lambda call: call[0].render_rgb([sound, other][call[1]]).image_bytes, calls)]
+        assert found == [expected[which] for _, which in calls]
+        for own in clients:
+            own.channel.close()
+
+
+def test_health_and_figures(results, sound):
+    with served(results / "0002", metrics_port=0) as (running, client):
+        health = health_pb2_grpc.HealthStub(client.channel)
+        for service in ("", SERVICE.full_name):
+            status = health.Check(health_pb2.HealthCheckRequest(service=service)).status
+            assert status == health_pb2.HealthCheckResponse.SERVING
+        size = len(client.render_rgb(sound).image_bytes)
+        with pytest.raises(grpc.RpcError):
+            client.render_rgb(sensorsim_pb2.RGBRenderRequest())
+        assert running.metrics_address.startswith("http://127.0.0.1:")
+        wait_until(lambda: 'code="NOT_FOUND"' in _page(running))
+        page = _page(running)
+        assert 'drivesplat_rpc_seconds_count{code="OK",rpc="render_rgb"} 1.0' in page
+        assert f'drivesplat_encoded_bytes_total{{format="PNG"}} {float(size)}' in page
+        assert "drivesplat_waiting_requests 0.0" in page and "drivesplat_loaded_scenes 1.0" in page
+        assert float(re.search(r"^drivesplat_model_seconds_total (\S+)", page, re.MULTILINE)[1]) > 0.0
+
+
+def _page(running) -> str:
+    with urllib.request.urlopen(running.metrics_address) as answer:
+        return answer.read().decode()
+
+
+def test_connections_can_be_encrypted(results, tmp_path):
+    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate]
+    try:
+        subprocess.run([*command, "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"],
+                       check=True, capture_output=True)  # fmt: skip
+    except FileNotFoundError:
+        pytest.skip("openssl is missing")
+    with served(results / "0002", tls=(certificate, key)) as (running, plain):
+        with pytest.raises(grpc.RpcError):
+            plain.get_version(EMPTY)
+        encrypted = SensorClient(running.address, certificate.read_bytes())
+        assert encrypted.get_version(EMPTY).version_id
+        encrypted.channel.close()
+
+
+def test_what_cannot_be_served_is_one_sentence(results, tmp_path, monkeypatch):
+    one = results / "0002"
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        for options, words in (
+            ({"address": address}, address), ({"address": "nowhere"}, "--address"),
+            ({"address": "h:99999"}, "--address"),
+            ({"address": "host.invalid:1"}, r"host\.invalid"), ({"max_loaded": 0}, "--max-loaded"),
+            ({"metrics_port": taken.getsockname()[1]}, "--metrics-port"),
+            ({"tls": (tmp_path / "none.pem", tmp_path / "none.pem")}, r"none\.pem"),
+        ):  # fmt: skip
+            with pytest.raises(RequestError, match=words) as raised:
+                drivesplat.SensorServer([one], **{"address": "127.0.0.1:0", "device": "cpu", **options})
+            assert "\n" not in str(raised.value)
+    monkeypatch.setitem(sys.modules, "grpc", None)
+    with pytest.raises(RequestError, match=r"pip install 'drivesplat\[serve\]'"):
+        drivesplat.SensorServer([one], "127.0.0.1:0", device="cpu")
+
+
+def test_the_command_refuses_half_of_an_encryption(results, capsys):
+    assert main(["serve", str(results), "--tls-cert", "cert.pem"]) == 1
+    assert "--tls-key" in capsys.readouterr().err
+
+
+def test_a_signal_ends_the_command_when_calls_have_been_answered(results, sound):
+    command = [sys.executable, "-m", "drivesplat.cli.main", "serve", str(results / "0002"), "--address", "127.0.0.1:0"]
+    process = subprocess.Popen([*command, "--device", "cpu"], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
+    try:
+        said = [process.stdout.readline() for _ in range(2)]
+        assert "slow" in said[0]
+        address = re.search(r"serve: (\S+) serves 0002;", said[1])[1]
+        client = SensorClient(address)
+        pending = client.render_rgb.future(sound)  # loads the scene, compiles kernels
+        health = health_pb2_grpc.HealthStub(client.channel)
+        wait_until(lambda: health.Check(health_pb2.HealthCheckRequest()).status)
+        wait_until(lambda: client.get_available_scenes(EMPTY).scene_ids)
+        process.send_signal(signal.SIGTERM)
+        assert "ending" in process.stdout.readline()
+        assert decoded(pending.result(PATIENCE_S).image_bytes).shape == (48, 64, 3)
+        assert process.wait(PATIENCE_S) == 0
+        client.channel.close()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+# ---- a policy
+
+
+class Watching(RouteFollowerPolicy):
+    """The reference policy, which keeps what its camera showed."""
+
+    def __init__(self):
+        super().__init__(cruise_speed_mps=5.0)
+        self.seen: list[np.ndarray] = []
+
+    def on_frame(self, session, frame) -> None:
+        self.seen.append(frame.as_array())
+
+
+def test_a_policy_drives_by_the_images_of_the_service(results, street):
+    """AlpaSim's order of calls: cameras, then in each step images, motion and route to the policy, whose plan a
+    kinematic bicycle follows."""
+    step_s, limits, policy = 0.1, VehicleSettings(), Watching()
+    assert isinstance(policy, BaseDriver)
+    driver = EgodriverServiceStub(in_process_channel(policy, "alpasim"))
+    with served(results / "0001/street", unlisted="recorded") as (_, client):
+        (scene_id,) = client.get_available_scenes(EMPTY).scene_ids
+        (camera,) = client.get_available_cameras(
+            sensorsim_pb2.AvailableCamerasRequest(scene_id=scene_id)
+        ).available_cameras  # fmt: skip
+        request = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=scene_id)
+        recorded = client.get_available_trajectories(request).available_trajectories[0].trajectory.poses
+        path, start_us = np.stack([pose_of(own.pose) for own in recorded]), recorded[0].timestamp_us
+        ground, ego = RecordedGround(path), state_of(path[0], 4.0, 0.0, limits.wheelbase)
+        begin = egodriver_pb2.DriveSessionRequest(session_uuid="a", random_seed=0)
+        begin.rollout_spec.vehicle.available_cameras.append(camera)
+        driver.start_session(begin)
+        for step in range(15):
+            now_us, rig = start_us + step * 100_000, ground.ego_to_world(ego)
+            pose = rig @ pose_of(camera.rig_to_camera)
+            shown = image_request(scene_id, (now_us, now_us), (pose, pose), spec=camera.intrinsics)
+            image = egodriver_pb2.RolloutCameraImage(session_uuid="a")
+            image.camera_image.logical_id = camera.logical_id
+            image.camera_image.frame_start_us = image.camera_image.frame_end_us = now_us
+            image.camera_image.image_bytes = client.render_rgb(shown).image_bytes
+            driver.submit_image_observation(image)
+            motion = egodriver_pb2.RolloutEgoTrajectory(session_uuid="a")
+            motion.trajectory.poses.add(pose=message_of(rig), timestamp_us=now_us)
+            motion.dynamic_states.add().linear_velocity.x = ego.speed
+            driver.submit_egomotion_observation(motion)
+            ahead = Pose.from_proto(message_of(rig)).inverse().transform_points(path[:, :3, 3])
+            route = egodriver_pb2.Route(timestamp_us=now_us, waypoints=waypoints_to_proto(ahead[ahead[:, 0] > 0.0]))
+            driver.submit_route(egodriver_pb2.RouteRequest(session_uuid="a", route=route))
+            times = {"time_now_us": now_us, "time_query_us": now_us + 100_000}
+            plan = Trajectory.from_proto(driver.drive(egodriver_pb2.DriveRequest(session_uuid="a", **times)).trajectory)
+            wanted = [plan.interpolate(now_us + 100_000 * (i + 1)) for i in range(10)]
+            local = [Pose.from_proto(message_of(rig)).inverse() @ own for own in wanted]
+            poses = np.array([[*own.position[:2], own.yaw] for own in local])
+            ego = advanced(ego, *control_towards(ego, poses, step_s, limits), step_s, limits)
+        driver.close_session(egodriver_pb2.DriveSessionCloseRequest(session_uuid="a"))
+    driven = ground.ego_to_world(ego)[:3, 3]
+    assert np.linalg.norm(path[:, :3, 3] - driven, axis=1).min() < 1.0 and driven[0] > 4.0
+    assert len(policy.seen) == 15 and all(image.std() > 5.0 for image in policy.seen)
+    assert any(np.abs(a.astype(int) - b).max() > 20 for a, b in zip(policy.seen, policy.seen[1:], strict=False))
+
+
+def test_a_service_may_be_started_by_a_relative_path(results, monkeypatch):
+    monkeypatch.chdir(results / "0002/street")
+    with served(Path()) as (running, _):
+        assert running.scenes == ["0002"]
