@@ -59,8 +59,8 @@ class SteadyPoses:
 
 
 def steady_poses(pairs: Sequence[Any], names: Sequence[str], times: FrameTimes) -> SteadyPoses:
-    """What moves from the first pose of a `PosePair` to the second during a frame: positions linearly, rotations by
-    slerp. A frame without length has no velocities.
+    """Motions from the first pose of each `PosePair` to the second during a frame: positions are linear in time,
+    rotations a slerp. A frame without length has no velocities.
 
     Raises ServiceError that names, of `names`, the first whose poses are missing or malformed.
     """
