@@ -166,7 +166,8 @@ class RecordedDrive:
             )
 
     @cached_property
-    def _scans(self) -> ScanRecords:
+    def scans(self) -> ScanRecords:
+        """The recorded scans. Raises RequestError where none were prepared."""
         if not self.scans_file.is_file():
             raise RequestError(
                 f"{self.where}: {self.scans_file} is missing, which has the rays of recorded LiDARs; give a LiDAR of "
@@ -178,7 +179,7 @@ class RecordedDrive:
         """The scan of a LiDAR that is nearest in time. Raises RequestError for an unknown LiDAR."""
         if lidar not in self.lidars:
             raise RequestError(f"{self.where} has no LiDAR {lidar!r}; there are: {', '.join(self.lidars) or 'none'}")
-        own = [scan for scan in self._scans.scans if scan.lidar == lidar]
+        own = [scan for scan in self.scans.scans if scan.lidar == lidar]
         if not own:
             raise RequestError(f"{self.where}: {self.scans_file} has no scan of {lidar}: its rays are not known")
         return min(own, key=lambda scan: abs(scan.seconds - time))

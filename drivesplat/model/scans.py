@@ -86,7 +86,7 @@ def scan_picture(sets: GaussianSets, view: ScanView, before: Float[Tensor, "b a"
         if own.lidar_logits is None:
             raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
         values.append(lidar_response(own.lidar_logits, own.means, sensor))
-    rendering = _rasterized(sets.shapes, view, torch.cat(values), before)
+    rendering = composited_scan(sets.shapes, view, torch.cat(values), before)
     intensity, returned = rendering.values.unbind(dim=-1)
     if view.blocked is not None:
         returned = torch.where(view.blocked, 0.0, returned)
@@ -97,12 +97,13 @@ def scan_picture(sets: GaussianSets, view: ScanView, before: Float[Tensor, "b a"
 
 def group_met(gaussians: Gaussians, view: ScanView, groups: Int[Tensor, " n"]) -> Int[Tensor, "b a"]:
     """The one of `groups`, numbers from -1, whose Gaussians contribute most to each ray; -1 where nothing is met."""
-    return strongest_group(groups, lambda shares: _rasterized(gaussians, view, shares.to(gaussians.means)).values)
+    return strongest_group(groups, lambda shares: composited_scan(gaussians, view, shares.to(gaussians.means)).values)
 
 
-def _rasterized(
+def composited_scan(
     gaussians: Gaussians, view: ScanView, values: Float[Tensor, "n v"], before: Float[Tensor, "b a"] | None = None
 ) -> ScanRendering:
+    """A rendering of `values` of Gaussians along the rays of a scan; with `alpha_before` the ranges `before` (metres)."""
     return rasterize_scan(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, values,
         view.world_to_sensor, view.rays, beam_spread=view.beam_spread,

@@ -88,7 +88,8 @@ class SimulationSettings(Settings):
     outputs: tuple[Literal["rgb", "depth", "instance"], ...] = ("rgb",)
     """What a policy sees of a camera."""
     validity: bool = False
-    """Whether a policy sees how far the image of the first camera can be trusted. It takes about 30 ms a step."""
+    """Whether a policy sees how far the image of the first camera, and the scan, can be trusted. An image takes about 30
+    ms a step."""
     lidar: str | None = None
     """The LiDAR that a policy sees. null = none."""
     max_boxes: int = Field(32, ge=1, le=1000)
@@ -101,9 +102,9 @@ class SimulationSettings(Settings):
     traffic: TrafficSettings = Field(default_factory=TrafficSettings)
 
     @model_validator(mode="after")
-    def _has_an_image_to_judge(self) -> "SimulationSettings":
-        if self.validity and self.cameras == ():
-            raise ValueError("'validity' is that of an image: name a camera in 'cameras'")
+    def _has_something_to_judge(self) -> "SimulationSettings":
+        if self.validity and self.cameras == () and self.lidar is None:
+            raise ValueError("'validity' is that of an image or a scan: name a camera in 'cameras', or a 'lidar'")
         return self
 
     @field_validator("cameras", "outputs")

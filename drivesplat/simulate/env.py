@@ -12,7 +12,7 @@ from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.errors import RequestError
 from drivesplat.settings.simulate import SimulationSettings
 from drivesplat.simulate.simulation import BOX_COLUMNS, EGO_COLUMNS, Observation, Simulation
-from drivesplat.simulate.validity import ViewKnowledge
+from drivesplat.simulate.trust import Trust
 
 
 class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -37,6 +37,7 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
         edits: list[dict[str, Any]] | None = None,
         render_mode: str | None = None,
         device: str = "any",
+        trust: Trust | None = None,
         **settings: Any,
     ):
         """
@@ -45,6 +46,8 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
             edits: Steps of an edit, as in an edits file.
             render_mode: 'rgb_array': `render` gives the image of the first camera.
             device: 'any', 'cuda' or 'cpu', for a drive that is opened here.
+            trust: With `validity`, that of the same drive and edits, to be shared with other environments; None: made
+                here.
             settings: Those of `SimulationSettings`, such as `rate_hz=20` or `traffic={"vehicles": "replay"}`.
 
         Raises RequestError and ConfigError for what does not fit the drive.
@@ -53,10 +56,7 @@ class DriveEnv(gymnasium.Env[Observation, np.ndarray]):
         self.simulation = Simulation(
             opened if not edits else opened.edited(edits), SimulationSettings.model_validate(settings)
         )
-        if self.simulation.settings.validity:
-            known = ViewKnowledge.of_drive(self.simulation.drive)
-            run = self.simulation
-            run.trust = lambda: known.validity(run.world(), run.view()).validity
+        (Trust(self.simulation.drive) if trust is None else trust).inform(self.simulation)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise RequestError(f"there is no render mode {render_mode!r}; there is: rgb_array")
         self.render_mode, self.settings = render_mode, self.simulation.settings
@@ -140,13 +140,14 @@ def vector_env(
     device: str = "any",
     **settings: Any,
 ) -> SyncVectorEnv:
-    """So many environments of one drive, whose model is in memory once. Episodes begin anew at the step after their
-    end.
+    """So many environments of one drive, whose model, and what tells its validity, is in memory once. Episodes begin
+    anew at the step after their end.
 
     >>> envs = vector_env("results/demo/street", 4, cameras=("CAM_FRONT",), width=200)
     """
     opened = drive if isinstance(drive, TrainedDrive) else open_drive(drive, device)
     changed = opened if not edits else opened.edited(edits)
+    trust = Trust(changed)
     return SyncVectorEnv(
-        [lambda: DriveEnv(changed, **settings)] * count, autoreset_mode=AutoresetMode.NEXT_STEP
-    )  # fmt: skip
+        [lambda: DriveEnv(changed, trust=trust, **settings)] * count, autoreset_mode=AutoresetMode.NEXT_STEP
+    )

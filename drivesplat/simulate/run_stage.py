@@ -17,12 +17,15 @@ from drivesplat.io.video import write_video
 from drivesplat.settings.simulate import RunJob
 from drivesplat.simulate.episodes import Episode, driven_episode
 from drivesplat.simulate.policies import Policy, policy_of, settings_for
+from drivesplat.simulate.scan_validity import ScanValidity
 from drivesplat.simulate.scores import run_scores
 from drivesplat.simulate.simulation import Simulation
-from drivesplat.simulate.validity import ViewKnowledge, ViewValidity
+from drivesplat.simulate.trust import Trust
+from drivesplat.simulate.validity import ViewValidity
 
 BELIEVABLE = 0.5
-"""The validity below which an image is not believed: 6 dB worse than held-out images, or half of it never seen."""
+"""The validity below which an image or a scan is not believed: 6 dB worse than held-out images, twice the range error of
+held-out scans, or half of it never seen."""
 METRES_AHEAD, METRES_BEHIND = 45.0, 15.0
 """What the view from above shows along the heading of the ego vehicle."""
 GROUND, PATH, EGO, OTHER, TOUCHED = (38, 40, 44), (90, 150, 230), (80, 200, 120), (190, 190, 195), (235, 80, 70)
@@ -44,9 +47,8 @@ def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
         policy, refused = None, str(error)
     simulation = Simulation(edited, settings_for(run.simulation, policy))
     pictures = RunFilm(simulation, run.film_width)
-    known = None if pictures.camera is None else ViewKnowledge.of_drive(edited)
-    if known is not None and run.simulation.validity:
-        simulation.trust = lambda: known.validity(simulation.world(), simulation.view()).validity
+    trust = Trust(edited)
+    trust.inform(simulation)
     rate = max(1, round(run.simulation.rate_hz))
     driven: list[_Driven] = []
     if policy is None:
@@ -54,7 +56,7 @@ def drive_runs(drive: TrainedDrive, job: RunJob, film: Path) -> dict[str, Any]:
     else:
         for number, seed in enumerate(run.seeds):  # a policy of its own for each: one that hangs keeps its thread
             own = policy if number == 0 else policy_of(run.policy, run.policy_settings)
-            driven.append(_Driven(simulation, own, seed, run.timeout_s, pictures, known, filmed=number == 0))
+            driven.append(_Driven(simulation, own, seed, run.timeout_s, pictures, trust, filmed=number == 0))
         write_video(film, driven[0].frames, pictures.size, rate, job.crf)
     failures = (own.episode.failed for own in driven)
     return {
@@ -146,7 +148,7 @@ class RunFilm:
 
 
 class _Driven:
-    """An episode with the validity of its images, and with `frames` of its film if it is `filmed`."""
+    """An episode with the validity of its images and scans, and with `frames` of its film if it is `filmed`."""
 
     def __init__(
         self,
@@ -155,16 +157,17 @@ class _Driven:
         seed: int,
         timeout_s: float,
         pictures: RunFilm,
-        known: ViewKnowledge | None,
+        trust: Trust,
         filmed: bool,
     ):
         self.frames: list[np.ndarray] = []
         self._views: list[ViewValidity] = []
+        self._scans: list[ScanValidity] = []
 
         def look(now: Simulation) -> None:
-            own = None if known is None else known.validity(now.world(), now.view(pictures.camera))
-            if own is not None:
-                self._views.append(own)
+            own, scan = None if pictures.camera is None else trust.image(now, pictures.camera), trust.scan(now)
+            self._views += [] if own is None else [own]
+            self._scans += [] if scan is None else [scan]
             if filmed:
                 touched = now.contacts()
                 note = f"contact with {', '.join(touched)}" if touched else ""
@@ -175,21 +178,23 @@ class _Driven:
             self.frames.append(pictures.frame(simulation, "a failed policy"))
 
     def figures(self) -> dict[str, Any]:
-        """The episode as plain data: its scores, the path of the ego vehicle, how far its images can be trusted, and
-        the seconds up to which they can (None: to the end)."""
-        run, views = self.episode.run, self._views
+        """The episode as plain data: its scores, the path of the ego vehicle, how far its images and scans can be
+        trusted, and the seconds up to which all of them can (None: to the end)."""
+        run, views, scans = self.episode.run, self._views, self._scans
         headings = np.arctan2(run.ego_to_world[:, 1, 0], run.ego_to_world[:, 0, 0])
         path = np.column_stack([run.seconds, run.ego_to_world[:, :3, 3], headings, run.speed, run.steering])
-        doubtful = np.flatnonzero([view.validity < BELIEVABLE for view in views])
-        expected = [view.expected_psnr for view in views]
+        doubtful = [i for own in (views, scans) for i, one in enumerate(own) if one.validity < BELIEVABLE]
+        expected, errors = [view.expected_psnr for view in views], [scan.expected_range_error for scan in scans]
         return {
             "seed": self.episode.seed,
             "ended": self.episode.ended,
             "failed": self.episode.failed,
             "scores": run_scores(run).summary,
-            "believable_s": float(run.seconds[doubtful[0]] - run.seconds[0]) if len(doubtful) else None,
+            "believable_s": float(run.seconds[min(doubtful)] - run.seconds[0]) if doubtful else None,
             "validity": [round(view.validity, 3) for view in views],
             "expected_psnr": [None if value is None else round(value, 2) for value in expected],
+            "scan_validity": [round(scan.validity, 3) for scan in scans],
+            "expected_range_error": [None if value is None else round(value, 4) for value in errors],
             "path_columns": ["seconds", "x", "y", "z", "yaw", "speed", "steering"],
             "path": np.round(path, 4).tolist(),
         }

@@ -1,17 +1,21 @@
-"""From where training images saw what a model shows: its static Gaussians, its objects, and the sky."""
+"""From where training images saw what a model shows: its static Gaussians, its objects, and the sky. `Sides` and all that
+makes them hold for LiDAR scans in place of images, too, of which a radian has one pixel."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.drive.world_actor import WorldActor
+from drivesplat.editing.placed_model import PlacedModel
+from drivesplat.errors import RequestError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
@@ -42,6 +46,7 @@ SKY_BINS = (60, 120)
 """Bins of the sky in elevation and azimuth, of 3 degrees."""
 SKY_ALPHA = 0.5
 """Alpha below which a pixel shows the sky."""
+Item = TypeVar("Item")
 
 
 def reduced(view: View, max_side: int) -> View:
@@ -176,9 +181,13 @@ class SeenSky:
 
 def training_images(drive: TrainedDrive) -> list[int]:
     """The indices of at most MAX_IMAGES training images, evenly spread."""
-    images = drive.record.train_images
-    chosen = np.linspace(0, len(images) - 1, min(len(images), MAX_IMAGES)).round().astype(int)
-    return [images[i] for i in chosen]
+    return evenly_chosen(drive.record.train_images)
+
+
+def evenly_chosen(items: Sequence[Item]) -> list[Item]:
+    """At most MAX_IMAGES of these, evenly spread."""
+    chosen = np.linspace(0, len(items) - 1, min(len(items), MAX_IMAGES)).round().astype(int)
+    return [items[i] for i in chosen]
 
 
 def recorded_image(drive: TrainedDrive, index: int) -> Path:
@@ -227,13 +236,14 @@ class SeenActor:
     azimuths: Float[np.ndarray, " k"]
     pixels_per_metre: Float[np.ndarray, " k"] | None
 
-    def side(self, actor: WorldActor, view: View) -> tuple[bool, float, float]:
-        """What `Sides` says of an object that has these Gaussians, at its place."""
-        place = inverse(actor.pose) @ view.camera_to_world[:, 3].double().cpu().numpy()
-        azimuth, distance = np.arctan2(place[1], place[0]), max(float(np.linalg.norm(place[:3])), 1e-6)
+    def side(self, actor: WorldActor, place: Float64[np.ndarray, "3"], focal: float) -> tuple[bool, float, float]:
+        """What `Sides` says of an object that has these Gaussians, at its place, from a sensor at a `place` in the world
+        with `focal` pixels per radian."""
+        toward = inverse(actor.pose) @ np.append(place, 1.0)
+        azimuth, distance = np.arctan2(toward[1], toward[0]), max(float(np.linalg.norm(toward[:3])), 1e-6)
         turns = np.abs(np.angle(np.exp(1j * (azimuth - self.azimuths))))
         known = self.pixels_per_metre
-        magnifications = np.ones(len(turns)) if known is None else float(view.K[0, 0]) / distance / known
+        magnifications = np.ones(len(turns)) if known is None else focal / distance / known
         similar = (turns <= SIMILAR) & (magnifications <= MAX_MAGNIFICATION)
         turn = min(float(turns.min(initial=np.pi)), OTHER_SIDE)
         return bool(similar.sum() >= MIN_IMAGES), turn, float(magnifications.min(initial=np.inf))
@@ -249,17 +259,45 @@ def seen_actors_of(drive: TrainedDrive) -> dict[str, SeenActor]:
     )
     recorded = drive if drive.before is None else drive.before
     found = {actor.id: _seen_actor(cameras, actor) for actor in recorded.edited_actors}
-    inserted = [actor for actor in drive.edited_actors if actor.seen is not None]
-    return found | {actor.source: SeenActor(actor.seen[~np.isnan(actor.seen)], None) for actor in inserted}
+    return found | seen_assets_of(drive)
 
 
-def sides_of_objects(known: Mapping[str, SeenActor], actors: Sequence[WorldActor], view: View) -> Sides:
-    """The sides that a view shows of these actors, and last an entry for what belongs to none of them: seen from here,
-    since nothing else is known of it."""
-    nothing = SeenActor(np.zeros(0), None)
-    sides = [known.get(actor.source, nothing).side(actor, view) for actor in actors]
+def seen_assets_of(drive: TrainedDrive) -> dict[str, SeenActor]:
+    """What the drives of inserted assets saw of them."""
+    inserted = [(actor.source, actor.seen) for actor in drive.edited_actors if actor.seen is not None]
+    return {source: SeenActor(seen[~np.isnan(seen)], None) for source, seen in inserted}
+
+
+def sides_of_parts(
+    drive: TrainedDrive, known: SeenGaussians, objects: Sides, placed: PlacedModel, sets: Sequence[Gaussians],
+    shown: Sequence[Tensor], place: Float[Tensor, "3"], focal: Float[Tensor, ""],
+) -> Iterator[tuple[bool, Tensor, Sides]]:  # fmt: skip
+    """Of each part of a placed model, of which `sets` has the Gaussians and `shown` the indices of those that count:
+    whether it has objects, indices, and the sides that a sensor sees. The indices of objects are those into `objects`,
+    the sides of the world's objects; of others they are the rows of the drive's model.
+
+    Raises RequestError for a model of another drive.
+    """
+    rows = {id(part): own for part, own in zip(drive.model.parts, drive.model.rows, strict=True)}
+    if any(not part.has_objects and id(part) not in rows for part in placed.model.parts):
+        raise RequestError(f"this world is not one of {drive.where}: open one drive, and take both from it")
+    for part, own, chosen in zip(placed.model.parts, sets, shown, strict=True):
+        if part.has_objects:
+            number = torch.full_like(chosen, -1) if own.placement is None else own.placement[chosen]
+            yield True, number, objects[number]
+        else:
+            row = chosen + rows[id(part)].start
+            yield False, row, known.sides(own.means[chosen], row, place, focal)
+
+
+def sides_of_objects(
+    known: Mapping[str, SeenActor], actors: Sequence[WorldActor], place: Float[Tensor, "3"], focal: float
+) -> Sides:
+    """The sides that a sensor at a `place`, with `focal` pixels per radian, sees of these actors, and last an entry for
+    what belongs to none of them: seen from here, since nothing else is known of it."""
+    nothing, at, device = SeenActor(np.zeros(0), None), place.double().cpu().numpy(), place.device
+    sides = [known.get(actor.source, nothing).side(actor, at, focal) for actor in actors]
     similar, turn, magnification = zip(*sides, (True, 0.0, 1.0), strict=True)
-    device = view.K.device
     numbers = (torch.tensor(values, dtype=torch.float32, device=device) for values in (turn, magnification))
     return Sides(torch.tensor(similar, device=device), *numbers)
 

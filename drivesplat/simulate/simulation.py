@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from drivesplat.drive.cameras import PoseableCamera
-from drivesplat.drive.drive_view import DriveView
+from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.drive.world_state import WorldState
 from drivesplat.errors import RequestError
@@ -40,8 +40,6 @@ EGO_COLUMNS = ("speed", "acceleration", "steering", "yaw_rate", "seconds")
 """What is known of the ego vehicle: m/s, m/s², radians, radians per second, and seconds since the run began."""
 PATH_S = 0.05
 """Seconds between the places of the recorded path."""
-
-
 Observation = dict[str, Any]
 
 
@@ -68,7 +66,7 @@ class Simulation:
         self.lidar = None if self.settings.lidar is None else drive.lidar(self.settings.lidar, self.settings.start)
         if not self.step_count:
             raise RequestError(f"{drive.where}: a run from {self.settings.start:g} s on has no step")
-        self.trust: Callable[[], float] | None = None
+        self.trust: Callable[[], dict[str, float]] | None = None
         limits = self.settings.vehicle
         self._shape, self._vehicle = shape_of(limits), limits.model_dump()
         self._precompute()
@@ -218,6 +216,7 @@ class Simulation:
         self.ego_to_world = self._ego_pose()
         self._objects = self._seen_from_ego()
         self._touched = self._met()
+        self._scanned: DriveScan | None = None
         self._log.append((self.ego, self.ego_to_world, self.traffic.poses, self.traffic.present))
 
     # ---- where everything is
@@ -328,12 +327,11 @@ class Simulation:
         padded = np.zeros((self.settings.max_boxes, len(BOX_COLUMNS)), dtype=np.float32)
         padded[: len(ids)] = boxes
         found: Observation = {"ego": self.ego_values(), "route": self.route(), "boxes": padded}
-        world = self.world() if self.cameras or self.lidar is not None else None
-        if world is not None and self.cameras:
-            views = world.render(list(self.cameras.values()), outputs=self.settings.outputs, **self.place)
+        if self.cameras:
+            views = self.world().render(list(self.cameras.values()), outputs=self.settings.outputs, **self.place)
             found["cameras"] = {name: _arrays(view) for name, view in zip(self.cameras, views, strict=True)}
-        if world is not None and self.lidar is not None:
-            scan = world.scan(self.lidar, **self.place, with_instance=False).arrays()
+        if self.lidar is not None:
+            scan = self.scan().arrays()
             values = {name: np.where(scan["returned"], scan[name], 0.0) for name in ("range", "intensity")}
             found["lidar"] = {name: own.astype(np.float32) for name, own in values.items()}
         return found
@@ -345,12 +343,19 @@ class Simulation:
             raise RequestError("the simulation has no camera")
         return self.drive.view(seen, self._model_time, **self.place)
 
+    def scan(self) -> DriveScan:
+        """What the LiDAR measures now, without objects; once for a step. Raises RequestError without a LiDAR."""
+        if self.lidar is None:
+            raise RequestError("the simulation has no LiDAR")
+        if self._scanned is None:
+            self._scanned = self.world().scan(self.lidar, **self.place, with_instance=False)
+        return self._scanned
+
     def facts(self) -> dict[str, Any]:
         """What is known beside the observation: the time of the drive, the pose of the ego vehicle, the ids of the
         objects in the rows of `boxes`, those that it touches, metres from the recorded path, whether it follows the
-        recording, and its settings; where `trust` is set, as `validity` how far the image of the first camera can be
-        trusted, 0 to 1."""
-        trusted = {} if self.trust is None else {"validity": self.trust()}
+        recording, its settings, and what `trust` says, where it is set."""
+        trusted = {} if self.trust is None else self.trust()
         return {
             **trusted,
             "time": self.time,

@@ -16,7 +16,7 @@ to the PSNR of its own held-out images, which eval.json states. The other consta
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -39,6 +39,7 @@ from drivesplat.simulate.seen_from import (
     seen_actors_of,
     seen_by_training,
     sides_of_objects,
+    sides_of_parts,
     training_images,
 )
 
@@ -60,6 +61,7 @@ DEFAULT_ERROR = 10.0**-2.6
 """Squared error of training images whose files are missing (PSNR: 26 dB), before it is fitted to held-out images."""
 RESIDUALS = (-2.4, 1.6)
 """The 5 % and 95 % quantiles of true minus expected PSNR (dB) in the calibration, times 1.5: it has a single street."""
+Read = TypeVar("Read")
 HALVING_DB = 6.0
 """Drop of the PSNR that halves the validity."""
 MIN_ERROR = 1e-6
@@ -225,27 +227,20 @@ class ViewKnowledge:
         small, placed = reduced(view, MAX_SIDE), world.placed()
         aside = self.cameras.aside(view)
         sets, actors = placed.sets_in(small), list(world.actors.values())
-        rows = {id(part): own for part, own in zip(self.drive.model.parts, self.drive.model.rows, strict=True)}
-        of_objects = sides_of_objects(self.objects, actors, view)
+        place, focal = view.camera_to_world[:3, 3], view.K[0, 0]
+        of_objects = sides_of_objects(self.objects, actors, place, float(focal))
         of_sources = [self.errors.objects.get(actor.source, self.errors.others) for actor in actors]
         errors = torch.tensor([*of_sources, self.errors.others], device=view.K.device)
-        if any(not part.has_objects and id(part) not in rows for part in placed.model.parts):
-            raise RequestError(f"this world is not one of {self.drive.where}: open one drive, and take both from it")
         shapes, values, kept, first = concatenate_shapes(sets), [], [], 0
-        for part, own in zip(placed.model.parts, sets, strict=True):
-            shown = may_show(view, own)
-            if part.has_objects:
-                number = torch.full_like(shown, -1) if own.placement is None else own.placement[shown]
-                sides, before = of_objects[number], errors[number]
-            else:
-                known = shown + rows[id(part)].start
-                sides = self.gaussians.sides(own.means[shown], known, view.camera_to_world[:3, 3], view.K[0, 0])
-                before = self.errors.gaussians[known]
+        shown = [may_show(view, own) for own in sets]
+        parts = sides_of_parts(self.drive, self.gaussians, of_objects, placed, sets, shown, place, focal)
+        for own, chosen, (has_objects, index, sides) in zip(sets, shown, parts, strict=True):
+            before = (errors if has_objects else self.errors.gaussians)[index]
             unseen, nothing = sides.unseen.float(), torch.zeros_like(before)
-            of_kind = (nothing, unseen) if part.has_objects else (unseen, nothing)
+            of_kind = (nothing, unseen) if has_objects else (unseen, nothing)
             supported = (sides.similar & ~sides.unseen).float()
             values.append(torch.stack([supported, *of_kind, self.errors.expected(sides, before, aside)], dim=1))
-            kept.append(shown + first)
+            kept.append(chosen + first)
             first += len(own)
         found = placed.model.composited(shapes[torch.cat(kept)], torch.cat(values), small)
         through, known = 1.0 - found.alpha[0, :, :, 0], self.sky.known(small)
@@ -291,21 +286,44 @@ class HeldOut:
 def held_out_images(drive: TrainedDrive) -> list[HeldOut]:
     """The groups of held-out images in eval.json beside the model; none without this file. Raises ResultError for an
     invalid one."""
-    file, record = drive.folder / "eval.json", drive.record
-    if not file.is_file():
-        return []
-    content, found = read_json(file, "evaluate"), []
-    try:
-        camera, results = content["protocol"]["eval_camera"], content["result"]
+    record, found = drive.record, []
+    camera = read_metrics(drive, lambda content: content["protocol"]["eval_camera"])
+    for name, psnr in held_out_figures(drive, "all", "psnr_frame_mean").items():
+        own = (int(index) for index in record.splits.get(name, ()))
+        images = [index for index in own if record.is_key_frame[index] and record.camera_name(index) == camera]
+        if images:
+            found.append(HeldOut(name, images, psnr))
+    return found
+
+
+def held_out_figures(drive: TrainedDrive, *keys: str) -> dict[str, float]:
+    """The figure of these keys of each group of GROUPS that has it in eval.json beside the model; none without this
+    file. Raises ResultError for an invalid one."""
+
+    def figures(content: dict[str, Any]) -> dict[str, float]:
+        found = {}
         for name in GROUPS:
-            own = (int(index) for index in record.splits.get(name, ()))
-            images = [index for index in own if record.is_key_frame[index] and record.camera_name(index) == camera]
-            psnr: Any = ((results.get(name) or {}).get("all") or {}).get("psnr_frame_mean")
-            if images and psnr is not None:
-                found.append(HeldOut(name, images, float(psnr)))
+            value = content["result"].get(name)
+            for key in keys:
+                value = None if value is None else value.get(key)
+            if value is not None:
+                found[name] = float(value)
+        return found
+
+    return read_metrics(drive, figures) or {}
+
+
+def read_metrics(drive: TrainedDrive, read: Callable[[dict[str, Any]], Read]) -> Read | None:
+    """What `read` takes from eval.json beside the model; None without this file. Raises ResultError where it is not as
+    `read` expects."""
+    file = drive.folder / "eval.json"
+    if not file.is_file():
+        return None
+    content = read_json(file, "evaluate")
+    try:
+        return read(content)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise unreadable(file, "evaluate", f"not a record of metrics ({error})") from error
-    return found
 
 
 def _tracks(drive: TrainedDrive) -> list[str]:

@@ -330,7 +330,7 @@ def test_what_the_drive_does_not_have_is_refused(drive, settings, error, message
 
 
 def test_without_a_camera_nothing_can_be_trusted():
-    with pytest.raises(ValueError, match="'validity' is that of an image"):
+    with pytest.raises(ValueError, match="'validity' is that of an image or a scan"):
         SimulationSettings(cameras=(), validity=True)
 
 
