@@ -103,7 +103,7 @@ def group_met(gaussians: Gaussians, view: ScanView, groups: Int[Tensor, " n"]) -
 def composited_scan(
     gaussians: Gaussians, view: ScanView, values: Float[Tensor, "n v"], before: Float[Tensor, "b a"] | None = None
 ) -> ScanRendering:
-    """A rendering of `values` of Gaussians along the rays of a scan; with `alpha_before` the ranges `before` (metres)."""
+    """`values` of Gaussians along the rays of a scan; with `alpha_before` the ranges `before` (metres)."""
     return rasterize_scan(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, values,
         view.world_to_sensor, view.rays, beam_spread=view.beam_spread,

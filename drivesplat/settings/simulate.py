@@ -88,8 +88,8 @@ class SimulationSettings(Settings):
     outputs: tuple[Literal["rgb", "depth", "instance"], ...] = ("rgb",)
     """What a policy sees of a camera."""
     validity: bool = False
-    """Whether a policy sees how far the image of the first camera, and the scan, can be trusted. An image takes about 30
-    ms a step."""
+    """Whether a policy sees how far the image of the first camera and the scan can be trusted. An image takes about
+    30 ms a step."""
     lidar: str | None = None
     """The LiDAR that a policy sees. null = none."""
     max_boxes: int = Field(32, ge=1, le=1000)

@@ -24,8 +24,8 @@ from drivesplat.simulate.trust import Trust
 from drivesplat.simulate.validity import ViewValidity
 
 BELIEVABLE = 0.5
-"""The validity below which an image or a scan is not believed: 6 dB worse than held-out images, twice the range error of
-held-out scans, or half of it never seen."""
+"""The validity below which an image or a scan is not believed: 6 dB worse than held-out images, twice the range error
+of held-out scans, or half of it never seen."""
 METRES_AHEAD, METRES_BEHIND = 45.0, 15.0
 """What the view from above shows along the heading of the ego vehicle."""
 GROUND, PATH, EGO, OTHER, TOUCHED = (38, 40, 44), (90, 150, 230), (80, 200, 120), (190, 190, 195), (235, 80, 70)

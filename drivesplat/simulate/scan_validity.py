@@ -9,8 +9,8 @@ e is the median range error of the training scans. `magnification` is the distan
 that saw a surface saw it, divided by the distance to the scan's own sensor, from 1 to MAX_MAGNIFICATION, which also
 holds for what none saw. The mean is over the rays that return. `a`, how fast a drive gets worse between its training
 scans, is fitted to the range errors of its own held-out scans, which eval.json states. The form, DEFAULT_GROWTH and
-RESIDUALS were fitted to the drive of the demo (docs/closed_loop.md). There, range errors of single Gaussians in training
-scans and angles between directions, which the error of images has, made the order of scans worse.
+RESIDUALS were fitted to the drive of the demo (docs/closed_loop.md). There, two terms that images have put scans into
+a worse order: the range errors of single Gaussians in training scans, and angles between directions.
 """
 
 import math
@@ -47,24 +47,25 @@ from drivesplat.training.unseen import MIN_WEIGHT
 MAX_RAYS = 8192
 """Rays of a scan for which the validity is computed: of larger scans every so many firings."""
 MIN_RAYS = 1.0
-"""Sum of the weights in the rays of a training scan that the Gaussians of an object need for the scan to have seen it."""
+"""Sum of the weights in the rays of a training scan that an object's Gaussians need for the scan to have seen it."""
 MAX_MAGNIFICATION = 4.0
 """The largest magnification that counts, and that of what no training scan saw."""
 DEFAULT_GROWTH = 1.7
 """`a` where held-out scans do not tell: that of the demo's drive."""
 RESIDUALS = (0.75, 2.4)
-"""The 5 % and 95 % quantiles of true divided by expected errors in the calibration, to the power of 1.5: it has a single
-street."""
+"""The 5 % and 95 % quantiles of true divided by expected errors in the calibration, to the power of 1.5: it has a
+single street."""
 
 
 @dataclass(frozen=True)
 class ScanValidity:
     """How far a scan can be trusted.
 
-    `distance` (metres) is that to the nearest place of the sensor in a training scan. `supported`, `unseen` and `turned`
-    are shares of the rays that return. `supported`: surfaces that two training scans saw from within 20 degrees and from
-    at most twice the distance. `unseen`: static Gaussians that no training scan saw. `turned`: objects that show a side
-    that no training scan saw, which is farther round than 40 degrees. What is neither was seen from elsewhere.
+    `distance` (metres) is that to the nearest place of the sensor in a training scan. `supported`, `unseen` and
+    `turned` are shares of the rays that return. `supported`: surfaces that two training scans saw from within 20
+    degrees and from at most twice the distance. `unseen`: static Gaussians that no training scan saw. `turned`: objects
+    that show a side that no training scan saw, which is farther round than 40 degrees. What is neither was seen from
+    another direction or from farther away.
 
     `expected_range_error` (metres) is the median of the absolute error of range, beside a scan that the sensor would
     have recorded, over the rays that return in both; `interval` (metres) is where 90 % of the scans of the calibration
@@ -86,7 +87,7 @@ class ScanValidity:
 
 @dataclass(frozen=True)
 class _Means:
-    """Means over the rays of a scan that return: the shares of `ScanValidity`, and sqrt(magnification - 1) (`nearer`)."""
+    """Means over the rays of a scan that return: shares of `ScanValidity`, and `nearer`, sqrt(magnification - 1)."""
 
     supported: float
     unseen: float
@@ -97,8 +98,8 @@ class _Means:
 @dataclass(frozen=True, eq=False)
 class ScanKnowledge:
     """What the training scans of a `drive` tell of scans from other places: what they saw of its `gaussians` and
-    `objects`; their median range error (`error`, metres), its `growth` (`a`), and the error that is expected of held-out
-    scans on the path (`reference`, metres)."""
+    `objects`; their median range error (`error`, metres), its `growth` (`a`), and the error that is expected of
+    held-out scans on the path (`reference`, metres)."""
 
     drive: TrainedDrive
     gaussians: SeenGaussians

@@ -1,5 +1,7 @@
-"""From where training images saw what a model shows: its static Gaussians, its objects, and the sky. `Sides` and all that
-makes them hold for LiDAR scans in place of images, too, of which a radian has one pixel."""
+"""From where training images saw what a model shows: its static Gaussians, its objects, and the sky.
+
+LiDAR scans take the place of images in `scan_validity`; a radian of them has one pixel.
+"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -237,8 +239,8 @@ class SeenActor:
     pixels_per_metre: Float[np.ndarray, " k"] | None
 
     def side(self, actor: WorldActor, place: Float64[np.ndarray, "3"], focal: float) -> tuple[bool, float, float]:
-        """What `Sides` says of an object that has these Gaussians, at its place, from a sensor at a `place` in the world
-        with `focal` pixels per radian."""
+        """What `Sides` says of an object that has these Gaussians, from a sensor at a `place` in the world with
+        `focal` pixels per radian."""
         toward = inverse(actor.pose) @ np.append(place, 1.0)
         azimuth, distance = np.arctan2(toward[1], toward[0]), max(float(np.linalg.norm(toward[:3])), 1e-6)
         turns = np.abs(np.angle(np.exp(1j * (azimuth - self.azimuths))))

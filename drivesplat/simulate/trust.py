@@ -44,7 +44,8 @@ class Trust:
             return
         if not simulation.cameras and simulation.lidar is None:
             raise RequestError(
-                f"{self.drive.where}: 'validity' is that of an image or a scan; name a camera in 'cameras', or a 'lidar'"
+                f"{self.drive.where}: 'validity' is that of an image or a scan; name a camera in 'cameras', or a "
+                "'lidar'"
             )
         _ = self.images if simulation.cameras else None, self.scans if simulation.lidar is not None else None
 
