@@ -24,7 +24,7 @@ from drivesplat.settings.simulate import RunJob
 from drivesplat.simulate.episodes import driven_episode
 from drivesplat.simulate.policies import policy_of, settings_for
 from drivesplat.simulate.simulation import Simulation
-from drivesplat.simulate.validity import ViewKnowledge
+from drivesplat.simulate.trust import Trust
 
 log = logging.getLogger(__name__)
 
@@ -58,9 +58,7 @@ def write_run_drive(
     simulation = Simulation(edited, settings_for(run.simulation, policy))
     if not simulation.cameras and simulation.lidar is None:
         raise RequestError(f"{where} has no sensor to record; name a camera in its simulation.cameras, or a lidar")
-    if run.simulation.validity:
-        known = ViewKnowledge.of_drive(edited)
-        simulation.trust = lambda: known.validity(simulation.world(), simulation.view()).validity
+    Trust(edited).inform(simulation)
     _remove(path.parent)
     recorder = _Recorder(simulation, path.parent)
     try:
