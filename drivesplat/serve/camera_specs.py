@@ -16,8 +16,8 @@ MAX_PIXELS = 16_777_216
 """Pixels of an image, and of what a lens is resampled from."""
 FOCAL_RANGE = 0.01, 100.0
 """Focal lengths in image widths."""
-MAX_CAMERAS = 64
-"""Cameras that are kept: the directions of a lens take long to compute."""
+MAX_CAMERAS = 16
+"""Cameras that are kept: the directions of a lens take long to compute, and some 30 bytes for each pixel."""
 READOUTS = {
     wire.ShutterType.ROLLING_TOP_TO_BOTTOM: (0.0, 1.0),
     wire.ShutterType.ROLLING_BOTTOM_TO_TOP: (0.0, -1.0),

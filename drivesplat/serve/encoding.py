@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from drivesplat.rendering.color_bytes import to_uint8
+from drivesplat.errors import ResultError
+from drivesplat.rendering.color_bytes import NOT_FINITE, to_uint8
 from drivesplat.serve.messages import wire
 
 
@@ -51,9 +52,10 @@ def encoded(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding) -> bytes:
 
 
 def jpeg_on_device(image: Float[Tensor, "h w 3"], quality: int) -> bytes:
-    """A JPEG of colours in [0, 1], encoded where they are: on a GPU by nvJPEG, without a copy of the image."""
+    """A JPEG of colours in [0, 1], encoded where they are: on a GPU by nvJPEG, without a copy of the image. Raises
+    ResultError where a colour is NaN or Inf."""
     from torchvision.io import encode_jpeg  # here: it takes long to import
 
-    finite = torch.isfinite(image).all()
-    assert finite
+    if not torch.isfinite(image).all():
+        raise ResultError(NOT_FINITE)
     return encode_jpeg(to_uint8(image).permute(2, 0, 1).contiguous(), quality=quality).cpu().numpy().tobytes()

@@ -3,7 +3,6 @@
 import importlib
 import logging
 import socket
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -91,9 +90,8 @@ class SensorServer:
         )
         self._server.add_generic_rpc_handlers([self._handlers()])
         self._health = self._add_health()
-        self._page = None if metrics_port is None else _page(self.service, metrics_port)
-        self._closing = threading.Event()
         self.address = self._bound(host, port, tls)
+        self._page = None if metrics_port is None else _page(self.service, metrics_port)
         self._server.start()
 
     @property
@@ -185,7 +183,9 @@ def _required(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise RequestError("the sensor service needs gRPC: pip install 'drivesplat[serve]'") from None
+        raise RequestError(
+            f"the sensor service needs the package of {module.partition('.')[0]}: pip install 'drivesplat[serve]'"
+        ) from None
 
 
 def _split(address: str) -> tuple[str, int]:

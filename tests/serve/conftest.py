@@ -5,9 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("carla_driver_interface")
-
 from helpers.hand_made_street import street_model, street_scene
 from helpers.scanned_street import scanned_street
 from helpers.served_drives import SensorClient, served, write_mask, write_method
