@@ -41,13 +41,14 @@ COLUMNS = [
 class RecordedDrive:
     """A scene with the tracks of a method, its training images, the outlines of the vehicle's own body in them, and the
     file of its LiDAR scans, which may be missing. `where` names scene and method in messages. Times are seconds since
-    the first image."""
+    the first image. `files` are the others that it was read from."""
 
     where: str
     scene: Scene
     record: TrainingRecord
     ego_mask: EgoMask
     scans_file: Path
+    files: tuple[Path, ...] = ()
 
     @classmethod
     def of_method(cls, folder: Path, tracks: Sequence[str], refined: bool) -> "RecordedDrive":
@@ -55,17 +56,16 @@ class RecordedDrive:
         were `refined` or not. Raises ResultError for missing files and those of another version."""
         results = folder.parent
         own: Tracks = "discovered" if any(track.startswith(FOUND) for track in tracks) else "annotated"
-        scene = read_scene(
-            results / (REFINED if refined and own == "annotated" else Path(TRACK_FOLDERS[own], "scene.json"))
-        )
+        record = results / (REFINED if refined and own == "annotated" else Path(TRACK_FOLDERS[own], "scene.json"))
+        scene = read_scene(record)
         # Images and rays are the same with any tracks.
         of_tracks = [results / TRACK_FOLDERS[of] for of in (own, "none")]
         parsers, scans = ([path / name for path in of_tracks] for name in ("parser.npz", "scans.npz"))
         parser, scan = (next((path for path in paths if path.is_file()), paths[0]) for paths in (parsers, scans))
-        mask = results / "own_car.json"
-        ego_mask = read_ego_mask(mask)[0] if mask.is_file() else NO_EGO_MASK
+        masks = [path for path in [results / "own_car.json"] if path.is_file()]
+        ego_mask = read_ego_mask(masks[0])[0] if masks else NO_EGO_MASK
         where = f"scene {scene.name}, method {folder.name}"
-        return cls(where, scene, read_training_record(parser), ego_mask, scan)
+        return cls(where, scene, read_training_record(parser), ego_mask, scan, (record, parser, *masks))
 
     @cached_property
     def cameras(self) -> list[str]:

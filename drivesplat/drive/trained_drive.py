@@ -21,6 +21,7 @@ from drivesplat.drive.cameras import (
 )
 from drivesplat.drive.drive_view import DriveScan, DriveView
 from drivesplat.drive.lidars import PoseableLidar
+from drivesplat.drive.packed_drive import unpack_drive
 from drivesplat.drive.recorded_drive import RecordedDrive, object_table
 from drivesplat.drive.world_state import AnyCamera, Sensors, WorldState
 from drivesplat.editing.actors import EditedModel, edited_model, other_objects, trained_actors
@@ -60,17 +61,19 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
     is that of its last saved state.
 
     Args:
-        folder: `results/{scene}/{method}`; scene and training record lie beside it.
+        folder: `results/{scene}/{method}`; scene and training record lie beside it. Or `scene.alpasim.usdz`, which
+            holds all of it, and is unpacked once (`drivesplat.drive.packed_drive.unpack_drive`).
         device: 'any' (the GPU where there is one), 'cuda' or 'cpu', or settings as under `device` in config.yaml.
 
-    Raises RequestError where the folder has no checkpoint, ResultError for files of another version, and DeviceError
-    where the device is missing or its memory is exhausted.
+    Raises RequestError where the folder has no checkpoint, ResultError for damaged files and those of another version,
+    and DeviceError where the device is missing or its memory is exhausted.
 
     >>> drive = open_drive("results/demo/street")
     >>> drive.render("CAM_FRONT", time=4.2).image.shape
     (225, 400, 3)
     """
     folder = Path(folder)
+    folder = unpack_drive(folder) if folder.is_file() or folder.suffix == ".usdz" else folder
     file = model_file(folder)
     checkpoint = read_checkpoint(file) if file.parent == folder else read_snapshot(file.parent)
     tracks = [track.id for part in checkpoint.parts for track in part.tracks]
