@@ -7,6 +7,7 @@
 #   snakemake --cores 4 runs                          policies that drive in the drives, of the runs file
 #   snakemake --cores 4 mcap                          the drives as rendered, edits and runs as MCAP files for ROS 2
 #   snakemake --cores 4 assets                        the actors of every method as assets, to insert into other drives
+#   snakemake --cores 4 alpasim                       scenes that the simulator AlpaSim loads
 #   snakemake --cores 1 report                        results/gap_report.html of what has been measured
 #   snakemake --cores 1 results/0061/ablation.csv     the contribution of each component of `street`, with three seeds
 #   snakemake --cores 4 estimate                      what all of it would take in time and disk, and how that is known
@@ -99,6 +100,11 @@ rule looks:
 rule exports:
     input:
         plan.exports,
+
+
+rule alpasim:
+    input:
+        plan.alpasim,
 
 
 rule report:

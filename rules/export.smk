@@ -2,8 +2,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.npz.
 # OUTPUTS: <results>/{scene}/{method}/splat.ply, cameras.json, transforms.json, parts/parts.json (and the PLYs beside
-# it); scene.usdz; viewer.html; colmap/; splat.spz; splat.sog. `export.formats` says which of them `all` and `exports`
-# make. far.npz, which all of them but colmap/ read.
+# it); scene.usdz; viewer.html; colmap/; splat.spz; splat.sog; scene.alpasim.usdz. `export.formats` says which of them
+# `all` and `exports` make, `alpasim` makes the last. far.npz, which all of them but colmap/ and the last read.
 
 
 rule far_gaussians:
@@ -201,3 +201,35 @@ rule export_sog:
         code=plan.code("export_sog"),
     script:
         "../workflow_scripts/export_sog.py"
+
+
+rule export_alpasim:
+    """
+    Exports a scene that AlpaSim loads: the recorded path of the vehicle, its cameras, all tracks, the ground and a
+    coarse mesh; with the drive itself, which `drivesplat serve` renders on another machine.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+        parser=plan.of_tracks("parser.npz"),
+        own_car=plan.of_images("own_car.json"),
+        scans=plan.training_input("scans"),
+    output:
+        usdz="<results>/{scene}/{method}/scene.alpasim.usdz",
+    log:
+        "<logs>/{scene}/{method}/export_alpasim.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/export_alpasim.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=4)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("export_alpasim"),
+        code=plan.code("export_alpasim"),
+    script:
+        "../workflow_scripts/export_alpasim.py"

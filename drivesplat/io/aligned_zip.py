@@ -44,7 +44,7 @@ def _header(archive: zipfile.ZipFile, name: str, size: int) -> zipfile.ZipInfo:
     """The header of the next member, with padding up to the next multiple of ALIGNMENT."""
     header = zipfile.ZipInfo(name, DATE)
     header.create_system, header.external_attr, header.file_size = 3, 0o644 << 16, size
-    header.compress_type = zipfile.ZIP_STORED
+    header.compress_type, header.CRC = zipfile.ZIP_STORED, 0
     is_large = size * 1.05 > zipfile.ZIP64_LIMIT  # as ZipFile.open decides
     begin = archive.fp.tell() + len(header.FileHeader(is_large)) + 4
     padding = -begin % ALIGNMENT

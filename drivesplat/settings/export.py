@@ -8,8 +8,9 @@ from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.render import TrajectorySettings
+from drivesplat.settings.simulate import VehicleBody
 
-ExportFormat = Literal["ply", "usd", "viewer", "colmap", "spz", "sog"]
+ExportFormat = Literal["ply", "usd", "viewer", "colmap", "spz", "sog", "alpasim"]
 ScanFormat = Literal["npz", "ply", "pcd.bin"]
 DriveLabel = Literal["depth", "instances"]
 
@@ -21,8 +22,8 @@ class ExportSettings(Settings):
     formats: tuple[ExportFormat, ...] = ("ply", "usd", "viewer", "colmap")
     """:printed: What `snakemake` and `snakemake exports` make: 'ply' (splat.ply, parts, cameras.json, transforms.json),
     'usd' (scene.usdz), 'viewer' (viewer.html), 'colmap' (text model of cameras and seed points), 'spz' (compressed
-    splat.spz) and 'sog' (splat.sog; needs Node and @playcanvas/splat-transform). The other files are made on
-    request."""
+    splat.spz), 'sog' (splat.sog; needs Node and @playcanvas/splat-transform) and 'alpasim' (scene.alpasim.usdz). The
+    other files are made on request."""
     max_distance: float = Field(MAX_DISTANCE, gt=0, le=MAX_DISTANCE)
     """Distance in metres from the world's origin within which all exported Gaussians lie. Those beyond are left out
     where no training image shows it, and moved nearer along the line of sight otherwise. docs/exports.md"""
@@ -51,6 +52,9 @@ class ExportSettings(Settings):
     """:printed: Files of rendered LiDAR scans: 'npz' (all rays), 'ply' (returns in world coordinates) and 'pcd.bin'
     (returns as nuScenes has them). They are made on request. docs/lidar.md"""
 
+    vehicle: VehicleBody = Field(default_factory=VehicleBody)
+    """The box of the ego vehicle in scene.alpasim.usdz. docs/alpasim_scene.md"""
+
     @field_validator("formats", "scan_formats")
     @classmethod
     def _once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
@@ -78,6 +82,12 @@ class FarJob(Settings):
     """All settings that determine one far.npz."""
 
     max_distance: float = MAX_DISTANCE
+
+
+class AlpasimJob(Settings):
+    """All settings that determine one scene.alpasim.usdz: the box of the vehicle."""
+
+    body: VehicleBody = Field(default_factory=VehicleBody)
 
 
 class SplatJob(Settings):

@@ -11,17 +11,24 @@ Length = Annotated[float, Field(gt=0, le=40)]
 Seconds = Annotated[float, Field(ge=0, le=36000)]
 
 
-class VehicleSettings(Settings):
-    """The ego vehicle. Its origin is on the ground below the rear axle."""
+class VehicleBody(Settings):
+    """The box of the ego vehicle. Its origin is on the ground below the rear axle."""
 
     length: Length = 4.6
     """Metres."""
     width: Length = 1.9
+    """Metres."""
     height: Length = 1.6
-    wheelbase: Length = 2.8
-    """Metres between the axles."""
+    """Metres."""
     rear_overhang: float = Field(0.9, ge=0, le=20)
     """Metres of the body behind the rear axle."""
+
+
+class VehicleSettings(VehicleBody):
+    """The ego vehicle. Its origin is on the ground below the rear axle."""
+
+    wheelbase: Length = 2.8
+    """Metres between the axles."""
     max_steering: float = Field(0.6, gt=0, le=1.2)
     """The largest angle of the front wheels, radians."""
     max_steering_rate: float = Field(1.0, gt=0, le=20)

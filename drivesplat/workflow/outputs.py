@@ -41,6 +41,7 @@ EXPORTS: dict[ExportFormat, tuple[str, ...]] = {
     "colmap": ("colmap/images.txt",),
     "spz": ("splat.spz",),
     "sog": ("splat.sog",),
+    "alpasim": ("scene.alpasim.usdz",),
 }
 """The files of every format, one or two for each rule that makes them."""
 PARTS_FILM = "parts"
@@ -227,6 +228,10 @@ class Outputs(Inputs):
         return self.of_methods(
             lambda scene, _: [name for kind in for_scene(self.config, scene).export.formats for name in EXPORTS[kind]]
         )
+
+    def alpasim(self, _: Any = None) -> list[str]:
+        """The scenes for AlpaSim of the batch's scenes and methods."""
+        return self.of_methods(lambda *_: EXPORTS["alpasim"])
 
     def of_methods(
         self, names: Callable[[str, str], Iterable[str]], scenes: Iterable[str] | None = None, cameras: bool = True

@@ -19,7 +19,16 @@ from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.discover import DiscoverJob
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
-from drivesplat.settings.export import AssetsJob, DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
+from drivesplat.settings.export import (
+    AlpasimJob,
+    AssetsJob,
+    DriveJob,
+    ExportJob,
+    FarJob,
+    ScanFolderJob,
+    SplatJob,
+    ViewerJob,
+)  # fmt: skip
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import LightJob, ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -382,6 +391,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "export_viewer": (ViewerJob, _viewer),
     "export_colmap": (Settings, _nothing),
     "actor_assets": (AssetsJob, lambda at: {"complete": at.config.export.complete_assets}),
+    "export_alpasim": (AlpasimJob, lambda at: {"body": at.config.export.vehicle}),
     "export_spz": (Settings, _nothing),
     "export_sog": (Settings, _nothing),
 }
