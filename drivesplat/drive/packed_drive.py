@@ -7,7 +7,6 @@ The archive is a scene for another program (`drivesplat.export.alpasim`), which 
 """
 
 import json
-import os
 import shutil
 import tempfile
 import zipfile
@@ -51,12 +50,15 @@ class PackedManifest:
 
 def packed_members(folder: Path, scene: str, files: Iterable[Path]) -> dict[str, bytes | Path]:
     """The members of an archive for the drive of a method with the result folder `folder`: the `files` that opening it
-    reads, which lie below the folder of results, and their list. Raises OSError where one cannot be read."""
-    own = Path(os.path.abspath(folder))
-    results = own.parents[1]
-    named = {Path(os.path.abspath(file)).relative_to(results).as_posix(): Path(file) for file in files}
+    reads, which lie in it or beside it, and their list. Raises OSError where one cannot be read."""
+    method, scene_folder = folder.absolute().name, folder.absolute().parent.name
+    named = {}
+    for file in files:
+        own = file.is_relative_to(folder)
+        below = Path(scene_folder, method) if own else Path(scene_folder)
+        named[(below / file.relative_to(folder if own else folder.parent)).as_posix()] = file
     digests = {name: sha256_file(named[name]) for name in sorted(named)}
-    manifest = PackedManifest(SCHEMA, scene, own.name, own.relative_to(results).as_posix(), digests)
+    manifest = PackedManifest(SCHEMA, scene, method, f"{scene_folder}/{method}", digests)
     content = canonical_json(field_values(manifest)).encode() + b"\n"
     return {MANIFEST: content, **{FILES + name: named[name] for name in sorted(named)}}
 

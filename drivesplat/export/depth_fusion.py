@@ -1,9 +1,9 @@
 """Depth images fused to a mesh by a truncated signed distance (Curless and Levoy 1996).
 
-The volume consists of blocks of BLOCK³ voxels, which lie at the corners of a lattice with edges of `edge` metres. Blocks
-exist about the surfaces that depth images show. A voxel has the weighted mean of its signed distances to them, to the
-plane through what the voxel's pixel shows, in units of TRUNCATION edges: 1 far before a surface, 0 on it, negative
-behind. Images that look through a block also count there, and so remove what only one image shows.
+The volume consists of blocks of BLOCK³ voxels, which lie at the corners of a lattice with edges of `edge` metres.
+Blocks exist about the surfaces that depth images show. A voxel has the weighted mean of its signed distances to the
+planes through what its pixels show, in units of TRUNCATION edges: 1 far before a surface, 0 on it, negative behind.
+Images that look through a block also count there, and so remove what only one image shows.
 """
 
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.ndimage import binary_erosion
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.ndimage import binary_erosion
 from skimage.measure import marching_cubes
 
 from drivesplat.io.triangle_mesh import TriangleMesh
@@ -33,30 +33,42 @@ COARSER = 1.25
 BEHIND = 2.0
 """Metres behind what a pixel shows up to which it says that there is something."""
 FULL_WEIGHT, LEAST_COSINE = 10.0, 0.05
-"""Metres up to which depth has full weight; beyond, its weight falls with the square of the distance. It is also that of
-the cosine between ray and normal, or of the least one."""
+"""Metres up to which depth has full weight; beyond, its weight falls with the square of the distance. It is also
+proportional to the cosine between ray and normal, or to the least one."""
+OF_NOTHING = 0.3
+"""The least weight of pixels before whose surface, if they show any, there is nothing."""
+NUDGE = 1e-3
+"""The least absolute distance: no vertex is on a voxel, so that each triangle is within a cell."""
 MIN_TRIANGLES = 60
 """Smaller pieces of a mesh are left out."""
 
+
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """The `depth` of an image in metres along the camera's axis, 0 where nothing is known; `K` in continuous pixels;
-    the pose of an OpenCV camera."""
+    """The `depth` of an image in metres along the camera's axis, 0 where it is not known, infinite where there is
+    nothing; `K` in continuous pixels; the pose of an OpenCV camera."""
 
     depth: Float32[np.ndarray, "h w"]
     K: Float[np.ndarray, "3 3"]
     camera_to_world: Float[np.ndarray, "4 4"]
 
+    @property
+    def shows(self) -> Bool[np.ndarray, "h w"]:
+        """The pixels that show a surface."""
+        return (self.depth > 0.0) & np.isfinite(self.depth)
+
     @cached_property
-    def points(self) -> Float[np.ndarray, "h w 3"]:
-        """What the pixels show, world metres."""
+    def points(self) -> Float32[np.ndarray, "h w 3"]:
+        """What the pixels show, world metres; the camera's place where they show no surface."""
         rows, columns = np.indices(self.depth.shape)
         x, y = (columns + 0.5 - self.K[0, 2]) / self.K[0, 0], (rows + 0.5 - self.K[1, 2]) / self.K[1, 1]
         rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.camera_to_world[:3, :3].T
-        return self.camera_to_world[:3, 3] + self.depth[..., None].astype(np.float64) * rays
+        return (self.camera_to_world[:3, 3] + np.where(self.shows, self.depth, 0.0)[..., None] * rays).astype(
+            np.float32
+        )
 
     @cached_property
-    def normals(self) -> Float[np.ndarray, "h w 3"]:
+    def normals(self) -> Float32[np.ndarray, "h w 3"]:
         """Unit normals of the surfaces there, towards the camera; the direction to the camera where the pixels around
         do not tell."""
         to_camera = self.camera_to_world[:3, 3] - self.points
@@ -66,8 +78,8 @@ class DepthImage:
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = normals / np.maximum(lengths, 1e-12)
         normals *= np.where((normals * to_camera).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
-        known = binary_erosion(self.depth > 0.0)[..., None] & (lengths > 1e-12)
-        return np.where(known, normals, to_camera)
+        known = binary_erosion(self.shows)[..., None] & (lengths > 1e-12)
+        return np.where(known, normals, to_camera).astype(np.float32)
 
     @cached_property
     def weights(self) -> Float32[np.ndarray, "h w"]:
@@ -75,7 +87,8 @@ class DepthImage:
         rays = self.points - self.camera_to_world[:3, 3]
         cosine = np.abs((rays * self.normals).sum(axis=-1)) / np.maximum(np.linalg.norm(rays, axis=-1), 1e-9)
         near = np.minimum(1.0, FULL_WEIGHT / np.maximum(self.depth, 1e-9)) ** 2
-        return (near * np.maximum(cosine, LEAST_COSINE)).astype(np.float32)
+        weights = np.where(self.shows, near * np.maximum(cosine, LEAST_COSINE), OF_NOTHING)
+        return weights.astype(np.float32)
 
 
 def fused_mesh(images: Sequence[DepthImage], edge: float, ground: HeightField | None = None) -> TriangleMesh:
@@ -100,8 +113,7 @@ def _blocks(images: Sequence[DepthImage], edge: float, ground: HeightField | Non
     reach, side = TRUNCATION * edge, BLOCK * edge
     found = [np.zeros((0, 3), dtype=np.int64)]
     for image in images:
-        known = image.depth > 0.0
-        points, away = image.points[known], reach * image.normals[known]
+        points, away = image.points[image.shows], reach * image.normals[image.shows]
         near = [np.floor((points + step * away) / side).astype(np.int64) for step in (-1.0, 0.0, 1.0)]
         found.append(np.unique(np.concatenate(near), axis=0))
     if ground is not None:
@@ -132,7 +144,7 @@ class _Volume:
         """Adds the distances along the rays of an image."""
         reach, half = TRUNCATION * self.edge, 0.5 * BLOCK * self.edge
         radius, (height, width) = np.sqrt(3.0) * half, image.depth.shape
-        farthest = image.depth.max() + BEHIND
+        farthest = image.depth.max(initial=0.0) + BEHIND
         middle = _pixels(image, self.keys * (BLOCK * self.edge) + half)[2]
         seen = np.flatnonzero((middle > -radius) & (middle < farthest + radius))
         for part in np.array_split(seen, max(1, len(seen) // 1024)):
@@ -146,10 +158,12 @@ class _Volume:
             inside, pixels, shown = inside[known], tuple(index[known] for index in pixels), shown[known]
             normals = image.normals[pixels]
             distance = ((places[inside] - image.points[pixels]) * normals).sum(axis=1) / reach
+            distance = np.where(np.isfinite(shown), distance, 1.0)
             counts = distance > -1.0
             block, voxel = np.unravel_index(inside[counts], (len(part), BLOCK**3))
-            weight = image.weights[pixels][counts]
-            self.values[part[block], voxel] += weight * np.minimum(distance[counts], 1.0).astype(np.float32)
+            value, weight = np.minimum(distance[counts], 1.0).astype(np.float32), image.weights[pixels][counts]
+            weight = np.where(value < 1.0, weight, np.maximum(weight, np.float32(OF_NOTHING)))
+            self.values[part[block], voxel] += weight * value
             self.weights[part[block], voxel] += weight
 
     def fill(self, ground: HeightField) -> None:
@@ -190,7 +204,7 @@ class _Volume:
             known[at] = weights > 0.0
             values[at] = np.where(known[at], self.values[block].reshape((BLOCK,) * 3) / np.maximum(weights, 1e-9), 1.0)
         values, known = values[:length, :length, :length], known[:length, :length, :length]
-        values = np.where(values == 0.0, np.float32(1e-6), values)  # no vertex on a voxel
+        values = np.where(np.abs(values) < NUDGE, np.copysign(np.float32(NUDGE), values), values)
         whole = known[:-1, :-1, :-1].copy()
         for corner in np.ndindex(2, 2, 2):
             whole &= known[tuple(slice(i, length - 1 + i) for i in corner)]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32
 from scipy.spatial import cKDTree
 
 from drivesplat.drive.trained_drive import TrainedDrive
@@ -17,8 +17,8 @@ from drivesplat.trajectories.camera_path import recorded_frames
 
 EDGE = 0.3
 """Metres between voxels."""
-MAX_DEPTH, MIN_ALPHA = 40.0, 0.7
-"""Metres up to which depth counts, and the least opacity where it does."""
+MAX_DEPTH, MIN_ALPHA, MAX_CLEAR = 40.0, 0.7, 0.05
+"""Metres up to which depth counts, the least opacity where it does, and the largest where there is nothing."""
 MAX_SLOPE = 0.5
 """Depth that differs by more than this share from a pixel beside it is between two surfaces."""
 WIDTH, MAX_IMAGES, MIN_STEP = 400, 160, 1.0
@@ -44,10 +44,16 @@ def depth_images(drive: TrainedDrive) -> Iterator[DepthImage]:
             world = drive.state(drive.scene.seconds(frame.timestamp), placements={})
             view = world.render(camera, camera_to_world=frame.camera_to_world, outputs=["depth", "alpha", "valid"])
             arrays = view.arrays()
-            known = (arrays["alpha"] >= MIN_ALPHA) & arrays["valid"] & (arrays["depth"] < MAX_DEPTH)
-            depth = np.where(known & ~_between(arrays["depth"]), arrays["depth"], 0.0).astype(np.float32)
-            if depth.any():
-                yield DepthImage(depth, camera.K, frame.camera_to_world)
+            yield DepthImage(_known_depth(**arrays), camera.K, frame.camera_to_world)
+
+
+def _known_depth(
+    depth: Float32[np.ndarray, "h w"], alpha: Float32[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """Depth as `DepthImage` has it, of what a drive renders."""
+    opaque, clear = alpha >= MIN_ALPHA, alpha <= MAX_CLEAR
+    known = np.where(opaque & (depth < MAX_DEPTH) & ~_between(depth), depth, 0.0)
+    return np.where(valid, np.where(clear, np.inf, known), 0.0).astype(np.float32)
 
 
 def _thinned(frames: list[Frame], most: int) -> list[Frame]:

@@ -13,7 +13,7 @@ import logging
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -32,7 +32,7 @@ REACH = 30.0
 """Metres about the path, and beyond its ends, that the ground covers."""
 HALF_WIDTH, CELL = 1.2, 0.25
 """Metres beside the path on which the vehicle stands, and the edge of the cells of known planes."""
-STIFFNESS, LEVEL = 1.0, 0.01
+STIFFNESS, LEVEL = 1.0, 0.001
 """Weights in units of the weight of a plane by LiDAR, which stands for one node."""
 OF_PATH = 10.0
 """The weight of the planes under the vehicle in the same units."""
@@ -60,8 +60,7 @@ def ground_surface(ego_to_world: Float[np.ndarray, "n 4 4"], points: Float[np.nd
     number[tuple(nodes[near].T)] = np.arange(near.sum())
     found = np.full(tuple(shape), poses[:, 2, 3].mean())
     found[tuple(nodes[near].T)] = _fitted(number, (places - lower) / EDGE, heights, weights)
-    corners = number >= 0
-    covered = corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:] & corners[1:, 1:]
+    covered = np.all([corner >= 0 for corner in _corners(number)], axis=0)
     lowest, values, cells = torch.from_numpy(lower).float(), torch.from_numpy(found).float(), torch.from_numpy(covered)
     surface = HeightField(lowest, EDGE, values, cells)
     off = np.abs(surface.at(torch.from_numpy(poses[:, :2, 3]).float()).numpy() - poses[:, 2, 3]).max()
@@ -76,8 +75,7 @@ def surface_mesh(surface: HeightField) -> TriangleMesh:
     nodes = np.stack(np.meshgrid(*map(np.arange, heights.shape), indexing="ij"), axis=-1)
     vertices = np.concatenate([surface.lower.double().numpy() + edge * nodes, heights[..., None]], axis=-1)
     number = np.arange(heights.size).reshape(heights.shape)
-    corners = [part[surface.covered.numpy()] for part in _corners(number)]
-    first, in_y, in_x, far = corners
+    first, in_y, in_x, far = (corner[surface.covered.numpy()] for corner in _corners(number))
     triangles = np.stack([np.stack([first, in_x, far], axis=1), np.stack([first, far, in_y], axis=1)], axis=1)
     return TriangleMesh(vertices.reshape(-1, 3), triangles.reshape(-1, 3)).with_triangles(np.arange(2 * len(first)))
 
@@ -97,8 +95,8 @@ def _known_heights(
     """The places (metres) at which the height is known, this height, and its weight; that of planes by LiDAR is
     negative."""
     settings = RoadSettings(half_width=HALF_WIDTH)
-    roads = [driven_road(poses, settings, CELL), lidar_road(points, settings)]
-    found = [(*_middles(road), np.full(len(road.weights), sign)) for road, sign in zip(roads, (OF_PATH, -1.0))]
+    roads = {OF_PATH: driven_road(poses, settings, CELL), -1.0: lidar_road(points, settings)}
+    found = [(*_middles(road), np.full(len(road.weights), weight)) for weight, road in roads.items()]
     places, heights, weights = (np.concatenate(column) for column in zip(*found, strict=True))
     near = np.isfinite(cKDTree(poses[:, :2, 3]).query(places, distance_upper_bound=REACH - 2 * EDGE)[0])
     return places[near], heights[near], weights[near] * (CELL / EDGE) ** 2
@@ -124,7 +122,7 @@ def _fitted(
     x, y = (places - cells).T
     shares = np.stack([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y], axis=1)
     nodes = np.stack([number[tuple((cells + corner).T)] for corner in ((0, 0), (0, 1), (1, 0), (1, 1))], axis=1)
-    count, rows = number.max() + 1, np.repeat(np.arange(len(known)), 4)
+    count, rows = int(number.max()) + 1, np.repeat(np.arange(len(known)), 4)
     at_places = sparse.csr_matrix((shares.ravel(), (rows, nodes.ravel())), (len(known), count))
     smooth = STIFFNESS * _squared(number, [1.0, -2.0, 1.0], count) + LEVEL * _squared(number, [-1.0, 1.0], count)
     mean, own = known.mean(), np.abs(weights)
@@ -151,6 +149,6 @@ def _squared(number: Int[np.ndarray, "x y"], stencil: list[float], count: int) -
     return total
 
 
-def _corners(nodes: Int[np.ndarray, "x y"]) -> tuple[Bool[np.ndarray, "a b"] | Int[np.ndarray, "a b"], ...]:
+def _corners(nodes: Int[np.ndarray, "x y"]) -> tuple[Int[np.ndarray, "x_less_1 y_less_1"], ...]:
     """The values at the four nodes of each cell: the first, the next along y, the next along x, the last."""
     return nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]
