@@ -70,8 +70,8 @@ def test_a_view_from_one_side_has_no_back():
     mesh = fused_mesh([image_of_ball(place)], EDGE)
     assert len(mesh) and mesh.vertices[:, 0].min() >= 0.0
     middles, areas = facing(mesh)
-    front = middles[:, 0] > 1.4  # not at the edge of what it hides
-    assert front.sum() > 300 and (((place - middles) * areas).sum(axis=1)[front] > 0.0).all()
+    towards = ((place - middles) * areas).sum(axis=1)[middles[:, 0] > 1.0]  # not at the edge of what it hides
+    assert towards[towards < 0.0].sum() > -0.02 * towards.sum()
 
 
 def test_what_one_image_shows_and_others_look_through_is_left_out():
