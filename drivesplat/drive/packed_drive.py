@@ -37,7 +37,7 @@ class PackedManifest:
     scene: str
     method: str
     folder: str
-    files: dict[str, str]
+    files: dict[str, Any]
 
     def fault(self) -> str | None:
         """What no manifest has, None without a fault."""
