@@ -32,7 +32,7 @@ MAX_BLOCKS = 16_000
 COARSER = 1.25
 BEHIND = 2.0
 """Metres behind what a pixel shows up to which it says that there is something."""
-FULL_WEIGHT, LEAST_COSINE = 10.0, 0.05
+FULL_WEIGHT, MIN_COSINE = 10.0, 0.05
 """Metres up to which depth has full weight; beyond, its weight falls with the square of the distance. It is also
 proportional to the cosine between ray and normal, or to the least one."""
 OF_NOTHING = 0.3
@@ -87,7 +87,7 @@ class DepthImage:
         rays = self.points - self.camera_to_world[:3, 3]
         cosine = np.abs((rays * self.normals).sum(axis=-1)) / np.maximum(np.linalg.norm(rays, axis=-1), 1e-9)
         near = np.minimum(1.0, FULL_WEIGHT / np.maximum(self.depth, 1e-9)) ** 2
-        weights = np.where(self.shows, near * np.maximum(cosine, LEAST_COSINE), OF_NOTHING)
+        weights = np.where(self.shows, near * np.maximum(cosine, MIN_COSINE), OF_NOTHING)
         return weights.astype(np.float32)
 
 

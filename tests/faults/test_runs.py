@@ -259,6 +259,7 @@ LOOK_SCRIPTS = {
     "export_usd": "vanilla/scene.usdz",
     "export_viewer": "vanilla/viewer.html",
     "export_colmap": "vanilla/colmap/points3D.txt",
+    "export_alpasim": "vanilla/scene.alpasim.usdz",
 }
 """Scripts, and a file of each that it cannot write."""
 

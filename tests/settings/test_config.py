@@ -18,7 +18,8 @@ from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_sett
 
 LOOKS = (
     "tracks", "film", "compare", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd",
-    "export_viewer", "export_colmap", "export_spz", "export_sog", "lidar_picture", "lidar_film", "truth_film",
+    "export_viewer", "export_colmap", "export_spz", "export_sog", "export_alpasim", "lidar_picture", "lidar_film",
+    "truth_film",
 )  # fmt: skip
 OF_SCENES = (
     *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "tracks", "compare",
