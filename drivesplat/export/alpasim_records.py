@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.editing.actors import other_objects
+from drivesplat.editing.ego import MAX_LEAD
 from drivesplat.export.sampled_motion import sample_motion
 from drivesplat.io.storage import Provenance
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.shutter import readout_of
 from drivesplat.settings.simulate import VehicleBody
-from drivesplat.trajectories.camera_path import film_timestamps, recorded_frames
+from drivesplat.trajectories.camera_path import film_timestamps, recorded_frames, recorded_timestamps
 from drivesplat.trajectories.edited_actors import EditedActor
 
 SEQUENCE = "dummy_chunk_id"
@@ -31,6 +32,8 @@ RATE = 30
 """Poses of the vehicle a second, besides those of images."""
 EXPOSURE_US = 1000
 """The length of an image without a known readout, microseconds: AlpaSim wants some."""
+LEAD_US = round(1e6 * MAX_LEAD)
+"""Microseconds before its first pose and after its last one in which the path of the vehicle is known."""
 IDENTITY = np.eye(4).tolist()
 LABELS = {
     ObjectClass.CAR: "automobile",
@@ -70,7 +73,7 @@ class AlpasimScene:
 
     @classmethod
     def of(cls, drive: TrainedDrive, scene_id: str) -> "AlpasimScene":
-        images = {name: _image_times(drive, name) for name in drive.cameras}
+        images = {name: times for name in drive.cameras if (times := _image_times(drive, name))}
         ends = np.array([time for own in images.values() for image in own for time in image], dtype=np.int64)
         regular = film_timestamps(int(ends.min()), int(ends.max()), RATE)
         return cls(drive, scene_id, images, np.unique(np.concatenate([ends, (ends[::2] + ends[1::2]) // 2, regular])))
@@ -95,11 +98,15 @@ class AlpasimScene:
 
 
 def _image_times(drive: TrainedDrive, name: str) -> list[list[int]]:
-    """The begin and the end of the readout of each image of a camera; without a known readout EXPOSURE_US about it."""
+    """The begin and the end of the readout of each image of a camera, where the path of the vehicle is known, by the
+    images of the first camera; without a known readout EXPOSURE_US about it."""
     sensor = next((camera for camera in drive.scene.cameras if camera.name == name), None)
     readout_us = 0 if sensor is None else round(1e6 * np.abs(readout_of(sensor)).sum())
     length, found = readout_us or EXPOSURE_US, []
+    known = recorded_timestamps(drive.scene, drive.cameras[0])[[0, -1]] + [-LEAD_US, LEAD_US]
     for frame in recorded_frames(drive.scene, name):
+        if not known[0] <= frame.timestamp <= known[1]:
+            continue
         middle = frame.timestamp + (round(1e6 * frame.readout_middle_s) if readout_us else 0)
         found.append([middle - length // 2, middle - length // 2 + length])
     return found
@@ -117,7 +124,7 @@ def metadata(scene: AlpasimScene, scene_id: str, provenance: Provenance) -> dict
         "dataset_hash": provenance["inputs_sha256"],
         "uuid": scene_id.removeprefix("clipgt-"),
         "is_resumable": False,
-        "sensors": {"camera_ids": drive.cameras, "lidar_ids": drive.lidars},
+        "sensors": {"camera_ids": [*scene.images], "lidar_ids": drive.lidars},
         "logger": {"name": f"drivesplat {drive.where}", "run_id": name, "run_url": None},
         "time_range": {"start": start, "end": end},
         "training_step_outputs": {},

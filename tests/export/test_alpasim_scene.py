@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers.shared_runs import CAR
+from helpers.shared_runs import CAR, made_once
 from helpers.workflow_copy import WorkflowCopy
 from plyfile import PlyData
 
@@ -39,12 +39,17 @@ LABELS = {
 
 @pytest.fixture(scope="module")
 def copy(finished_run, tmp_path_factory) -> WorkflowCopy:
-    made = finished_run.again(tmp_path_factory.mktemp("alpasim") / "workflow")
-    made.config["export"] = {"vehicle": BODY.model_dump()}
-    made.write_config()
-    done = made.run(TARGET)
-    assert done.returncode == 0, done.stdout
-    return made
+    """A workflow with the scene of one method, made once for all workers."""
+
+    def run(folder: Path) -> None:
+        made = finished_run.again(folder / "workflow")
+        made.config["export"] = {"vehicle": BODY.model_dump()}
+        made.write_config()
+        done = made.run(TARGET)
+        assert done.returncode == 0, done.stdout
+
+    folder = made_once(tmp_path_factory, "alpasim", run) / "workflow"
+    return WorkflowCopy(folder, yaml.safe_load((folder / "mine.yaml").read_text()))
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +330,8 @@ def test_another_process_writes_the_same_bytes(usdz, drive, tmp_path):
     assert {key for key in records[0] if records[0][key] != records[1][key]} <= {"version_string", "dataset_hash"}
 
 
-def test_the_target_makes_a_scene_of_each_method_and_again_only_after_a_change(copy):
+def test_the_target_makes_a_scene_of_each_method_and_again_only_after_a_change(copy, tmp_path):
+    copy = copy.again(tmp_path / "workflow")
     assert copy.planned("alpasim") == {"export_alpasim": 1, "alpasim": 1}  # vanilla
     with copy.set_to(export={"vehicle": {"length": 4.0}, "formats": ["alpasim"]}):
         assert copy.planned("exports") == {"export_alpasim": 2, "exports": 1}
