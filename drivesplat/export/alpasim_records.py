@@ -31,7 +31,7 @@ CONTROLLABLE = "CONTROLLABLE"
 RATE = 30
 """Poses of the vehicle a second, besides those of images."""
 EXPOSURE_US = 1000
-"""The length of an image without a known readout, microseconds: AlpaSim wants some."""
+"""The length of an image without a known readout, microseconds: AlpaSim refuses images that end when they begin."""
 LEAD_US = round(1e6 * MAX_LEAD)
 """Microseconds before its first pose and after its last one in which the path of the vehicle is known."""
 IDENTITY = np.eye(4).tolist()
