@@ -75,7 +75,7 @@ class RunningServer:
 @contextmanager
 def running_server(paths: Sequence[Path], device: str, options: Sequence[str] = ()) -> Iterator[RunningServer]:
     """A server of drives, until the block ends."""
-    command = [sys.executable, "-m", "drivesplat.cli.main", "serve", *map(str, paths), "--address", "127.0.0.1:0"]
+    command = [sys.executable, "-m", "drivesplat.cli", "serve", *map(str, paths), "--address", "127.0.0.1:0"]
     command += ["--metrics-port", "0", "--device", device, *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

@@ -124,7 +124,7 @@ make_venv() {
 # The command drivesplat, and `import drivesplat` in any folder. Whoever has no network goes without.
 install_command() {
   .venv/bin/python -m pip install --quiet --no-deps -e . ||
-    say "the command drivesplat could not be installed (see above); python -m drivesplat.cli.main does the same here"
+    say "the command drivesplat could not be installed (see above); python -m drivesplat.cli does the same here"
 }
 
 # What is compiled at its first use otherwise, and waited for then: bytecode, and what trains and makes worlds on

@@ -457,7 +457,7 @@ def test_scans_of_a_fixed_model_replay_one_graph(captures, monkeypatch):
     assert len(captures) == 1 and captures[0] is not None
     for view, picture in zip(views, found, strict=True):
         alone = model.scan(view)
-        assert float(alone.alpha.max()) > 0.5
+        assert float(alone.alpha.max()) > 0.1
         for name in ("range", "returned", "intensity", "alpha"):
             torch.testing.assert_close(getattr(picture, name), getattr(alone, name), atol=1e-4, rtol=1e-4)
 

@@ -10,10 +10,11 @@ from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.occlusion import patches, unoccluded
 from drivesplat.lidar.sweeps import returns_of
 from drivesplat.scene.images import continuous_intrinsics, target_size
+from drivesplat.scene.recorded_shutters import shutter_of
 from drivesplat.scene.regions import fill, hulls_in
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
-from drivesplat.scene.shutter import shutter_of, where_seen
+from drivesplat.scene.shutter import where_seen
 from drivesplat.scene.splits import Group
 from drivesplat.settings.lidar_depth import LidarDepthJob
 

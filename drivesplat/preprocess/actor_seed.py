@@ -17,10 +17,11 @@ from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.sweeps import returns_of
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
+from drivesplat.scene.recorded_shutters import shutter_of
 from drivesplat.scene.regions import MIN_PIXELS, hulls_in, owner_image
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
-from drivesplat.scene.shutter import Shutter, shutter_of, where_seen
+from drivesplat.scene.shutter import Shutter, where_seen
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
 from drivesplat.settings.train import PartName

@@ -27,10 +27,10 @@ from drivesplat.readers.outline import without_lidar, without_training
 from drivesplat.readers.sweeps import sweep_fault
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
+from drivesplat.scene.recorded_shutters import shutter_of
 from drivesplat.scene.regions import fill, hulls_in
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
-from drivesplat.scene.shutter import shutter_of
 from drivesplat.scene.splits import sweep_groups, training_images
 from drivesplat.scene.tracks import boxes_of, moving_tracks
 from drivesplat.settings.images import ImageSettings

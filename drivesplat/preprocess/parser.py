@@ -8,8 +8,8 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.scene.images import continuous_intrinsics, target_size
+from drivesplat.scene.recorded_shutters import shutters
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.shutter import shutters
 from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames, sweep_groups
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
 from drivesplat.settings.images import ParserJob

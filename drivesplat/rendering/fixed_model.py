@@ -88,7 +88,7 @@ class FixedModel:
     def __init__(self, model: SplatModel):
         self.model = model
         self._same: dict[tuple[bool, bool], dict[int, Gaussians]] = {}  # by what is wanted, then by number of the part
-        self._kinds: list[_Kind] = []  # the one used last is the last
+        self._kinds: list[_RenderingKind] = []  # the one used last is the last
         self._pool: MemoryPool | None = None
         self._grids: list[tuple[ScanRays, RayGrid]] = []  # the one used last is the last
         self._captures = graphs_supported(model.parts[0].params["means"].device)
@@ -188,16 +188,16 @@ class FixedModel:
                 kind.graph = None
         else:
             shared = [own for same in self._same.values() for own in same.values()]
-            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _Kind(view, sets, needs, shared)]
+            self._kinds = [*self._kinds[1 - MAX_GRAPHS :], _RenderingKind(view, sets, needs, shared)]
         return Pending(rendered, torch.empty(0, dtype=torch.int32), [], retry)
 
-    def _kind_of(self, view: View | ScanView, sets: Sequence[Gaussians]) -> "_Kind | None":
+    def _kind_of(self, view: View | ScanView, sets: Sequence[Gaussians]) -> "_RenderingKind | None":
         """The known kind of a rendering; that to which the fewest Gaussians are copied."""
         form = _form(view)
         known = [kind for kind in self._kinds if kind.has(form, sets)]
         return max(known, key=lambda kind: sum(kind.same), default=None)
 
-    def _captured(self, kind: "_Kind", render: Rendering[Any, Shown]) -> CudaGraph[Shown] | None:
+    def _captured(self, kind: "_RenderingKind", render: Rendering[Any, Shown]) -> CudaGraph[Shown] | None:
         """A graph of renderings of a kind; None where the GPU or its driver refuses. Graphs are replayed one after the
         other and their results copied before, so that they can share memory."""
         device = _inputs(kind.view)[0].device
@@ -219,7 +219,7 @@ class FixedModel:
         return dropped
 
 
-class _Kind:
+class _RenderingKind:
     """Renderings of one graph: its inputs, into which those of others are copied. `needs` are the most entries that
     each of their lists needed. Sets that are among `shared` are the same in all of them."""
 

@@ -33,6 +33,7 @@ from drivesplat.model.states import SCAN
 from drivesplat.rasterization.scans import RayGrid
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.simulate.held_out import GROUPS, held_out_figures
 from drivesplat.simulate.seen_from import (
     SeenActor,
     SeenGaussians,
@@ -41,7 +42,6 @@ from drivesplat.simulate.seen_from import (
     sides_of_objects,
     sides_of_parts,
 )
-from drivesplat.simulate.validity import GROUPS, GROWTHS, held_out_figures
 from drivesplat.training.unseen import MIN_WEIGHT
 
 MAX_RAYS = 8192
@@ -50,11 +50,11 @@ MIN_RAYS = 1.0
 """Sum of the weights in the rays of a training scan that an object's Gaussians need for the scan to have seen it."""
 MAX_MAGNIFICATION = 4.0
 """The largest magnification that counts, and that of what no training scan saw."""
-DEFAULT_GROWTH = 1.7
-"""`a` where held-out scans do not tell: that of the demo's drive."""
-RESIDUALS = (0.75, 2.4)
-"""The 5 % and 95 % quantiles of true divided by expected errors in the calibration, to the power of 1.5: it has a
-single street."""
+DEFAULT_GROWTH, GROWTHS = 1.7, (0.1, 10.0)
+"""`a` where held-out scans do not tell, that of the demo's drive; and its limits."""
+RESIDUALS = (0.5, 2.4)
+"""True divided by expected errors: the 5 % quantile of a second street, and the 95 % quantile of the demo's to the
+power of 1.5."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class ScanValidity:
 
 
 @dataclass(frozen=True)
-class _Means:
+class _RayMeans:
     """Means over the rays of a scan that return: shares of `ScanValidity`, and `nearer`, sqrt(magnification - 1)."""
 
     supported: float
@@ -150,10 +150,10 @@ class ScanKnowledge:
         validity = known * min(1.0, self.reference / error)
         return ScanValidity(distance, means.supported, means.unseen, means.turned, error, interval, validity)
 
-    def _expected(self, means: _Means) -> float:
+    def _expected(self, means: _RayMeans) -> float:
         return self.error * (1.0 + self.growth * means.nearer)
 
-    def _means(self, world: WorldState, view: ScanView, returned: Bool[Tensor, "b a"]) -> _Means | None:
+    def _means(self, world: WorldState, view: ScanView, returned: Bool[Tensor, "b a"]) -> _RayMeans | None:
         """The means over the rays that return, of at most MAX_RAYS rays; None where none does."""
         every = math.ceil(returned.numel() / MAX_RAYS)
         counted = returned[:, ::every]
@@ -175,10 +175,10 @@ class ScanKnowledge:
             values.append(torch.stack([supported, *of_kind, (magnification - 1.0).sqrt()], dim=1))
         found = composited_scan(concatenate_shapes(sets), small, torch.cat(values))
         of_rays = found.values[counted] / found.alpha[counted].clamp(min=1e-6)[:, None]
-        return _Means(*of_rays.mean(dim=0).tolist())
+        return _RayMeans(*of_rays.mean(dim=0).tolist())
 
     @torch.no_grad()
-    def _means_of_scan(self, scan: RecordedScan) -> _Means | None:
+    def _means_of_scan(self, scan: RecordedScan) -> _RayMeans | None:
         """The means of the rays of a recorded scan of the drive as recorded."""
         drive = self.drive if self.drive.before is None else self.drive.before
         world, view = drive.state(scan.seconds, outside="clamp"), view_of_scan(scan, drive.beam_spread, drive.device)
@@ -203,7 +203,7 @@ class ScanKnowledge:
         logs = [math.log(fitted._expected(one)) for one in near or self._of_scans(training)]
         return replace(fitted, reference=math.exp(sum(logs) / len(logs)) if logs else fitted.error)
 
-    def _of_scans(self, scans: Sequence[RecordedScan]) -> list[_Means]:
+    def _of_scans(self, scans: Sequence[RecordedScan]) -> list[_RayMeans]:
         found = (self._means_of_scan(scan) for scan in evenly_chosen(scans))
         return [means for means in found if means is not None]
 

@@ -8,8 +8,8 @@ import pytest
 from helpers.hand_made_assets import filled_car
 
 from drivesplat.cli import assets as assets_command
+from drivesplat.cli.__main__ import main
 from drivesplat.cli.assets import with_action
-from drivesplat.cli.main import main
 from drivesplat.editing.assets.asset import read_asset, write_asset
 from drivesplat.editing.assets.exchange import FORMATS
 from drivesplat.scene.object_class import ObjectClass

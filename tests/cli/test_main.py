@@ -11,8 +11,8 @@ import yaml
 from helpers import REPOSITORY
 
 from drivesplat import SNAKEFILE, WORKFLOW
-from drivesplat.cli import main as command_line
-from drivesplat.cli.main import chosen_page, exported_pages, main, results_folder, snakemake_command
+from drivesplat.cli import __main__ as command_line
+from drivesplat.cli.__main__ import chosen_page, exported_pages, main, results_folder, snakemake_command
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation import summary
 from drivesplat.io.this_copy import in_this_copy
@@ -87,7 +87,7 @@ def ended(command: list[str], **streams) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-CONFIG = ["-c", "import sys; from drivesplat.cli.main import main; sys.exit(main(['config']))"]
+CONFIG = ["-c", "import sys; from drivesplat.cli.__main__ import main; sys.exit(main(['config']))"]
 SCHEMA = ["-m", "drivesplat.readers.drive", "schema"]
 
 

@@ -95,7 +95,7 @@ def test_an_installed_copy_has_the_code_digests_of_the_checkout_and_its_own_page
 def test_an_installed_copy_plans_the_demo_in_an_empty_folder(site, tmp_path):
     """With the packaged Snakefile, presets, edits and default profile; it writes nothing where it is installed."""
     before = {file for file in site.rglob("*") if "__pycache__" not in file.parts}
-    code = "import sys; from drivesplat.cli.main import main; sys.exit(main())"
+    code = "import sys; from drivesplat.cli.__main__ import main; sys.exit(main())"
     planned = python(site, code, "run", "-n", "--configfile", "presets/demo.yaml", "--", "all", cwd=tmp_path)
     assert planned.returncode == 0, planned.stderr
     output = planned.stdout + planned.stderr

@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import drivesplat
-from drivesplat.cli.main import main
+from drivesplat.cli.__main__ import main
 from drivesplat.drive.pose_files import read_poses
 from drivesplat.errors import RequestError
 from drivesplat.readers.truth import DEPTH_UNITS_PER_METRE

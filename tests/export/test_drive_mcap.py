@@ -17,7 +17,7 @@ from helpers.mcap_files import Recording, columns_of, nanoseconds, pose_of, reco
 from helpers.scanned_street import REVOLUTION_S, scan_records, scanned_street
 from PIL import Image
 
-from drivesplat.cli.main import main
+from drivesplat.cli.__main__ import main
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.editing.drive_folder import write_rendered_drive
 from drivesplat.editing.scan_folder import write_scan_folder

@@ -13,10 +13,10 @@ from drivesplat.preprocess.poses.refine import refine_from_matches
 from drivesplat.preprocess.poses.refinement_record import Refinement
 from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.recorded_shutters import shutters
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.sensors import Camera
-from drivesplat.scene.shutter import shutters
 
 READOUT_S = 0.05
 KEY_FRAMES = 10

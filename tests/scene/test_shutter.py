@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drivesplat.scene.recorded_shutters import shutter_of, shutters
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.sensors import Camera
-from drivesplat.scene.shutter import Shutter, displaced, readout_of, shutter_of, shutters, where_seen
+from drivesplat.scene.shutter import Shutter, displaced, readout_of, where_seen
 
 SIZE = (640, 360)
 K = np.array([[500.0, 0.0, 310.0], [0.0, 520.0, 190.0], [0.0, 0.0, 1.0]])

@@ -24,7 +24,7 @@ from helpers.patience import PATIENCE_S, wait_until
 from helpers.served_drives import CAMERA, SERVICE, SensorClient, decoded, image_request, message_of, pose_of, served
 
 import drivesplat
-from drivesplat.cli.main import main
+from drivesplat.cli.__main__ import main
 from drivesplat.errors import RequestError
 from drivesplat.settings.simulate import VehicleSettings
 from drivesplat.simulate.vehicle import RecordedGround, advanced, control_towards, state_of
@@ -122,7 +122,7 @@ def test_the_command_refuses_half_of_an_encryption(results, capsys):
 
 
 def test_a_signal_ends_the_command_when_calls_have_been_answered(results, sound):
-    command = [sys.executable, "-m", "drivesplat.cli.main", "serve", str(results / "0002"), "--address", "127.0.0.1:0"]
+    command = [sys.executable, "-m", "drivesplat.cli", "serve", str(results / "0002"), "--address", "127.0.0.1:0"]
     process = subprocess.Popen([*command, "--device", "cpu"], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
     try:
         said = [process.stdout.readline() for _ in range(2)]

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from drivesplat.preprocess.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics
-from drivesplat.scene.shutter import Shutter, displaced, shutters
+from drivesplat.scene.recorded_shutters import shutters
+from drivesplat.scene.shutter import Shutter, displaced
 
 FAR = 1e4
 """Depth in metres of features without a point."""

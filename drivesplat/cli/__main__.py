@@ -225,4 +225,4 @@ def chosen_page(
 
 
 if __name__ == "__main__":
-    sys.exit(main(program="python -m drivesplat.cli.main"))
+    sys.exit(main(program="python -m drivesplat.cli"))
