@@ -20,7 +20,13 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         COMMAND, help="serve trained drives as the renderer of AlpaSim, over gRPC (docs/simulators.md)"
     )
-    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help="folder of results, of a scene or a method")
+    parser.add_argument(
+        "paths",
+        type=Path,
+        nargs="+",
+        metavar="PATH",
+        help="folder of results, a scene or a method, or scene.alpasim.usdz",
+    )
     parser.add_argument("--address", default="127.0.0.1:50051", help="host and port to listen at (127.0.0.1:50051)")
     parser.add_argument("--device", default="any", choices=["any", "cuda", "cpu"], help="any: a GPU where there is one")
     parser.add_argument(

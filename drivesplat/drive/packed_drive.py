@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from drivesplat.errors import ResultError
 from drivesplat.io.aligned_zip import ArchiveError, copy_member, is_inside, open_archive, read_member
 from drivesplat.io.regular_file import regular_file
@@ -24,6 +26,7 @@ from drivesplat.io.typed_record import field_values, typed_record
 MANIFEST = "drivesplat/manifest.json"
 FILES = "drivesplat/results/"
 """Members of an archive: the list of files, and what precedes the names of the files."""
+METADATA = "metadata.yaml"
 SCHEMA = 1
 MAX_MANIFEST_BYTES = 64_000_000
 
@@ -87,6 +90,24 @@ def unpack_drive(path: str | Path, cache: str | Path | None = None) -> Path:
         why = str(error) if isinstance(error, ArchiveError) else f"cannot be read ({error})"
         raise ResultError(f"{path}: {why}; export it again: the target 'alpasim' makes it") from None
     return folder / manifest.folder
+
+
+def packed_scene_id(path: str | Path, checkpoint: Path | None = None) -> str | None:
+    """The id by which a simulator knows the scene of an archive, `scene_id` of its metadata.yaml. None where the
+    archive holds another training than the file `checkpoint`.
+
+    Raises ResultError, one sentence that names the file, where it is missing, damaged or of another version.
+    """
+    path = Path(path)
+    try:
+        with open_archive(regular_file(path)) as archive:
+            manifest = _manifest(read_member(archive, MANIFEST, MAX_MANIFEST_BYTES))
+            found = yaml.safe_load(read_member(archive, METADATA, MAX_MANIFEST_BYTES))
+        packed = manifest.files[f"{manifest.folder}/checkpoint.npz"]
+        return None if checkpoint is not None and sha256_file(checkpoint) != packed else str(found["scene_id"])
+    except (ArchiveError, OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        why = str(error) if isinstance(error, ArchiveError) else f"has a damaged {METADATA} ({error})"
+        raise ResultError(f"{path}: {why}; export it again: the target 'alpasim' makes it") from None
 
 
 def _manifest(text: bytes) -> PackedManifest:

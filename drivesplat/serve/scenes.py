@@ -3,12 +3,13 @@
 import gc
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import torch
 
+from drivesplat.drive.packed_drive import packed_scene_id, unpack_drive
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.errors import DeviceError, RequestError
 from drivesplat.model.checkpoint import model_file
@@ -17,22 +18,30 @@ from drivesplat.serve.faults import ServiceError, as_service_errors
 from drivesplat.serve.poses import FrameTimes
 from drivesplat.trajectories.edited_actors import EditedActor
 
-CHECKPOINT, MASK_FILE = "checkpoint.npz", "own_car.json"
+CHECKPOINT, MASK_FILE, ARCHIVE = "checkpoint.npz", "own_car.json", "scene.alpasim.usdz"
 
 
 @dataclass(frozen=True)
 class DriveSource:
-    """A trained drive that can be opened: the result folder of a `method` of a `scene`."""
+    """A trained drive that can be opened: the result folder of a `method` of a `scene`. `archive_id` is its id in
+    scene.alpasim.usdz (None: there is no such file)."""
 
     scene: str
     method: str
     folder: Path
+    archive_id: str | None = None
 
     @classmethod
     def of(cls, folder: Path) -> "DriveSource":
-        """The source of a method's result folder."""
-        resolved = folder.resolve()
-        return cls(resolved.parent.name, resolved.name, folder)
+        """The source of a method's result folder. Raises ResultError for a damaged archive in it."""
+        resolved, archive = folder.resolve(), folder / ARCHIVE
+        own = packed_scene_id(archive, folder / CHECKPOINT) if archive.is_file() else None
+        return cls(resolved.parent.name, resolved.name, folder, own)
+
+    @classmethod
+    def packed(cls, archive: Path) -> "DriveSource":
+        """The source of a drive in an archive, which is unpacked. Raises ResultError where this fails."""
+        return replace(cls.of(unpack_drive(archive)), archive_id=packed_scene_id(archive))
 
     @property
     def full_name(self) -> str:
@@ -51,10 +60,12 @@ class DriveSource:
 
 
 def find_sources(paths: Iterable[Path]) -> dict[str, DriveSource]:
-    """The trained drives of result folders (all trained methods of all scenes below) and of methods' folders, by scene
-    id: the name of the scene, or `scene/method` where several methods of a scene are served.
+    """The trained drives of result folders (all trained methods of all scenes below), of methods' folders, and of
+    scenes for AlpaSim (`*.usdz`, also those of a folder that has nothing else), by scene id: the name of the scene, or
+    `scene/method` where several methods of a scene are served.
 
-    Raises RequestError for a path without any, and for two scenes of one name in different folders.
+    Raises RequestError for a path without any, and for two scenes of one name in different folders; ResultError for a
+    damaged archive.
     """
     sources = {source.folder.resolve(): source for path in paths for source in _sources_of(path)}
     methods = Counter(source.scene for source in sources.values())
@@ -70,12 +81,20 @@ def find_sources(paths: Iterable[Path]) -> dict[str, DriveSource]:
     return found
 
 
+def scene_ids(sources: Mapping[str, DriveSource]) -> list[str]:
+    """The ids that a simulator may know scenes by: their names, and then those of their archives."""
+    return [*sources, *(source.archive_id for source in sources.values() if source.archive_id)]
+
+
 def _sources_of(path: Path) -> Iterator[DriveSource]:
-    """The trained drives of one argument. A scene that comes as a file, as `*.usdz`, is opened here."""
+    """The trained drives of one argument."""
     if path.is_file():
-        raise RequestError(f"{path} is a file: name a folder of results, such as results, or results/demo/street")
+        yield DriveSource.packed(path)
+        return
     folders = [file.parent for depth in ("", "*/", "*/*/") for file in sorted(path.glob(f"{depth}{CHECKPOINT}"))]
-    if not folders:
+    archives = [] if folders else sorted(path.glob("*.usdz"))
+    yield from map(DriveSource.packed, archives)
+    if not folders and not archives:
         model_file(path)  # a training that runs; raises RequestError for a folder without any
         folders = [path]
     yield from map(DriveSource.of, folders)
@@ -120,10 +139,12 @@ class LoadedDrives:
         self.offered, self.max_loaded = offered, max_loaded
         self._device = device
         self._aliases = {source.full_name: name for name, source in offered.items()}
+        self._aliases |= {source.archive_id: name for name, source in offered.items() if source.archive_id}
         self._loaded: dict[str, LoadedDrive] = {}  # the one used last is the last
 
     def name_of(self, scene_id: str) -> str:
-        """The scene id of a request as it is offered; `scene/method` also names a scene of one method. Raises
+        """The scene id of a request as it is offered; `scene/method` also names a scene of one method, and the
+        id of its archive any scene. Raises
         ServiceError (NOT_FOUND) for a scene that is not served."""
         name = scene_id if scene_id in self.offered else self._aliases.get(scene_id)
         if name is None:
@@ -135,7 +156,7 @@ class LoadedDrives:
     @property
     def names(self) -> list[str]:
         """The scene ids of the drives in memory."""
-        return list(self._loaded)
+        return scene_ids({name: self.offered[name] for name in self._loaded})
 
     def get(self, scene_id: str) -> LoadedDrive:
         """A drive, which is loaded if it is not in memory. Raises ServiceError for an unknown scene, a result that

@@ -18,7 +18,7 @@ from drivesplat.errors import RequestError
 from drivesplat.machine.device import choose_device
 from drivesplat.serve.faults import ServiceError, invalid
 from drivesplat.serve.messages import METHODS, SERVICE
-from drivesplat.serve.scenes import find_sources
+from drivesplat.serve.scenes import find_sources, scene_ids
 from drivesplat.serve.service import MAX_MESSAGE_BYTES, JpegEncoder, SensorService, ServiceOptions, Unlisted
 from drivesplat.settings.device import DeviceSettings
 
@@ -56,7 +56,7 @@ class SensorServer:
         """Starts a server.
 
         Args:
-            paths: Folders of results, of scenes or of methods.
+            paths: Folders of results, of scenes or of methods; `scene.alpasim.usdz`, or a folder of such files.
             address: Host and port; port 0 is any free port.
             device: 'any' (the GPU where there is one), 'cuda' or 'cpu'.
             max_loaded: Number of scenes that may be in memory at a time.
@@ -77,7 +77,7 @@ class SensorServer:
         self.device = choose_device(DeviceSettings.model_validate(device), min_free_gb=0.0)
         options = ServiceOptions(_version(), self.device.type, max_loaded, unlisted, jpeg)
         _require_free(host, port)
-        self.scenes = list(sources)
+        self.scenes = scene_ids(sources)
         self.service = SensorService(sources, options)
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="drivesplat-serve")
         self._server = self._grpc.server(

@@ -23,7 +23,7 @@ from drivesplat.serve.figures import ServiceFigures
 from drivesplat.serve.messages import wire
 from drivesplat.serve.poses import ListedObjects, pose_message
 from drivesplat.serve.requests import ImageRequest, RequestReader, ScanRequest, WorldKey, require_affordable
-from drivesplat.serve.scenes import DriveSource, LoadedDrive, LoadedDrives
+from drivesplat.serve.scenes import DriveSource, LoadedDrive, LoadedDrives, scene_ids
 
 API_VERSION = 0, 54, 0
 """The version of AlpaSim's messages that the service speaks."""
@@ -79,7 +79,7 @@ class SensorService:
 
     def get_available_scenes(self, request: Any, active: IsActive) -> Any:
         """The ids of all scenes."""
-        return wire.AvailableScenesReturn(scene_ids=self._sources)
+        return wire.AvailableScenesReturn(scene_ids=scene_ids(self._sources))
 
     def get_loaded_scenes(self, request: Any, active: IsActive) -> Any:
         """The scenes in memory, each of which serves any number of clients."""

@@ -2,6 +2,7 @@
 
 import shutil
 import weakref
+from pathlib import Path
 
 import grpc
 import numpy as np
@@ -9,7 +10,11 @@ import pytest
 from carla_driver_interface._proto import common_pb2, sensorsim_pb2
 from helpers.served_drives import CAMERA, image_request, pose_of, served
 
-from drivesplat.errors import DeviceError, RequestError
+import drivesplat
+from drivesplat.drive.packed_drive import packed_members, packed_scene_id
+from drivesplat.errors import DeviceError, RequestError, ResultError
+from drivesplat.export.alpasim import drive_files, scene_id
+from drivesplat.io.aligned_zip import write_aligned_zip
 from drivesplat.serve import scenes
 from drivesplat.serve.scenes import LoadedDrives, find_sources
 
@@ -26,14 +31,52 @@ def test_scenes_are_named_by_their_folders(results):
 
 
 def test_what_is_no_trained_drive_says_so(results, tmp_path):
-    file = tmp_path / "scene.usdz"
-    file.touch()
     shutil.copytree(results / "0002", tmp_path / "results/0002")
     for paths, words in (
-        ([tmp_path / "none"], "no checkpoint.npz"), ([file], "is a file"), ([results, tmp_path / "results"], "0002"),
+        ([tmp_path / "none"], "no checkpoint.npz"), ([results, tmp_path / "results"], "0002"),
     ):  # fmt: skip
         with pytest.raises(RequestError, match=words):
             find_sources(paths)
+
+
+@pytest.fixture
+def archive(results, tmp_path, monkeypatch) -> Path:
+    """The drive of results/0002/street as scenes/scene.alpasim.usdz, without what other programs read of it."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    drive = drivesplat.open(results / "0002/street", device="cpu")
+    members = packed_members(drive.folder, drive.scene.name, drive_files(drive))
+    path = tmp_path / "scenes/scene.alpasim.usdz"
+    path.parent.mkdir()
+    write_aligned_zip(path, {"metadata.yaml": f"scene_id: {scene_id(drive)}\n".encode(), **members})
+    return path
+
+
+def test_a_scene_for_alpasim_is_served_by_its_id_without_the_folder_of_results(results, street, archive):
+    own, stamp = packed_scene_id(archive), street.scene.frames[1].timestamp
+    seen = (stamp, stamp), (street.camera_to_world(CAMERA, street.scene.seconds(stamp)),) * 2
+    with served(results / "0002") as (_, client):
+        expected = client.render_rgb(image_request("0002", *seen)).image_bytes
+    for path in (archive, archive.parent):
+        with served(path) as (_, client):
+            assert [*client.get_available_scenes(EMPTY).scene_ids] == ["0002", own]
+            assert client.render_rgb(image_request(own, *seen)).image_bytes == expected
+            assert [entry.scene_id for entry in client.get_loaded_scenes(EMPTY).scenes] == ["0002", own]
+
+
+def test_a_folder_of_results_knows_the_id_of_the_scene_that_it_exported(results, archive, tmp_path):
+    folder = tmp_path / "results/0002/street"
+    shutil.copytree(results / "0002", folder.parent)
+    shutil.copy(archive, folder)
+    assert find_sources([folder])["0002"].archive_id == packed_scene_id(archive)
+    shutil.copy(results / "0001/street_lidar/checkpoint.npz", folder)
+    assert find_sources([folder])["0002"].archive_id is None, "another training"
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK", None])
+def test_a_damaged_scene_says_so(archive, damage):
+    archive.write_bytes(archive.read_bytes()[:-30] if damage is None else damage)
+    with pytest.raises(ResultError, match=r"scene\.alpasim\.usdz: .*; export it again"):
+        find_sources([archive])
 
 
 def test_a_scene_of_one_method_is_also_known_by_its_full_name(client):
