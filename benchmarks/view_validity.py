@@ -73,7 +73,11 @@ class TrueViews:
         camera = record.camera_name(0)
         for index in np.flatnonzero(record.is_key_frame & (record.camera_indices == record.camera_indices[0])).tolist():
             view = known.view(index, known.recording.frame(index), device)
-            yield "path", view, read_image(recorded_image(self._drive, index), record.image_size(index)) / 255.0
+            yield (
+                "path",
+                view,
+                read_image(recorded_image(record, self._drive.folder, index), record.image_size(index)) / 255.0,
+            )
             for yaw in YAWS:
                 turn = rigid(Rotation.from_euler("y", -yaw, degrees=True).as_matrix(), np.zeros(3))
                 pose = view.camera_to_world @ torch.from_numpy(turn).float().to(device)

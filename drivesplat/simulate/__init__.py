@@ -1,5 +1,5 @@
-"""Closed loop: a policy drives in a trained drive. The environment, other traffic, scores, and how far images can be
-trusted.
+"""Closed loop: a policy drives in a trained drive. The environment, other traffic, scores, and how far images and scans
+can be trusted.
 
 `DriveEnv` and `vector_env` need Gymnasium, an optional package (docs/closed_loop.md); `Simulation` does not.
 """

@@ -7,14 +7,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from drivesplat.drive.trained_drive import TrainedDrive
+from drivesplat.drive.recorded_drive import RecordedDrive
 from drivesplat.drive.world_actor import WorldActor
 from drivesplat.editing.placed_model import PlacedModel
 from drivesplat.errors import RequestError
@@ -23,6 +23,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
 from drivesplat.scene.images import read_image
 from drivesplat.scene.rigid import inverse
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.training.unseen import MIN_WEIGHT
 from drivesplat.trajectories.edited_actors import EditedActor
 from drivesplat.trajectories.seen_sides import TimedCameras
@@ -140,14 +141,14 @@ class TrainingCameras:
     segments: Float[Tensor, "s 2 3"]
 
     @classmethod
-    def of(cls, drive: TrainedDrive) -> "TrainingCameras":
+    def of(cls, record: TrainingRecord, device: torch.device) -> "TrainingCameras":
         """Those of a drive. A camera with one image has a path without length."""
-        record, segments = drive.record, []
+        segments: list[Any] = []
         for camera in np.unique(record.camera_indices):
             own = np.flatnonzero(record.camera_indices == camera)
             own = own[np.argsort(record.timestamps[own], kind="stable")]
             segments += zip(own, [*own[1:], own[-1]], strict=True)
-        poses = torch.from_numpy(record.camtoworlds).float().to(drive.device)
+        poses = torch.from_numpy(record.camtoworlds).float().to(device)
         trained = poses[torch.tensor(record.train_images)]
         return cls(trained[:, :3, 3], trained[:, :3, 2], poses[:, :3, 3][torch.tensor(np.array(segments))])
 
@@ -181,9 +182,9 @@ class SeenSky:
         return self.bins.flatten()[_bins_of(view.rays())].float()
 
 
-def training_images(drive: TrainedDrive) -> list[int]:
+def training_images(record: TrainingRecord) -> list[int]:
     """The indices of at most MAX_IMAGES training images, evenly spread."""
-    return evenly_chosen(drive.record.train_images)
+    return evenly_chosen(record.train_images)
 
 
 def evenly_chosen(items: Sequence[Item]) -> list[Item]:
@@ -192,30 +193,33 @@ def evenly_chosen(items: Sequence[Item]) -> list[Item]:
     return [items[i] for i in chosen]
 
 
-def recorded_image(drive: TrainedDrive, index: int) -> Path:
+def recorded_image(record: TrainingRecord, folder: Path, index: int) -> Path:
     """The file of a recorded image, which may be missing: relative paths begin in the workflow's folder, the current
-    one or the one that contains the folder of results."""
-    path = Path(drive.record.image_paths[index])
-    elsewhere = [folder / path for folder in drive.folder.absolute().parents[2:3]]
+    one or the one that contains the folder of results, of which `folder` is a method's."""
+    path = Path(record.image_paths[index])
+    elsewhere = [workflow / path for workflow in folder.absolute().parents[2:3]]
     return next((found for found in (path, *elsewhere) if found.is_file()), path)
 
 
 @torch.no_grad()
-def seen_by_training(drive: TrainedDrive, images: Sequence[int]) -> tuple[SeenGaussians, SeenSky]:
-    """What these training images saw of the drive as recorded. An image saw a Gaussian whose weights in its pixels,
-    without those that the vehicle's own body covers, sum to MIN_WEIGHT pixels. Without the files of the recorded images
-    there are no errors."""
-    paths = [recorded_image(drive, index) for index in images]
-    has_files, model = all(path.is_file() for path in paths), drive.model
-    views = [view_of(drive.record, index, drive.device) for index in images]
-    sky, of_sky = torch.zeros(SKY_BINS, dtype=torch.bool, device=drive.device), torch.zeros(2, device=drive.device)
-    seen, sums = [], torch.zeros(2, sum(part.row_count for part in model.parts), device=drive.device)
+def seen_by_training(
+    recording: RecordedDrive, folder: Path, model: SplatModel, device: torch.device, images: Sequence[int]
+) -> tuple[SeenGaussians, SeenSky]:
+    """What these training images saw of the model of the method with this result folder, as recorded. An image saw a
+    Gaussian whose weights in its pixels, without those that the vehicle's own body covers, sum to MIN_WEIGHT pixels.
+    Without the files of the recorded images there are no errors."""
+    record = recording.record
+    paths = [recorded_image(record, folder, index) for index in images]
+    has_files = all(path.is_file() for path in paths)
+    views = [view_of(record, index, device) for index in images]
+    sky, of_sky = torch.zeros(SKY_BINS, dtype=torch.bool, device=device), torch.zeros(2, device=device)
+    seen, sums = [], torch.zeros(2, sum(part.row_count for part in model.parts), device=device)
     for index, path, view in zip(images, paths, views, strict=True):
-        uncovered = torch.from_numpy(_uncovered(drive, index)).to(drive.device).float()
+        uncovered = torch.from_numpy(_uncovered(recording, index)).to(device).float()
         picture, values = model.render(view), [uncovered]
         transmitted = uncovered * (1.0 - picture.alpha) * (picture.alpha < SKY_ALPHA)
         if has_files:
-            recorded = torch.from_numpy(read_image(path, drive.record.image_size(index)) / 255.0).to(picture.image)
+            recorded = torch.from_numpy(read_image(path, record.image_size(index)) / 255.0).to(picture.image)
             error = (picture.image.clamp(0.0, 1.0) - recorded).square().mean(dim=2)
             values.append(uncovered * error)
             of_sky += torch.stack([transmitted.sum(), (transmitted * error).sum()])
@@ -251,38 +255,36 @@ class SeenActor:
         return bool(similar.sum() >= MIN_IMAGES), turn, float(magnifications.min(initial=np.inf))
 
 
-def seen_actors_of(drive: TrainedDrive) -> dict[str, SeenActor]:
-    """What training images saw of the objects of a drive, by the track or asset whose Gaussians they have. Objects that
-    hide each other are not accounted for."""
-    record, images = drive.record, np.array(drive.record.train_images)
+def seen_actors_of(record: TrainingRecord, actors: Sequence[EditedActor]) -> dict[str, SeenActor]:
+    """What training images saw of the objects of a drive as recorded, by the track whose Gaussians they have. Objects
+    that hide each other are not accounted for."""
+    images = np.array(record.train_images)
     poses, K = record.camtoworlds[images].astype(np.float64), record.Ks[images].astype(np.float64)
     cameras = TimedCameras(
         np.array([record.seconds(i) for i in record.train_images]), poses, K, record.image_sizes[images]
     )
-    recorded = drive if drive.before is None else drive.before
-    found = {actor.id: _seen_actor(cameras, actor) for actor in recorded.edited_actors}
-    return found | seen_assets_of(drive)
+    return {actor.id: _seen_actor(cameras, actor) for actor in actors}
 
 
-def seen_assets_of(drive: TrainedDrive) -> dict[str, SeenActor]:
-    """What the drives of inserted assets saw of them."""
-    inserted = [(actor.source, actor.seen) for actor in drive.edited_actors if actor.seen is not None]
+def seen_assets_of(actors: Sequence[EditedActor]) -> dict[str, SeenActor]:
+    """What the drives of the inserted assets among some objects saw of them, by asset."""
+    inserted = [(actor.source, actor.seen) for actor in actors if actor.seen is not None]
     return {source: SeenActor(seen[~np.isnan(seen)], None) for source, seen in inserted}
 
 
 def sides_of_parts(
-    drive: TrainedDrive, known: SeenGaussians, objects: Sides, placed: PlacedModel, sets: Sequence[Gaussians],
+    model: SplatModel, known: SeenGaussians, objects: Sides, placed: PlacedModel, sets: Sequence[Gaussians],
     shown: Sequence[Tensor], place: Float[Tensor, "3"], focal: Float[Tensor, ""],
 ) -> Iterator[tuple[bool, Tensor, Sides]]:  # fmt: skip
     """Of each part of a placed model, of which `sets` has the Gaussians and `shown` the indices of those that count:
     whether it has objects, indices, and the sides that a sensor sees. The indices of objects are those into `objects`,
-    the sides of the world's objects; of others they are the rows of the drive's model.
+    the sides of the world's objects; of others they are the rows of `model`, the one that `known` knows.
 
-    Raises RequestError for a model of another drive.
+    Raises RequestError where the placed model is none of `model`.
     """
-    rows = {id(part): own for part, own in zip(drive.model.parts, drive.model.rows, strict=True)}
+    rows = {id(part): own for part, own in zip(model.parts, model.rows, strict=True)}
     if any(not part.has_objects and id(part) not in rows for part in placed.model.parts):
-        raise RequestError(f"this world is not one of {drive.where}: open one drive, and take both from it")
+        raise RequestError("this world is not one of the drive that is known: open one drive, and take both from it")
     for part, own, chosen in zip(placed.model.parts, sets, shown, strict=True):
         if part.has_objects:
             number = torch.full_like(chosen, -1) if own.placement is None else own.placement[chosen]
@@ -316,9 +318,10 @@ def _joined(sides: Sequence[Sides]) -> Sides:
     return Sides(*(torch.cat([getattr(own, field.name) for own in sides]) for field in fields(Sides)))
 
 
-def _uncovered(drive: TrainedDrive, index: int) -> Bool[np.ndarray, "h w"]:
+def _uncovered(recording: RecordedDrive, index: int) -> Bool[np.ndarray, "h w"]:
     """The pixels of a training image that show more than the vehicle's own body."""
-    camera, size = drive.recording.camera_of_name(drive.record.camera_name(index)), drive.record.image_size(index)
+    record = recording.record
+    camera, size = recording.camera_of_name(record.camera_name(index)), record.image_size(index)
     return replace(camera, width=size[0], height=size[1]).uncovered()
 
 

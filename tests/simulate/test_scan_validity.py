@@ -2,18 +2,21 @@
 
 import dataclasses
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers import REPOSITORY
 from helpers.hand_made import about_z, round_gaussians
 from helpers.hand_made_drive import BEAM_SPREAD, drive_of
 from helpers.hand_made_street import AHEAD, street_actors, street_scene
 from helpers.records import recorded_scan
 from torch import nn
 
+import drivesplat
 from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError, ResultError
@@ -31,10 +34,11 @@ from drivesplat.simulate.run_stage import drive_runs
 from drivesplat.simulate.scan_validity import DEFAULT_GROWTH, MAX_MAGNIFICATION, RESIDUALS, ScanKnowledge, ScanValidity
 from drivesplat.simulate.simulation import Simulation
 from drivesplat.simulate.trust import Trust
+from drivesplat.simulate.validity import ViewValidity
 
-LIDAR = PoseableLidar.spinning(np.radians(np.linspace(-14.0, 6.0, 10)), 180, revolution_s=0.0)
-STEP_M, SCANS, HEIGHT = 4.0, 7, 1.8
-"""Training scans stand at 0, 4, ... 24 m along x, half a second apart."""
+LIDAR = PoseableLidar.spinning(np.radians(np.linspace(-14.0, 6.0, 8)), 120, revolution_s=0.0)
+STEP_M, SCANS, HEIGHT = 4.0, 5, 1.8
+"""Training scans stand at 0, 4, ... 16 m along x, half a second apart."""
 WALL_AT = 20.0
 """Metres to the left of the path."""
 ERROR = 0.05
@@ -127,7 +131,7 @@ def test_a_scan_from_a_training_place_has_the_error_of_training_scans(known):
 @pytest.mark.parametrize("nearer", [5.0, 12.0, 17.0])
 def test_the_error_grows_with_the_magnification_as_documented(known, nearer):
     """Of the left wall alone, ahead of the sensor, nearer to it by so many metres than the nearest training scan."""
-    beside = PoseableLidar(facing(90.0, half=1.5).rays)
+    beside = PoseableLidar(facing(90.0, half=2.0).rays)
     found = found_at(known, (3 * STEP_M, nearer, HEIGHT), lidar=beside)
     magnification = min(WALL_AT / (WALL_AT - nearer), MAX_MAGNIFICATION)
     expected = known.error * (1.0 + DEFAULT_GROWTH * np.sqrt(magnification - 1.0))
@@ -196,10 +200,10 @@ def write_metrics(drive: TrainedDrive, **medians: float) -> None:
 @pytest.mark.parametrize("measured", [1.1 * ERROR, 1.4 * ERROR, 3.0 * ERROR, 0.8 * ERROR])
 def test_held_out_scans_have_the_error_that_was_measured(scene, tmp_path, measured):
     """Whether or not the growth explains it."""
-    drive = drive_with(scene, tmp_path, held_out=[2, 3, 4])
+    drive = drive_with(scene, tmp_path, held_out=[2, 3])
     write_metrics(drive, interpolation=measured)
     known = ScanKnowledge.of_drive(drive)
-    found = [found_at(known, (STEP_M * number, 0.0, HEIGHT), 0.5 * number) for number in (2, 3, 4)]
+    found = [found_at(known, (STEP_M * number, 0.0, HEIGHT), 0.5 * number) for number in (2, 3)]
     assert np.mean([one.expected_range_error for one in found]) == pytest.approx(measured, rel=0.01)
     assert np.mean([one.validity for one in found]) > 0.95
 
@@ -242,6 +246,15 @@ def test_a_policy_is_told_how_far_it_can_trust_the_scan(known, drive):
     np.testing.assert_array_equal(seen["lidar"]["range"] > 0.0, scan.returned.numpy())
 
 
+def test_the_example_of_the_guide_runs(drive, monkeypatch):
+    page = (REPOSITORY / "docs/closed_loop.md").read_text()
+    (example,) = (own for own in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "scan_validity" in own)
+    monkeypatch.setattr(drivesplat, "open", lambda folder: drive)
+    names = {"drivesplat": drivesplat}
+    exec(example, names)
+    assert 0.0 < names["found"].validity <= 1.0
+
+
 def test_environments_of_a_vector_share_what_tells_their_validity(drive, monkeypatch):
     made = []
     of_drive = ScanKnowledge.of_drive
@@ -256,8 +269,8 @@ def test_a_run_is_believed_until_its_scan_is_not(drive, tmp_path, monkeypatch):
     """Though its images are believed."""
     settings = SimulationSettings(cameras=(), lidar="LIDAR_TOP", seconds=0.5)
     job = RunJob(run=RunSettings(policy="recorded", film_width=64, simulation=settings), edit=None, code=None, crf=30)
-    image, scan = Trust.image, Trust.scan
-    monkeypatch.setattr(Trust, "image", lambda *given: dataclasses.replace(image(*given), validity=1.0))
+    scan, believed = Trust.scan, ViewValidity(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, None, None, 0.0, 1.0)
+    monkeypatch.setattr(Trust, "image", lambda *given: believed)
     monkeypatch.setattr(
         Trust, "scan", lambda own, now: dataclasses.replace(scan(own, now), validity=0.4 if now.steps > 2 else 0.6)
     )

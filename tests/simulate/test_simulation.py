@@ -364,7 +364,8 @@ def test_the_examples_of_the_guide_run(drive, tmp_path, monkeypatch):
     examples = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs/closed_loop.md").read_text(), flags=re.DOTALL)
     names: dict = {}
     for example in examples:
-        exec(example, names)
+        if "scan_validity" not in example:  # needs a method that renders LiDAR: see test_scan_validity
+            exec(example, names)
     assert examples and names["image"].shape == (225, 400, 3)
 
 

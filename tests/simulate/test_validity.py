@@ -361,7 +361,7 @@ def test_gaussians_that_are_left_out_show_in_no_pixel(drive):
 
 def test_of_many_training_images_as_many_are_looked_at_as_memory_allows(drive, monkeypatch):
     monkeypatch.setattr(seen_from, "MAX_IMAGES", 4)
-    assert seen_from.training_images(drive) == [0, 6, 12, 18]
+    assert seen_from.training_images(drive.record) == [0, 6, 12, 18]
 
 
 def test_a_small_image_shows_the_same_directions(drive):
