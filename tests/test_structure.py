@@ -22,7 +22,7 @@ from helpers.structure import (
 from helpers.syntax_trees import source_of, statements, tree_of
 
 MAX_PLACES, MAX_LOOSE_MODULES = 27, 2
-MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 9, 19
+MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 9, 18
 MAX_LINES = 400
 SIGNED = packages(LIBRARY, "benchmarks")
 
