@@ -103,17 +103,8 @@ def write_folder(
     if missing:
         raise DatasetError(f"{len(missing)} of {len(images)} images are missing (first: {missing[0]})")
     path = folder / FILE
-    try:
-        write_json(path, record)
-    except ValueError as error:
-        raise DatasetError(f"{path}: a number is not finite ({error})") from error
-    faults, drive = structure_of(path)
-    if drive is not None:
-        faults = [f"{path}: {fault}" for fault in faults_of(drive)]
+    write_checked(path, record)
     path.unlink()  # it is the last file of a whole folder
-    if faults:
-        more = f" ({len(faults) - 1} more faults)" if len(faults) > 1 else ""
-        raise DatasetError(f"{faults[0]}{more}")
     for name, source in images.items():
         link_or_copy(source, folder / name)
     for name, columns in sweeps:
@@ -121,3 +112,21 @@ def write_folder(
         np.savez_compressed(folder / name, **columns)
     write_json(path, record)
     return path
+
+
+def write_checked(path: Path, record: Mapping[str, Any], name: Path | None = None) -> None:
+    """Writes `record` as the drive.json `path`, which messages call `name` (`path`). Raises DatasetError, and leaves no
+    file, where it has a fault."""
+    shown = path if name is None else name
+    try:
+        write_json(path, record)
+    except ValueError as error:
+        raise DatasetError(f"{shown}: a number is not finite ({error})") from error
+    faults, drive = structure_of(path)
+    faults = [fault.replace(str(path), str(shown)) for fault in faults]
+    if drive is not None:
+        faults = [f"{shown}: {fault}" for fault in faults_of(drive)]
+    if faults:
+        path.unlink()
+        more = f" ({len(faults) - 1} more faults)" if len(faults) > 1 else ""
+        raise DatasetError(f"{faults[0]}{more}")

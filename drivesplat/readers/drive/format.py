@@ -244,10 +244,10 @@ def structure_of(path: Path) -> tuple[list[str], Drive | None]:
     try:
         return [], Drive.model_validate(values)
     except ValidationError as error:
-        return [f"{path}: {_sentence(item)}" for item in error.errors(include_url=False)], None
+        return [f"{path}: {sentence_of(item)}" for item in error.errors(include_url=False)], None
 
 
-def _sentence(item: Any) -> str:
+def sentence_of(item: Any) -> str:
     """One error of pydantic as a sentence: frames[3].timestamp is …"""
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in item["loc"]).removeprefix(".")
     if item["type"] == "missing":
