@@ -81,7 +81,7 @@ class BagFile:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[BagFile]:
-    """The bag at `path`: a .bag, .mcap or .db3 file, or a folder with metadata.yaml or with such files of one recording.
+    """The bag at `path`: a .bag, .mcap or .db3 file, or a folder with metadata.yaml or the files of one recording.
 
     Raises DatasetError where there is none, or it is damaged or empty; RequestError where rosbags is missing.
     """

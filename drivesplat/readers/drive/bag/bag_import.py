@@ -132,12 +132,12 @@ def _require_topics(bag: BagFile, bag_map: BagMap, map_path: Path) -> None:
         if topic not in (known := [one.name for one in bag.of_kind(*kinds)]):
             what = " or ".join(kind.rpartition("/")[2] for kind in kinds)
             raise DatasetError(
-                f"{map_path}: {key} is {topic}, on which {bag.path} has no {what}; topics that have are: {listed(known)}"
+                f"{map_path}: {key} is {topic}, on which {bag.path} has no {what}; topics with it: {listed(known)}"
             )
     if bag_map.poses == TF and not bag.of_kind(*TRANSFORMS):
         raise DatasetError(
-            f"{bag.path} has no tf, and so no poses of the vehicle; record /tf and /tf_static, name a topic of Odometry "
-            "as poses in the map, or set poses: null to have them estimated (docs/poses.md)"
+            f"{bag.path} has no tf, and so no poses of the vehicle; record /tf and /tf_static, name a topic of "
+            "Odometry as poses in the map, or set poses: null to have them estimated (docs/poses.md)"
         )
 
 

@@ -77,8 +77,8 @@ class BagLidar(DriveRecord):
     """The frame in that of the vehicle. null: by tf."""
     stamp: StampPlace = "start"
     """The part of the revolution at which sweeps are stamped. Only used where times count from `start`."""
-    revolution_s: float = Field(gt=0, le=10)
-    """Time of a revolution (seconds)."""
+    revolution_s: float | None = Field(None, gt=0, le=10)
+    """Time of a revolution (seconds). null: unknown."""
     time: PointTime | None = None
     """null: the times of points are not known."""
     motion_compensated: bool
@@ -94,6 +94,8 @@ class BagLidar(DriveRecord):
     def _times_for_compensation(self) -> "BagLidar":
         if not self.motion_compensated and self.time is None:
             raise ValueError("motion_compensated: false needs the times of points (time)")
+        if self.time and self.time.counts_from == "start" and self.stamp != "start" and self.revolution_s is None:
+            raise ValueError("counts_from: start needs revolution_s where the stamp is not at the start")
         return self
 
 
@@ -119,8 +121,8 @@ class BagMap(DriveRecord):
     """The vehicle's frame in the ego frame, which is on the ground under the rear axle: x forward, y left, z up."""
     poses: str | None
     """'tf', or the topic of Odometry messages. null: there are none, and they will be estimated."""
-    cameras: dict[str, BagCamera] = {}
-    lidars: dict[str, BagLidar] = {}
+    cameras: dict[str, BagCamera] = Field(default_factory=dict)
+    lidars: dict[str, BagLidar] = Field(default_factory=dict)
     key_frames: KeyFrames
     raw_images: Literal["png", "jpeg"] = "png"
     """How images are stored that were recorded without compression."""

@@ -85,7 +85,7 @@ def _seconds(values: np.ndarray, lidar: BagLidar, time: PointTime, stamp: int) -
     else:
         seconds = values.astype(np.float64) * (unit * 1e-9)
     if time.counts_from == "start":
-        seconds = seconds - seconds.min() - SHARE_BEFORE_STAMP[lidar.stamp] * lidar.revolution_s
+        seconds = seconds - seconds.min() - SHARE_BEFORE_STAMP[lidar.stamp] * (lidar.revolution_s or 0.0)
     if not (np.abs(seconds) <= MAX_OFFSET_S).all():
         raise DatasetError(
             f"has points {np.nanmin(seconds):.3g} to {np.nanmax(seconds):.3g} s after its stamp by the field "

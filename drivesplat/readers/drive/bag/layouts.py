@@ -17,11 +17,11 @@ RINGS = ("ring", "channel", "line", "laser_id")
 """Fields with the index of the beam: Velodyne, Ouster and Hesai; Autoware; Livox; others."""
 INTENSITIES = ("reflectivity", "intensity", "reflectance")
 """Fields with the intensity. Ouster's reflectivity counts to 255, its intensity is a number of photons."""
-OWN = (("x", 0), ("y", 4), ("z", 8), ("intensity", 12), ("t", 16), ("ring", 20))
+OWN = {"x": 0, "y": 4, "z": 8, "intensity": 12, "t": 16, "ring": 20}
 """The fields and offsets of clouds that `drivesplat mcap` writes, with a point_step of OWN_STEP bytes."""
 OWN_STEP = 24
-MIN_SHARE, MAX_SHARE = 0.1, 1.6
-"""Shares of a revolution that the times of a sweep's points span."""
+MIN_SPAN_S, MAX_SPAN_S = 1e-3, 1.0
+"""Seconds that the times of a sweep's points span: in one unit only, since units differ by factors of 1000."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class CloudLayout:
     scale_reason: str
 
 
-def cloud_layout(cloud: Any, revolution_s: float) -> CloudLayout:
+def cloud_layout(cloud: Any) -> CloudLayout:
     """The proposal for a cloud like this one. Raises DatasetError, the end of a sentence, for one that has no x, y, z
     or is damaged."""
     rows = point_rows(cloud)
     names = rows.dtype.names or ()
-    time, reason = _time(rows, header_stamp(cloud), revolution_s)
-    own = rows.dtype.itemsize == OWN_STEP and tuple((name, rows.dtype.fields[name][1]) for name in names) == OWN
+    time, reason = _time(rows, header_stamp(cloud))
+    own = rows.dtype.itemsize == OWN_STEP and all(rows.dtype.fields[name][1] == OWN.get(name) for name in names)
     if own:
         compensated, why = True, "the layout of `drivesplat mcap`, whose points are compensated"
     elif time == "null":
@@ -61,7 +61,7 @@ def cloud_layout(cloud: Any, revolution_s: float) -> CloudLayout:
     )  # fmt: skip
 
 
-def _time(rows: np.ndarray, stamp: int, revolution_s: float) -> tuple[str, str]:
+def _time(rows: np.ndarray, stamp: int) -> tuple[str, str]:
     """The value of `time` and its reason: the unit is that in which the times of the points span a revolution."""
     field = next((name for name in TIMES if name in (rows.dtype.names or ())), None)
     if field is None:
@@ -73,12 +73,9 @@ def _time(rows: np.ndarray, stamp: int, revolution_s: float) -> tuple[str, str]:
         return "null", f"all of {field} is the same"
     absolute = float(np.median(np.abs(values))) > 100 * span
     span = float(np.ptp(values)) if absolute else span
-    fitting = [
-        unit for unit, factor in NANOSECONDS.items()
-        if MIN_SHARE * revolution_s <= span * factor * 1e-9 <= MAX_SHARE * revolution_s
-    ]  # fmt: skip
+    fitting = [unit for unit, factor in NANOSECONDS.items() if MIN_SPAN_S <= span * factor * 1e-9 < MAX_SPAN_S]
     if not fitting:
-        return "null", f"{field} spans {span:g}, which is no revolution of {revolution_s:g} s in any unit: state it"
+        return "null", f"{field} spans {span:g}, which is no revolution in s, ms, us or ns"
     unit = fitting[0]
     said = f"{TIMES[field]} name; spans a revolution in {unit}"
     if not absolute:

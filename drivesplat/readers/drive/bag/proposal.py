@@ -28,7 +28,8 @@ NO_NAMES = {
 """Parts of topics that name no sensor."""
 MIN_KEY_INTERVAL_S = 0.09
 """Least time between proposed key frames, where images come faster than at 10 Hz."""
-DEFAULT_REVOLUTION_S = 0.1
+MAX_REVOLUTION_S = 0.25
+"""Time between sweeps up to which it is taken for that of a revolution."""
 AXES_OPTICAL, AXES_FORWARD = "optical", "forward"
 
 
@@ -112,7 +113,7 @@ def _why_not(topic: TopicSurvey, found: BagSurvey) -> str:
         return "it has one message"
     if topic.kind == POINT_CLOUD:
         try:
-            cloud_layout(topic.samples[0], DEFAULT_REVOLUTION_S)
+            cloud_layout(topic.samples[0])
         except DatasetError as error:
             return f"its cloud {error}"
         return ""
@@ -220,13 +221,14 @@ def _camera_frame(topic: TopicSurvey, tree: TransformTree, vehicle: str) -> tupl
 
 def _lidar(name: str, topic: TopicSurvey) -> Iterator[Line]:
     cloud = topic.samples[0]
-    revolution = topic.interval_s or (1.0 / topic.rate if topic.rate else DEFAULT_REVOLUTION_S)
-    revolution = float(f"{min(10.0, max(1e-3, revolution)):.3g}")
-    layout = cloud_layout(cloud, revolution)
+    known = topic.interval_s is not None and 1e-3 < topic.interval_s <= MAX_REVOLUTION_S
+    revolution = f"{topic.interval_s:.3g}" if known else "null"
+    why = "the time between its first sweeps" if known else "sweeps follow each other at longer intervals; state it"
+    layout = cloud_layout(cloud)
     yield Line(f"  {name}:")
     yield Line(f"    points: {quoted(topic.name)}", f"fields {', '.join(str(one.name) for one in cloud.fields)}")
     yield Line(f"    frame: {quoted(topic.frame or 'lidar')}", "the frame of its headers")
-    yield Line(f"    revolution_s: {revolution:g}", "the time between its first sweeps")
+    yield Line(f"    revolution_s: {revolution}", why)
     yield Line("    stamp: start", "as drivers stamp; only used where times count from start")
     yield Line(f"    time: {layout.time}", layout.time_reason)
     yield Line(f"    motion_compensated: {str(layout.compensated).lower()}", layout.compensated_reason)

@@ -72,7 +72,7 @@ class SensorRecordings:
         return name
 
     def require_sound(self, topic: str, samples: Sequence[Any]) -> None:
-        """Raises DatasetError where the first messages are missing, or all of them are damaged or do not fit the map."""
+        """Raises DatasetError where there are no first messages, or none of them can be converted."""
         if not samples:
             raise DatasetError(f"{self.name}: no {self.what} on {topic} can be read between --start and --end")
         faults = []
