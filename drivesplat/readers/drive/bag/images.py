@@ -80,7 +80,7 @@ def _of_compressed(form: str, data: bytes, raw: str) -> ImageFile:
                 raise DatasetError(f"has more than 8 bits per channel ({mode}); convert the images to 8 bits")
             mosaic = inside.startswith("bayer") and mode == "L"
             if kind in ("JPEG", "PNG") and not mosaic:
-                image.draft("RGB", (size[0] // 8, size[1] // 8))
+                image.draft("RGB", (max(1, size[0] // 8), max(1, size[1] // 8)))
                 image.load()
                 return ImageFile(".jpg" if kind == "JPEG" else ".png", data, size, mode in ("L", "1", "LA"))
             pixels = np.asarray(image.convert("L" if mode == "L" else "RGB"))
