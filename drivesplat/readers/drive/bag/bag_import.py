@@ -22,7 +22,7 @@ from drivesplat.readers.drive.bag.clouds import POINT_CLOUD
 from drivesplat.readers.drive.bag.drive_record import DriveOfBag, calibrations_of
 from drivesplat.readers.drive.bag.images import CAMERA_INFO, COMPRESSED_IMAGE, RAW_IMAGE
 from drivesplat.readers.drive.bag.proposal import proposed_map
-from drivesplat.readers.drive.bag.recordings import SensorRecordings, recordings_of
+from drivesplat.readers.drive.bag.recordings import SensorRecordings, recordings_of, write_recordings
 from drivesplat.readers.drive.bag.survey import BagSurvey, clock_fault, survey
 from drivesplat.readers.drive.bag.transforms import (
     ODOMETRY,
@@ -98,10 +98,8 @@ def import_bag(
         for topic, name in bag_map.topics.items():
             recordings[name].require_sound(topic, found.topics[topic].samples)
         with _new_folder(folder) as aside:
-            for one in recordings.values():
-                (aside / one.folder).mkdir(parents=True)
-            for message in bag.messages(list(bag_map.topics), begin, stop):
-                recordings[bag_map.topics[message.topic]].add(message, bag_map.clock, ego, aside)
+            by_topic = {topic: recordings[name] for topic, name in bag_map.topics.items()}
+            write_recordings(bag, by_topic, (begin, stop), bag_map.clock, ego, aside)
             write_checked(aside / FILE, drive.record(recordings, f"Imported from {path.name}"), folder / FILE)
             notes = drive.notes(recordings)
             write_json(aside / RECORD, _import_record(path, (start, end), decisions, recordings, notes))

@@ -1,6 +1,6 @@
 """The recordings of each sensor of a bag: converted and written one by one, counted, and looked through for gaps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.drive.bag.bag_file import BagMessage, header_stamp, microseconds
+from drivesplat.io.prefetch import prefetch
+from drivesplat.readers.drive.bag.bag_file import BagFile, BagMessage, header_stamp, microseconds
 from drivesplat.readers.drive.bag.bag_map import BagCamera, BagLidar, BagMap, Calibration
 from drivesplat.readers.drive.bag.clouds import sweep_columns
 from drivesplat.readers.drive.bag.images import ImageFile, image_file
@@ -19,6 +20,17 @@ SHARE_AFTER_STAMP = {"start": 0.5, "middle": 0.0, "end": -0.5}
 """The part of an exposure from its stamp to its middle."""
 GAP_INTERVALS, MIN_GAP_US = 3.0, 250_000
 """Usual intervals and microseconds from which on a time without recordings is a gap."""
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenFile:
+    """The file of a message, or the end of a sentence on why there is none."""
+
+    recordings: "SensorRecordings"
+    timestamp: int
+    name: str = ""
+    grey: bool = False
+    fault: str = ""
 
 
 @dataclass(eq=False)
@@ -37,39 +49,58 @@ class SensorRecordings:
     damaged: int = 0
     damage: str = ""
     grey: int = 0
+    seen: set[int] = field(default_factory=set)
 
     @property
     def count(self) -> int:
         """The number of messages."""
         return len(self.files) + self.unposed + self.repeated + self.damaged
 
-    def add(self, message: BagMessage, clock: str, ego: EgoTrack | None, root: Path) -> None:
-        """Writes the file of a message below `root`, unless it is damaged, has the timestamp of another one, or no pose
-        of the vehicle."""
+    def accepted(self, message: BagMessage, clock: str, ego: EgoTrack | None) -> tuple[int, Any] | None:
+        """The timestamp and the content of a message; None, and counted, where it is damaged, has the timestamp of
+        another one, or no pose of the vehicle."""
         try:
             content = message.content()
             timestamp = microseconds(header_stamp(content) if clock == "header" else message.log) + self.shift
             if timestamp < 0:
                 raise DatasetError(f"has the timestamp {timestamp}")
-            if timestamp in self.files:
-                self.repeated += 1
-            elif ego is not None and not ego.covers(timestamp):
-                self.unposed += 1
-            else:
-                self.files[timestamp] = self._written(self.convert(content), timestamp, root)
         except DatasetError as error:
-            self.damaged += 1
-            self.damage = self.damage or str(error)
+            self._count_damage(str(error))
+            return None
+        if timestamp in self.seen:
+            self.repeated += 1
+        elif ego is not None and not ego.covers(timestamp):
+            self.unposed += 1
+        else:
+            self.seen.add(timestamp)
+            return timestamp, content
+        return None
 
-    def _written(self, content: ImageFile | dict[str, np.ndarray], timestamp: int, root: Path) -> str:
-        if isinstance(content, ImageFile):
-            name = f"{self.folder}/{timestamp}{content.suffix}"
-            (root / name).write_bytes(content.data)
-            self.grey += content.grey
-        else:  # deflating takes longer than all else, and saves a fifth
-            name = f"{self.folder}/{timestamp}.npz"
-            np.savez(root / name, **content)
-        return name
+    def written(self, timestamp: int, content: Any, root: Path) -> WrittenFile:
+        """Writes the file of an accepted message below `root`. May run in a thread."""
+        try:
+            file = self.convert(content)
+        except DatasetError as error:
+            return WrittenFile(self, timestamp, fault=str(error))
+        if isinstance(file, ImageFile):
+            name = f"{self.folder}/{timestamp}{file.suffix}"
+            (root / name).write_bytes(file.data)
+            return WrittenFile(self, timestamp, name, file.grey)
+        name = f"{self.folder}/{timestamp}.npz"
+        np.savez(root / name, **file)  # deflating takes longer than all else, and saves a fifth
+        return WrittenFile(self, timestamp, name)
+
+    def add(self, file: WrittenFile) -> None:
+        """Counts a file."""
+        if file.fault:
+            self._count_damage(file.fault)
+        else:
+            self.files[file.timestamp] = file.name
+            self.grey += file.grey
+
+    def _count_damage(self, reason: str) -> None:
+        self.damaged += 1
+        self.damage = self.damage or reason
 
     def require_sound(self, topic: str, samples: Sequence[Any]) -> None:
         """Raises DatasetError where there are no first messages, or none of them can be converted."""
@@ -160,3 +191,22 @@ def grey_sentence(recordings: Sequence[SensorRecordings]) -> str | None:
         f"{', '.join(grey)} record{'s' if one else ''} grey images, the other cameras colours: leave "
         f"{'it' if one else 'them'} out of `cameras` in the config, since a model learns one colour for all cameras"
     )
+
+
+def write_recordings(
+    bag: BagFile, by_topic: Mapping[str, SensorRecordings], window: tuple[int, int], clock: str, ego: EgoTrack | None,
+    root: Path,
+) -> None:  # fmt: skip
+    """Writes the files of all messages with log times in a window (nanoseconds) below `root`. Two threads convert and
+    write; at most as many messages are in memory beside one that is read."""
+
+    def accepted() -> Iterator[tuple[SensorRecordings, int, Any]]:
+        for message in bag.messages(list(by_topic), *window):
+            one = by_topic[message.topic]
+            if task := one.accepted(message, clock, ego):
+                yield one, *task
+
+    for one in by_topic.values():
+        (root / one.folder).mkdir(parents=True)
+    for file in prefetch(lambda task: task[0].written(*task[1:], root), accepted(), threads=2):
+        file.recordings.add(file)
