@@ -101,7 +101,9 @@ def import_bag(
             by_topic = {topic: recordings[name] for topic, name in bag_map.topics.items()}
             write_recordings(bag, by_topic, (begin, stop), bag_map.clock, ego, aside)
             write_checked(aside / FILE, drive.record(recordings, f"Imported from {path.name}"), folder / FILE)
-            notes = drive.notes(recordings)
+            whole = start is None and end is None
+            indexed = {name: bag.topics[topic].count for topic, name in bag_map.topics.items() if whole}
+            notes = drive.notes(recordings, indexed)
             write_json(aside / RECORD, _import_record(path, (start, end), decisions, recordings, notes))
     counts = {name: len(one.files) for name, one in recordings.items()}
     return ImportedBag(folder / FILE, counts, tuple(notes))

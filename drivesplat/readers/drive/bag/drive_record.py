@@ -146,12 +146,16 @@ class DriveOfBag:
                 kept.append(stamp)
         return kept
 
-    def notes(self, recordings: Mapping[str, SensorRecordings]) -> list[str]:
-        """Sentences on what was left out and what is unusual."""
+    def notes(self, recordings: Mapping[str, SensorRecordings], indexed: Mapping[str, int]) -> list[str]:
+        """Sentences on what was left out and what is unusual. `indexed`: the numbers of messages by the index of a bag
+        that was read as a whole."""
         every = list(recordings.values())
         begin = min(stamp for one in every for stamp in one.files)
         found = [unposed_sentence(every), grey_sentence(every), self._pose_gaps(begin)]
-        return [*(sentence for sentence in found if sentence), *(note for one in every for note in one.notes(begin))]
+        return [
+            *(sentence for sentence in found if sentence),
+            *(note for one in every for note in one.notes(begin, indexed.get(one.name))),
+        ]
 
     def _pose_gaps(self, begin: int) -> str | None:
         steps = np.zeros(0) if self._ego is None else np.diff(self._ego.stamps)

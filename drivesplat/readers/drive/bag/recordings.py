@@ -115,9 +115,15 @@ class SensorRecordings:
                 faults.append(str(error))
         raise DatasetError(f"{self.name}: the first {self.what} on {topic} {faults[0]}")
 
-    def notes(self, begin: int) -> list[str]:
-        """Sentences on what was left out and is missing. `begin` is the first timestamp of the drive."""
+    def notes(self, begin: int, indexed: int | None) -> list[str]:
+        """Sentences on what was left out and is missing. `begin` is the first timestamp of the drive, `indexed` the
+        number of messages by the index of the bag, None where not all of it was read."""
         found = []
+        if indexed is not None and self.count < indexed:
+            found.append(
+                f"{self.name}: the index of the bag counts {indexed} messages, {self.count} are there: the bag is "
+                "damaged"
+            )
         if self.damaged:
             what = counted(self.damaged, self.what)
             found.append(f"{self.name}: {what} of {self.count} left out as damaged; the first one {self.damage}")
