@@ -50,7 +50,7 @@ LENSES = {
 
 
 @dataclass(frozen=True, eq=False)
-class ImageFile:
+class EncodedImage:
     """The content of an image file: `suffix`, bytes, width and height in pixels, and whether it has no colours."""
 
     suffix: str
@@ -59,7 +59,7 @@ class ImageFile:
     grey: bool
 
 
-def image_file(message: Any, raw: str) -> ImageFile:
+def image_file(message: Any, raw: str) -> EncodedImage:
     """An Image or CompressedImage as a file. JPEG and PNG files stay what they are; other images become `raw`, png or
     jpeg. Raises DatasetError, the end of a sentence, where it is damaged or has more than 8 bits."""
     if hasattr(message, "format"):
@@ -67,7 +67,7 @@ def image_file(message: Any, raw: str) -> ImageFile:
     return _encoded(_pixels(message), raw)
 
 
-def _of_compressed(form: str, data: bytes, raw: str) -> ImageFile:
+def _of_compressed(form: str, data: bytes, raw: str) -> EncodedImage:
     inside = form.rpartition("compressed")[2].strip() if ";" in form else ""
     if "compressedDepth" in form:
         raise DatasetError("is an image of depths; map a topic of colours")
@@ -82,7 +82,7 @@ def _of_compressed(form: str, data: bytes, raw: str) -> ImageFile:
             if kind in ("JPEG", "PNG") and not mosaic:
                 image.draft("RGB", (max(1, size[0] // 8), max(1, size[1] // 8)))
                 image.load()
-                return ImageFile(".jpg" if kind == "JPEG" else ".png", data, size, mode in ("L", "1", "LA"))
+                return EncodedImage(".jpg" if kind == "JPEG" else ".png", data, size, mode in ("L", "1", "LA"))
             pixels = np.asarray(image.convert("L" if mode == "L" else "RGB"))
     except DECODING_ERRORS as error:
         raise DatasetError(f"cannot be decoded ({' '.join(str(error).split())[:100]})") from None
@@ -115,7 +115,7 @@ def _pixels(message: Any) -> np.ndarray:
         raise DatasetError(f"of {width}x{height} pixels cannot be converted from {message.encoding}") from None
 
 
-def _encoded(pixels: np.ndarray, raw: str) -> ImageFile:
+def _encoded(pixels: np.ndarray, raw: str) -> EncodedImage:
     """Pixels (h, w, 3) RGB or (h, w) as a file."""
     file = BytesIO()
     if raw == "png":
@@ -123,7 +123,7 @@ def _encoded(pixels: np.ndarray, raw: str) -> ImageFile:
     else:
         Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)
     size = (pixels.shape[1], pixels.shape[0])
-    return ImageFile(".png" if raw == "png" else ".jpg", file.getvalue(), size, pixels.ndim == 2)
+    return EncodedImage(".png" if raw == "png" else ".jpg", file.getvalue(), size, pixels.ndim == 2)
 
 
 def calibration_of(message: Any, rectified: bool) -> tuple[Calibration, np.ndarray]:

@@ -12,7 +12,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.readers.drive.bag.bag_file import BagFile, BagMessage, header_stamp, microseconds
 from drivesplat.readers.drive.bag.bag_map import BagCamera, BagLidar, BagMap, Calibration
 from drivesplat.readers.drive.bag.clouds import sweep_columns
-from drivesplat.readers.drive.bag.images import ImageFile, image_file
+from drivesplat.readers.drive.bag.images import EncodedImage, image_file
 from drivesplat.readers.drive.bag.transforms import EgoTrack
 from drivesplat.readers.record_names import counted
 
@@ -42,7 +42,7 @@ class SensorRecordings:
     what: str
     folder: str
     shift: int
-    convert: Callable[[Any], ImageFile | dict[str, np.ndarray]]
+    convert: Callable[[Any], EncodedImage | dict[str, np.ndarray]]
     files: dict[int, str] = field(default_factory=dict)
     unposed: int = 0
     repeated: int = 0
@@ -82,7 +82,7 @@ class SensorRecordings:
             file = self.convert(content)
         except DatasetError as error:
             return WrittenFile(self, timestamp, fault=str(error))
-        if isinstance(file, ImageFile):
+        if isinstance(file, EncodedImage):
             name = f"{self.folder}/{timestamp}{file.suffix}"
             (root / name).write_bytes(file.data)
             return WrittenFile(self, timestamp, name, file.grey)
@@ -155,11 +155,11 @@ def recordings_of(bag_map: BagMap, calibrations: dict[str, Calibration]) -> dict
     return found
 
 
-def _camera_converter(calibration: Calibration, raw: str, camera: BagCamera) -> Callable[[Any], ImageFile]:
+def _camera_converter(calibration: Calibration, raw: str, camera: BagCamera) -> Callable[[Any], EncodedImage]:
     size = (calibration.width, calibration.height)
     source = f"its CameraInfo on {camera.info}" if camera.calibration is None else "the calibration in the map"
 
-    def convert(message: Any) -> ImageFile:
+    def convert(message: Any) -> EncodedImage:
         file = image_file(message, raw)
         if file.size != size:
             raise DatasetError(
