@@ -213,7 +213,7 @@ def test_damaged_and_repeated_messages_are_counted(tmp_path, capsys):
         (("  top:", "  front:"), "a camera and a LiDAR have the same name"),
         (("  top:", "  ../top:"), "must have letters, digits, - and _ only"),
         (("ring: ring", "ring: rings"), "the first sweep on /top/points has no field rings"),
-        (("unit: ns", "unit: us"), "check its unit and what it counts from in the map"),
+        (("unit: ns", "unit: us"), "check its unit, what it counts from, and revolution_s in the map"),
         (("unit: ns", "unit: d"), "lidars.top.time.unit is 'd'"),
         (("time: {field: t, unit: ns, counts_from: stamp}", "time: null"), "motion_compensated: false needs the times"),
         (("stamp: middle", "speed: 3"), "cameras.front.speed is no key"),

@@ -1,9 +1,12 @@
 """Bags of ROS as drive folders: all containers, a drive that was written as MCAP, and what the map decides."""
 
 import json
+import shutil
+import sqlite3
 import sys
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from helpers.bags import (
     INFO,
     LENS,
     LIDAR,
+    OUSTER,
     START,
     WALL,
     K,
@@ -72,6 +76,41 @@ def test_bags_of_every_container_become_the_same_drive(container, tmp_path, caps
         np.testing.assert_array_equal(returns.rings, np.arange(len(WALL)) % 4)
         np.testing.assert_allclose(returns.intensity, np.arange(len(WALL)) % 200 / 255, atol=1e-6)
     assert "note:" not in capsys.readouterr().out
+
+
+def test_old_and_split_bags_are_read(tmp_path):
+    """ROS 2 before Iron stored no definitions of messages; a folder may have lost its metadata.yaml."""
+    path = TestBag.recorded(seconds=0.3).write(tmp_path, "sqlite")
+    (file,) = path.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+    assert imported(path, tmp_path) == 0
+    assert len(drive_in(tmp_path).frames) == 3
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    for name, begin, end in (("0", -(10**6), 150_000), ("1", 150_000, 10**6)):
+        bag = TestBag.recorded(seconds=0.3)
+        bag.messages = [one for one in bag.messages if begin <= one[1] - START < end]
+        (tmp_path / name).mkdir()
+        shutil.copy(bag.write(tmp_path / name), parts / f"drive_{name}.mcap")
+    (tmp_path / "out").rename(tmp_path / "first")
+    assert imported(parts, tmp_path) == 0
+    assert [frame.timestamp - START for frame in drive_in(tmp_path).frames] == [0, 100_000, 200_000]
+
+
+def test_sweeps_longer_than_their_interval(tmp_path):
+    """Points span 0.106 s at 10 Hz: the proposed revolution has room for them."""
+
+    def longer(message: Any) -> Any:
+        rows = message.data.view(OUSTER).copy()
+        rows["t"] = rows["t"] * 1.07
+        message.data = np.frombuffer(rows.tobytes(), dtype=np.uint8)
+        return message
+
+    assert imported(TestBag.recorded(seconds=0.5).changed(CLOUD, longer).write(tmp_path), tmp_path) == 0
+    drive = drive_in(tmp_path)
+    assert drive.lidars["top"].revolution_s == pytest.approx(0.108, abs=1e-3) and len(drive.sweeps) == 5
 
 
 def test_a_drive_written_as_mcap_is_read_back(tiny_scene, tmp_path):

@@ -7,7 +7,9 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive.bag.bag_file import header_stamp, listed
 from drivesplat.readers.drive.bag.bag_map import BagLidar, PointTime
+from drivesplat.readers.drive.poses import reach_us
 from drivesplat.readers.drive.sweep_file import MAX_RINGS
+from drivesplat.readers.sweep_motion import TOLERANCE_S
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -49,7 +51,8 @@ def point_rows(cloud: Any) -> np.ndarray:
 
 def sweep_columns(cloud: Any, lidar: BagLidar) -> dict[str, np.ndarray]:
     """The columns of a sweep: x, y, z in metres in the LiDAR's frame and, where the map names them, intensity (0 to 1),
-    ring, and time in seconds after the stamp. Points that are not finite, or at the sensor itself, are none.
+    ring, and time in seconds after the stamp. Points that are not finite or at the sensor itself are left out, and
+    points with the time 0 where times count from 1970.
 
     Raises DatasetError, the end of a sentence, where the cloud does not fit the map, or has no points.
     """
@@ -59,7 +62,10 @@ def sweep_columns(cloud: Any, lidar: BagLidar) -> dict[str, np.ndarray]:
     if lacking:
         raise DatasetError(f"has no field {', '.join(lacking)}; its fields are {listed(rows.dtype.names)}")
     points = np.stack([rows[name] for name in "xyz"], axis=1).astype(np.float32)
-    rows, points = rows[measured := np.isfinite(points).all(axis=1) & points.any(axis=1)], points[measured]
+    measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
+    if lidar.time and lidar.time.counts_from == "epoch":
+        measured &= rows[lidar.time.field] != 0
+    rows, points = rows[measured], points[measured]
     if not len(points):
         raise DatasetError("has no points")
     columns = dict(zip("xyz", np.ascontiguousarray(points.T), strict=True))
@@ -86,9 +92,12 @@ def _seconds(values: np.ndarray, lidar: BagLidar, time: PointTime, stamp: int) -
         seconds = values.astype(np.float64) * (unit * 1e-9)
     if time.counts_from == "start":
         seconds = seconds - seconds.min() - SHARE_BEFORE_STAMP[lidar.stamp] * (lidar.revolution_s or 0.0)
-    if not (np.abs(seconds) <= MAX_OFFSET_S).all():
+    longest = MAX_OFFSET_S
+    if not lidar.motion_compensated:  # as drive folders are read
+        longest = reach_us(lidar.revolution_s) * 1e-6 + TOLERANCE_S
+    if not (np.abs(seconds) <= longest).all():
         raise DatasetError(
             f"has points {np.nanmin(seconds):.3g} to {np.nanmax(seconds):.3g} s after its stamp by the field "
-            f"{time.field}: check its unit and what it counts from in the map"
+            f"{time.field}: check its unit, what it counts from, and revolution_s in the map"
         )
     return seconds

@@ -26,10 +26,12 @@ MIN_SPAN_S, MAX_SPAN_S = 1e-3, 1.0
 
 @dataclass(frozen=True)
 class CloudLayout:
-    """What a map says of a LiDAR's fields: values as YAML, and reasons."""
+    """What a map says of a LiDAR's fields: values as YAML, and reasons. `span_s`: seconds between the first and the
+    last point, 0 where times are not known."""
 
     time: str
     time_reason: str
+    span_s: float
     compensated: bool
     compensated_reason: str
     ring: str
@@ -44,7 +46,7 @@ def cloud_layout(cloud: Any) -> CloudLayout:
     or is damaged."""
     rows = point_rows(cloud)
     names = rows.dtype.names or ()
-    time, reason = _time(rows, header_stamp(cloud))
+    time, reason, span = _time(rows, header_stamp(cloud))
     own = rows.dtype.itemsize == OWN_STEP and all(rows.dtype.fields[name][1] == OWN.get(name) for name in names)
     if own:
         compensated, why = True, "the layout of `drivesplat mcap`, whose points are compensated"
@@ -56,26 +58,27 @@ def cloud_layout(cloud: Any) -> CloudLayout:
     intensity = next((name for name in INTENSITIES if name in names), None)
     scale, scaled = _scale(rows, intensity)
     return CloudLayout(
-        time, reason, compensated, why, ring or "null",
+        time, reason, span, compensated, why, ring or "null",
         "index of the beam" if ring else "no field has the index of the beam", intensity or "null", scale, scaled,
     )  # fmt: skip
 
 
-def _time(rows: np.ndarray, stamp: int) -> tuple[str, str]:
-    """The value of `time` and its reason: the unit is that in which the times of the points span a revolution."""
+def _time(rows: np.ndarray, stamp: int) -> tuple[str, str, float]:
+    """The value of `time`, its reason, and the seconds that the times span. The unit is the one in which they span a
+    revolution."""
     field = next((name for name in TIMES if name in (rows.dtype.names or ())), None)
     if field is None:
-        return "null", "no field has the times of points"
+        return "null", "no field has the times of points", 0.0
     values = rows[field].astype(np.float64)
     values = values[np.isfinite(values) & (values != 0)] if len(values) else values
     span = float(np.ptp(rows[field].astype(np.float64))) if len(rows) else 0.0
     if not len(values) or not span:
-        return "null", f"all of {field} is the same"
+        return "null", f"all of {field} is the same", 0.0
     absolute = float(np.median(np.abs(values))) > 100 * span
     span = float(np.ptp(values)) if absolute else span
     fitting = [unit for unit, factor in NANOSECONDS.items() if MIN_SPAN_S <= span * factor * 1e-9 < MAX_SPAN_S]
     if not fitting:
-        return "null", f"{field} spans {span:g}, which is no revolution in s, ms, us or ns"
+        return "null", f"{field} spans {span:g}, which is no revolution in s, ms, us or ns", 0.0
     unit = fitting[0]
     said = f"{TIMES[field]} name; spans a revolution in {unit}"
     if not absolute:
@@ -87,7 +90,7 @@ def _time(rows: np.ndarray, stamp: int) -> tuple[str, str]:
     else:
         counts_from = "start"
         said += ", on another clock than the stamp"
-    return f"{{field: {field}, unit: {unit}, counts_from: {counts_from}}}", said
+    return f"{{field: {field}, unit: {unit}, counts_from: {counts_from}}}", said, span * NANOSECONDS[unit] * 1e-9
 
 
 def _scale(rows: np.ndarray, field: str | None) -> tuple[float, str]:

@@ -30,6 +30,8 @@ MIN_KEY_INTERVAL_S = 0.09
 """Least time between proposed key frames, where images come faster than at 10 Hz."""
 MAX_REVOLUTION_S = 0.25
 """Time between sweeps up to which it is taken for that of a revolution."""
+SPAN_MARGIN = 1.02
+"""Factor on the time between the first and the last point of a sweep, which varies from sweep to sweep."""
 AXES_OPTICAL, AXES_FORWARD = "optical", "forward"
 
 
@@ -221,10 +223,13 @@ def _camera_frame(topic: TopicSurvey, tree: TransformTree, vehicle: str) -> tupl
 
 def _lidar(name: str, topic: TopicSurvey) -> Iterator[Line]:
     cloud = topic.samples[0]
-    known = topic.interval_s is not None and 1e-3 < topic.interval_s <= MAX_REVOLUTION_S
-    revolution = f"{topic.interval_s:.3g}" if known else "null"
-    why = "the time between its first sweeps" if known else "sweeps follow each other at longer intervals; state it"
     layout = cloud_layout(cloud)
+    span = max(cloud_layout(sample).span_s for sample in topic.samples)
+    interval = topic.interval_s if topic.interval_s and 1e-3 < topic.interval_s <= MAX_REVOLUTION_S else 0.0
+    revolution = f"{interval if interval >= span else SPAN_MARGIN * span:.4g}" if interval or span else "null"
+    why = "sweeps follow each other at longer intervals; state it"
+    if revolution != "null":
+        why = "the time between its first sweeps" if interval >= span else "2 % more than points span"
     yield Line(f"  {name}:")
     yield Line(f"    points: {quoted(topic.name)}", f"fields {', '.join(str(one.name) for one in cloud.fields)}")
     yield Line(f"    frame: {quoted(topic.frame or 'lidar')}", "the frame of its headers")

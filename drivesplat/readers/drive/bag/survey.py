@@ -23,7 +23,7 @@ KINDS = (RAW_IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, POINT_CLOUD, ODOMETRY, *TRANS
 @dataclass(frozen=True, eq=False)
 class TopicSurvey:
     """A topic with messages that an import uses: their number per second of the bag, the frame of its first message,
-    the median of stamp minus log time in seconds, the usual time between its first messages, and these."""
+    the median of stamp minus log time in seconds, the usual time between the first stamps, and the first messages."""
 
     name: str
     kind: str
@@ -73,21 +73,21 @@ def survey(bag: BagFile, begin: int, end: int) -> BagSurvey:
             continue
         latched = topic.name.endswith(LATCHED)
         window = (None, None) if latched else (begin, end)
-        found, samples, logs = [], [], []
+        found, samples, stamps = [], [], []
         for message in islice(bag.messages([topic.name], *window), SAMPLES):
             try:
                 content = message.content()
             except DatasetError:
                 continue  # an import counts it
             samples.append(content)
-            logs.append(message.log)
             inner = content.transforms[0] if getattr(content, "transforms", None) else content
             if hasattr(inner, "header"):
-                found.append((frame_name(inner.header.frame_id), (header_stamp(inner) - message.log) * 1e-9))
+                stamps.append(header_stamp(inner))
+                found.append((frame_name(inner.header.frame_id), (stamps[-1] - message.log) * 1e-9))
         ahead = float(np.median([it for _, it in found])) if found and not latched else None
         frame = found[0][0] if found else ""
         rate = topic.count / seconds if topic.count > 1 else 0.0
-        interval = float(np.median(np.diff(logs))) * 1e-9 if len(logs) > 1 else None
+        interval = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else None
         used[topic.name] = TopicSurvey(topic.name, topic.kind, topic.count, rate, frame, ahead, interval, samples)
     return BagSurvey(used, others, seconds)
 
