@@ -285,6 +285,28 @@ def test_memory_does_not_grow_with_the_bag(tmp_path):
     assert len(drive_in(tmp_path).frames) == 60
 
 
+def test_names_of_sensors_are_those_of_their_namespaces(tmp_path):
+    """Numbers and words that YAML takes for something else get a prefix."""
+    bag = TestBag.recorded(seconds=0.3)
+    bag.messages = [m for m in bag.messages if m[0] not in (IMAGE, INFO)]
+    names = {
+        "/sensing/camera/0": "sensor_0",
+        "/cam_left/color": "cam_left",
+        "/on": "sensor_on",
+        "/b/cam_left": "cam_left_2",
+    }
+    for stamp in range(START, START + 300_000, 100_000):
+        for space in names:
+            bag.messages.append((f"{space}/image_raw", stamp, bag.make.compressed(stamp, "front_optical", jpeg(0))))
+            bag.messages.append((f"{space}/camera_info", stamp, bag.make.info(stamp, "front_optical")))
+    assert imported(bag.write(tmp_path), tmp_path) == 0
+    values = yaml.safe_load((tmp_path / "topics.yaml").read_text())["cameras"]
+    found = {camera["images"].removesuffix("/image_raw"): name for name, camera in values.items()}
+    assert found.keys() == names.keys()
+    assert sorted(found.values()) == sorted(names.values())
+    assert all(camera["info"] == camera["images"].replace("image_raw", "camera_info") for camera in values.values())
+
+
 def test_missing_extra_is_a_sentence(tmp_path, monkeypatch, capsys):
     path = TestBag.recorded(seconds=0.2).write(tmp_path)
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)

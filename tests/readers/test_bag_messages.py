@@ -113,6 +113,15 @@ def test_layouts_of_drivers_are_read_by_names_and_offsets(name):
     assert ("ring" in columns) == (name != "microseconds")
 
 
+def test_points_without_a_time_do_not_hide_the_unit():
+    """A driver leaves timestamp 0 where nothing returned."""
+    kind, values, _ = LAYOUTS["hesai"]
+    cloud = cloud_of(kind, **values | {"timestamp": np.array([0, *(STAMP * 1e-6 + SECONDS[1:])])})
+    lidar = proposed(cloud)
+    assert lidar.time and (lidar.time.unit, lidar.time.counts_from) == ("s", "epoch")
+    np.testing.assert_allclose(sweep_columns(cloud, lidar)["time"], SECONDS[1:], atol=1e-6)
+
+
 def test_big_endian_padded_and_organised_clouds():
     """Two rows of two points, with 8 bytes behind each row; the bytes of numbers in the other order."""
     kind = layout(16, x=(">f4", 0), y=(">f4", 4), z=(">f4", 8), intensity=(">f4", 12))

@@ -69,13 +69,13 @@ def _time(rows: np.ndarray, stamp: int) -> tuple[str, str, float]:
     field = next((name for name in TIMES if name in (rows.dtype.names or ())), None)
     if field is None:
         return "null", "no field has the times of points", 0.0
-    values = rows[field].astype(np.float64)
-    values = values[np.isfinite(values) & (values != 0)] if len(values) else values
-    span = float(np.ptp(rows[field].astype(np.float64))) if len(rows) else 0.0
-    if not len(values) or not span:
+    every = rows[field].astype(np.float64)
+    every = every[np.isfinite(every)]
+    values = every[every != 0]  # points without a return may have no time
+    if not len(values) or not np.ptp(every):
         return "null", f"all of {field} is the same", 0.0
-    absolute = float(np.median(np.abs(values))) > 100 * span
-    span = float(np.ptp(values)) if absolute else span
+    absolute = float(np.median(np.abs(values))) > 100 * float(np.ptp(values))
+    span = float(np.ptp(values if absolute else every))
     fitting = [unit for unit, factor in NANOSECONDS.items() if MIN_SPAN_S <= span * factor * 1e-9 < MAX_SPAN_S]
     if not fitting:
         return "null", f"{field} spans {span:g}, which is no revolution in s, ms, us or ns", 0.0

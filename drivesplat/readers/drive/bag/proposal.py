@@ -23,7 +23,7 @@ WORLDS = ("map", "odom", "world", "earth", "utm")
 NO_NAMES = {
     "image", "image_raw", "image_rect", "image_rect_color", "image_color", "image_mono", "compressed", "points",
     "points_raw", "point_cloud", "pointcloud", "pointcloud2", "cloud", "raw", "camera", "cameras", "sensing", "sensors",
-    "lidar", "rectified",
+    "lidar", "rectified", "color", "rgb",
 }  # fmt: skip
 """Parts of topics that name no sensor."""
 MIN_KEY_INTERVAL_S = 0.09
@@ -102,7 +102,8 @@ def _is_sensor(topic: TopicSurvey) -> bool:
 def _plain_name(topic: str) -> str:
     parts = [part for part in PurePath(topic).parts if part != "/"]
     named = [part for part in parts if part.lower() not in NO_NAMES] or parts
-    return re.sub(r"[^A-Za-z0-9]+", "_", named[-1]).strip("_") or "sensor"
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", named[-1]).strip("_")
+    return plain if quoted(plain) == plain else f"sensor_{plain}"  # YAML takes 0 and on for other things
 
 
 def _why_not(topic: TopicSurvey, found: BagSurvey) -> str:
