@@ -199,6 +199,21 @@ def test_damaged_and_repeated_messages_are_counted(tmp_path, capsys):
     assert check(tmp_path / "out", None) == []
 
 
+def test_transforms_that_are_none_are_counted(tmp_path, capsys):
+    """A gimbal without a rotation, and one pose of the vehicle of twenty is none."""
+    bag = TestBag.recorded(seconds=0.5)
+    transforms = [one for one in bag.messages if one[0] == "/tf"]
+    transforms[20][2].transforms[1].transform.rotation.w += 0.5
+    gimbal = bag.make.transforms(START, ("base_link", "gimbal", np.eye(4)))
+    gimbal.transforms[0].transform.rotation.w = 0.0
+    bag.messages.append(("/tf", START, gimbal))
+    assert imported(bag.write(tmp_path), tmp_path) == 0
+    said = capsys.readouterr().out
+    assert "note: transforms of base_link to odom left out as damaged: 1" in said
+    assert "note: transforms of gimbal to base_link left out as damaged: 1" in said
+    assert len(read_drive(tmp_path / "out").frames) == 5
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -343,7 +358,7 @@ def sound(content: Any, table: TransformTable) -> None:
         assert calibration.K[0][0] > 0 and np.isfinite(calibration.K).all() and np.array_equal(turn, np.eye(3))
     elif hasattr(content, "transforms"):
         for one in content.transforms:
-            table.add(one.header.frame_id, one.child_frame_id, 0, one.transform.translation, one.transform.rotation)
+            table.add(one.header, one.child_frame_id, 0, one.transform.translation, one.transform.rotation)
         for one in table.tree().edges:
             assert np.isfinite(one.poses(np.zeros(1, dtype=np.int64))).all()
     else:

@@ -265,13 +265,13 @@ def test_images_without_poses_are_left_out_and_counted(tmp_path, capsys):
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path):
-    """60 raw images of 0.9 MB."""
+    """30 raw images of 0.9 MB."""
     make, rows = Messages(), np.random.default_rng(0).integers(0, 256, (480, 1920), dtype=np.uint8)
     bag = TestBag.recorded(seconds=2.0).without(IMAGE, INFO, CLOUD)
     changes = {"width": 640, "height": 480, "k": [500, 0, 320, 0, 500, 240, 0, 0, 1], "d": []}
     bag.messages.append(("/cam/camera_info", START, make.info(START, "front_optical", **changes)))
-    for i in range(60):
-        stamp = START + 30_000 * i
+    for i in range(30):
+        stamp = START + 60_000 * i
         bag.messages.append(("/cam/image_raw", stamp, make.raw(stamp, "front_optical", "rgb8", (640, 480), rows)))
     path = bag.write(tmp_path)
     topics = tmp_path / "topics.yaml"
@@ -281,8 +281,8 @@ def test_memory_does_not_grow_with_the_bag(tmp_path):
     assert main(["import", "bag", str(path), "--map", str(topics), "--out", str(tmp_path / "out")]) == 0
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert path.stat().st_size > 50e6 and peak < 20e6
-    assert len(drive_in(tmp_path).frames) == 60
+    assert path.stat().st_size > 25e6 and peak < 12e6, peak
+    assert len(drive_in(tmp_path).frames) == 30
 
 
 def test_names_of_sensors_are_those_of_their_namespaces(tmp_path):

@@ -81,7 +81,7 @@ class DriveOfBag:
         calibrations: Mapping[str, Calibration],
         turns: Mapping[str, np.ndarray],
     ):
-        self._map, self._ego, self._calibrations = bag_map, ego, calibrations
+        self._map, self._tree, self._ego, self._calibrations = bag_map, tree, ego, calibrations
         sensors: dict[str, BagCamera | BagLidar] = {**bag_map.cameras, **bag_map.lidars}
         self._mounts = {
             name: SensorMount(sensor, tree, bag_map, turns.get(name, np.eye(3))) for name, sensor in sensors.items()
@@ -151,7 +151,8 @@ class DriveOfBag:
         that was read as a whole."""
         every = list(recordings.values())
         begin = min(stamp for one in every for stamp in one.files)
-        found = [unposed_sentence(every), grey_sentence(every), self._pose_gaps(begin)]
+        damaged = [f"{what} left out as damaged: {count}" for what, count in self._tree.damaged.items()]
+        found = [unposed_sentence(every), grey_sentence(every), self._pose_gaps(begin), *damaged]
         return [
             *(sentence for sentence in found if sentence),
             *(note for one in every for note in one.notes(begin, indexed.get(one.name))),

@@ -228,7 +228,7 @@ def _lidar(name: str, topic: TopicSurvey) -> Iterator[Line]:
     span = max(cloud_layout(sample).span_s for sample in topic.samples)
     interval = topic.interval_s if topic.interval_s and 1e-3 < topic.interval_s <= MAX_REVOLUTION_S else 0.0
     revolution = f"{interval if interval >= span else SPAN_MARGIN * span:.4g}" if interval or span else "null"
-    why = "sweeps follow each other at longer intervals; state it"
+    why = "unknown: sweeps follow each other at longer intervals"
     if revolution != "null":
         why = "the time between its first sweeps" if interval >= span else "2 % more than points span"
     yield Line(f"  {name}:")

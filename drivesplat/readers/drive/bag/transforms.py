@@ -1,8 +1,8 @@
 """The transforms of a bag: poses of frames in each other over time, and the path of the ego vehicle."""
 
 from array import array
-from collections import defaultdict, deque
-from collections.abc import Iterable
+from collections import Counter, defaultdict, deque
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -63,10 +63,11 @@ class FrameEdge:
 
 
 class TransformTree:
-    """Frames that are connected by transforms."""
+    """Frames that are connected by transforms. `damaged`: what was left out, such as "base_link to map", and how
+    often."""
 
-    def __init__(self, edges: Iterable[FrameEdge]):
-        self.edges = list(edges)
+    def __init__(self, edges: Iterable[FrameEdge], damaged: Mapping[str, int] | None = None):
+        self.edges, self.damaged = list(edges), dict(damaged or {})
         self._beside: dict[str, list[tuple[str, FrameEdge]]] = defaultdict(list)
         for edge in self.edges:
             self._beside[edge.child].append((edge.parent, edge))
@@ -114,32 +115,44 @@ class TransformTable:
     def __init__(self) -> None:
         self._rows: dict[tuple[str, str, bool], array] = defaultdict(lambda: array("d"))
         self._stamps: dict[tuple[str, str, bool], array] = defaultdict(lambda: array("q"))
+        self.damaged: Counter[str] = Counter()
 
-    def add(self, parent: Any, child: Any, stamp: int, place: Any, turn: Any, latched: bool = False) -> None:
-        """Adds the pose of a frame in its parent: messages with x, y, z and x, y, z, w. Raises DatasetError where it is
-        none."""
-        numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
-        key = frame_name(parent), frame_name(child), latched
-        length = float(np.linalg.norm(numbers[3:]))
-        if not (np.isfinite(numbers).all() and abs(length - 1.0) < UNIT_TOLERANCE) or key[0] == key[1]:
-            raise DatasetError(f"the transform of {key[1]} to {key[0]} at {stamp} is no rigid one: {listed(numbers)}")
-        self._rows[key].extend(numbers)
+    def add(self, header: Any, child: Any, stamp: int, place: Any, turn: Any, latched: bool = False) -> None:
+        """Adds the pose of the frame `child` in that of `header`: messages with x, y, z and x, y, z, w."""
+        key = frame_name(header.frame_id), frame_name(child), latched
+        self._rows[key].extend((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
         self._stamps[key].append(stamp)
 
+    def contents(self, messages: Iterable[BagMessage]) -> Iterator[tuple[BagMessage, Any]]:
+        """Messages with their contents; damaged ones are counted."""
+        for message in messages:
+            try:
+                content = message.content()
+            except DatasetError:
+                self.damaged[f"messages on {message.topic}"] += 1
+                continue
+            yield message, content
+
     def tree(self) -> TransformTree:
-        """The transforms in the order of time, of equal times the last. Latched ones hold their last value; the same
-        transform on a topic that is not latched counts more."""
+        """The transforms in the order of time, of equal times the last, without those that are not rigid. Latched ones
+        hold their last value; they count more than the same transform on other topics."""
         edges: dict[tuple[str, str], FrameEdge] = {}
-        for (parent, child, latched), rows in sorted(self._rows.items(), key=lambda item: not item[0][2]):
+        for (parent, child, latched), rows in sorted(self._rows.items(), key=lambda item: item[0][2]):
             values = np.frombuffer(rows, dtype=np.float64).reshape(-1, 7)
             stamps = np.frombuffer(self._stamps[parent, child, latched], dtype=np.int64)
-            if latched:
-                values, stamps = values[-1:], stamps[-1:]
+            with np.errstate(over="ignore", invalid="ignore"):
+                lengths = np.linalg.norm(values[:, 3:], axis=1)
+                sound = np.isfinite(values).all(axis=1) & (np.abs(lengths - 1.0) < UNIT_TOLERANCE) & (parent != child)
+            if not sound.all():
+                self.damaged[f"transforms of {child} to {parent}"] += int((~sound).sum())
+            values, stamps = values[sound][-1 if latched else 0 :], stamps[sound][-1 if latched else 0 :]
+            if not len(stamps):
+                continue
             stamps, last = np.unique(stamps[::-1], return_index=True)
             values = values[::-1][last]
             turns = values[:, 3:] / np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
             edges[parent, child] = FrameEdge(parent, child, stamps, values[:, :3], turns, latched)
-        return TransformTree(edges.values())
+        return TransformTree(edges.values(), self.damaged)
 
 
 def read_transforms(
@@ -147,29 +160,26 @@ def read_transforms(
 ) -> TransformTree:
     """The transforms on all tf topics with log times from `begin` to `end` (nanoseconds), latched ones of all times,
     and the poses of a topic of Odometry. These replace what tf says of `vehicle` over time."""
+
+    def time(stamped: Any, message: BagMessage) -> int:
+        return microseconds(header_stamp(stamped) if clock == "header" else message.log)
+
     table, topics = TransformTable(), [topic.name for topic in bag.of_kind(*TRANSFORMS)]
     latched = [name for name in topics if name.endswith(LATCHED)]
-    for message in bag.messages(latched):
-        for one in message.content().transforms:
-            table.add(
-                one.header.frame_id, one.child_frame_id, 0, one.transform.translation, one.transform.rotation, True
-            )
+    for _, content in table.contents(bag.messages(latched)):
+        for one in content.transforms:
+            place, turn = one.transform.translation, one.transform.rotation
+            table.add(one.header, one.child_frame_id, 0, place, turn, latched=True)
     moving = [name for name in topics if name not in latched]
-    for message in bag.messages(moving, begin, end):
-        for one in message.content().transforms:
+    for message, content in table.contents(bag.messages(moving, begin, end)):
+        for one in content.transforms:
             if odometry is None or frame_name(one.child_frame_id) != vehicle:
                 place, turn = one.transform.translation, one.transform.rotation
-                table.add(one.header.frame_id, one.child_frame_id, _time(one, message, clock), place, turn)
-    for message in bag.messages([odometry] if odometry else [], begin, end):
-        one = message.content()
-        child = one.child_frame_id or vehicle
+                table.add(one.header, one.child_frame_id, time(one, message), place, turn)
+    for message, one in table.contents(bag.messages([odometry] if odometry else [], begin, end)):
         pose = one.pose.pose
-        table.add(one.header.frame_id, child, _time(one, message, clock), pose.position, pose.orientation)
+        table.add(one.header, one.child_frame_id or vehicle, time(one, message), pose.position, pose.orientation)
     return table.tree()
-
-
-def _time(stamped: Any, message: BagMessage, clock: str) -> int:
-    return microseconds(header_stamp(stamped) if clock == "header" else message.log)
 
 
 @dataclass(frozen=True, eq=False)
