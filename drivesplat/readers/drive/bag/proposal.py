@@ -73,7 +73,7 @@ def proposed_map(found: BagSurvey, tree: TransformTree, source: str) -> str:
             lines += _lidar(name, topic)
     lines.append(_key_frames(cameras, lidars))
     if any(topic.kind == RAW_IMAGE for topic in cameras.values()):
-        lines.append(Line("raw_images: png", "loses nothing; jpeg takes a fifth of the space"))
+        lines.append(Line("raw_images: png", "loses nothing; jpeg takes less space"))
     used = {topic.name for topic in sensors.values()}
     lines += [
         Line(f"# not used: {_printable(topic.name)}", why)

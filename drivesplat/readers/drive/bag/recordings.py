@@ -87,7 +87,7 @@ class SensorRecordings:
             (root / name).write_bytes(file.data)
             return WrittenFile(self, timestamp, name, file.grey)
         name = f"{self.folder}/{timestamp}.npz"
-        np.savez(root / name, **file)  # deflating takes longer than all else, and saves a fifth
+        np.savez(root / name, **file)  # deflating takes longer than all else
         return WrittenFile(self, timestamp, name)
 
     def add(self, file: WrittenFile) -> None:
