@@ -83,7 +83,7 @@ def ros_types() -> Any:
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
-        raise RequestError("MCAP files need the package rosbags: pip install 'drivesplat[mcap]'") from None
+        raise RequestError("MCAP files need the package rosbags: pip install 'drivesplat[ros]'") from None
     types = get_typestore(Stores.ROS2_HUMBLE)
     for name, definition in VISION_MSGS.items():
         types.register(get_types_from_msg(definition, name))

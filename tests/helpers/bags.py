@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from drivesplat.cli.main import main
+from drivesplat.cli.__main__ import main
 from drivesplat.scene.rigid import apply, inverse, rigid
 
 CONTAINERS = ("ros1", "sqlite", "mcap")

@@ -16,7 +16,7 @@ from helpers.shown_drives import require_refused_or_sound
 from helpers.table_files import time_limit
 from PIL import Image
 
-from drivesplat.cli.main import main
+from drivesplat.cli.__main__ import main
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive.bag.bag_file import BagMessage
 from drivesplat.readers.drive.bag.bag_import import propose

@@ -31,7 +31,7 @@ from helpers.bags import (
 )  # fmt: skip
 from scipy.spatial.transform import Rotation
 
-from drivesplat.cli.main import main
+from drivesplat.cli.__main__ import main
 from drivesplat.export.drive_mcap import write_mcap
 from drivesplat.readers.drive.check import check, whole_scene
 from drivesplat.readers.drive.format import Drive, read_drive
