@@ -163,7 +163,7 @@ rule compare:
     the last one, as a film.
     """
     input:
-        checkpoints=expand("<results>/{{scene}}/{method}/checkpoint.npz", method=plan.config.methods),
+        checkpoints=plan.checkpoints,
         scene=plan.annotated_scene,
         parser=plan.first_parser,
         masks="<results>/{scene}/masks/masks.json",

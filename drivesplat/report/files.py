@@ -57,9 +57,11 @@ def write_report(
     write_json(record, report)
     write_figures(table, report)
     # the costs of the configured scenes so far
-    stages = [name for stages in job.expected.values() for name in stages]
-    methods = dict.fromkeys(name.partition("/")[0] for name in stages if "/" in name)
-    totals = {total["scene"]: total for total in scene_totals(read_costs(results)[0], list(methods))}
+    of_scenes = {
+        scene: list(dict.fromkeys(name.partition("/")[0] for name in stages if "/" in name))
+        for scene, stages in job.expected.items()
+    }
+    totals = {total["scene"]: total for total in scene_totals(read_costs(results)[0], (), of_scenes)}
     costs = [totals[scene] for scene in job.expected if scene in totals]
     _write_page(ghosts, render_ghosts_page())
     _write_page(page, report_page(report, media, costs))

@@ -35,12 +35,13 @@ from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.scans import ScanSettings
 from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.visuals import GhostSettings, RemovalSettings, SubjectSettings
+from drivesplat.settings.without_boxes import REPLACED, substitutes
 from drivesplat.settings.world import CameraChannel
 
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
     "lidar_depth", "scans", "discover", "masks", "sky", "train", "render", "ghosts", "removal", "export",
-    "device",
+    "device", "replace_street",
 )  # fmt: skip
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
 
@@ -60,6 +61,9 @@ class Config(Settings):
     """:printed: Methods to train and compare, each under a name of your choice, which also names its result folder.
     null drops a method: `methods: {street: null}` in a file laid over this one. vanilla and street stand before all
     others."""
+    replace_street: bool = True
+    """:printed: On a drive without boxes train `street_discovered` in place of `street`, without LiDAR scans
+    `drifting`, unless your own `methods` change `street`. docs/without_boxes.md"""
     ablation: AblationSettings = AblationSettings()
     """:printed: Ablation of a method. Only `snakemake results/{scene}/ablation.csv` trains it."""
     cameras: tuple[str, ...] = ("CAM_FRONT",)
@@ -206,6 +210,24 @@ class Config(Settings):
         return found
 
     @cached_property
+    def outlines(self) -> dict[str, Any]:
+        """Cache of `workflow.without_tracks`: the outlines of recordings, by scene."""
+        return {}
+
+    @cached_property
+    def untracked(self) -> dict[str, bool]:
+        """Cache of the same: whether recordings lack tracks, by scene."""
+        return {}
+
+    @cached_property
+    def substitutes(self) -> dict[str, MethodSettings]:
+        """The methods of which one takes the place of `street` on a drive without boxes, by name: those of the config
+        where it has such names. Empty where `street` is dropped or changed."""
+        if self.methods.get(REPLACED) != default_methods()[REPLACED]:
+            return {}
+        return {name: self.methods.get(name) or method for name, method in substitutes().items()}
+
+    @cached_property
     def ablated(self) -> dict[str, MethodSettings]:
         """The methods of the ablation, by name; empty where the ablated method is not configured."""
         whole = self.methods.get(self.ablation.of)
@@ -213,8 +235,9 @@ class Config(Settings):
 
     @property
     def all_methods(self) -> dict[str, MethodSettings]:
-        """The configured methods and those of the ablation."""
-        return {**self.methods, **self.ablated}
+        """The configured methods, those that take the place of `street` on drives without boxes, and those of the
+        ablation."""
+        return {**self.methods, **self.substitutes, **self.ablated}
 
     @cached_property
     def dataset_names(self) -> dict[str, str]:

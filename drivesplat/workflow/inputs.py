@@ -17,6 +17,7 @@ from drivesplat.settings.tracks import OTHER_TRACKS, TRACK_FOLDERS, Tracks
 from drivesplat.settings.world import CameraChannel
 from drivesplat.workflow.stages import SCAN_BASELINES, SCANS, refines_poses, training_inputs
 from drivesplat.workflow.without_cameras import has_cameras
+from drivesplat.workflow.without_tracks import methods_of
 
 
 def unwritable_results(config: Config, error: OSError) -> DriveSplatError:
@@ -176,12 +177,12 @@ class Inputs:
 
     def first_parser(self, wildcards: Any) -> str:
         """The training record of the first method: cameras and splits are the same for all tracks."""
-        return self._of(next(iter(self.config.methods.values())).tracks, wildcards, "parser.npz")
+        return self._of(next(iter(methods_of(self.config, wildcards.scene).values())).tracks, wildcards, "parser.npz")
 
     def discovered(self, wildcards: Any) -> list[str]:
         """The discovered tracks of a scene, if those of the job are discovered or, without any, those of a method."""
         alone = hasattr(wildcards, "tracks")
-        of_any = (method.tracks for method in self.config.methods.values())
+        of_any = (method.tracks for method in methods_of(self.config, wildcards.scene).values())
         wanted = "discovered" in ([self.tracks(wildcards)] if alone else of_any)
         return [f"{self.config.results_dir}/{wildcards.scene}/discovered.json"] if wanted else []
 
@@ -227,13 +228,15 @@ class Inputs:
 
     def scan_baselines(self, wildcards: Any) -> list[str]:
         """The baselines of a scene's LiDAR scans, if any method renders them."""
-        rendered = any(self.renders_lidar(wildcards.scene, method) for method in self.config.methods)
+        rendered = any(
+            self.renders_lidar(wildcards.scene, method) for method in methods_of(self.config, wildcards.scene)
+        )
         return [f"{self.config.results_dir}/{wildcards.scene}/{SCAN_BASELINES}.json"] if rendered else []
 
     def actors(self, wildcards: Any) -> list[str]:
         """The actors of a scene and of the tracks of a job, if any method with these tracks has them."""
         tracks = self.tracks(wildcards)
-        own = [name for name, method in self.config.methods.items() if method.tracks == tracks]
+        own = [name for name, method in methods_of(self.config, wildcards.scene).items() if method.tracks == tracks]
         taken = any("actors" in training_inputs(self.config, wildcards.scene, method) for method in own)
         return [self._of(tracks, wildcards, "actors.npz")] if taken else []
 

@@ -15,6 +15,7 @@ from drivesplat.settings.track_references import EditReference, TrackReferences
 from drivesplat.settings.tracks import FOUND, Tracks
 from drivesplat.settings.visuals import SubjectSettings
 from drivesplat.workflow.film_names import EDITS, QUAD, scene_edits
+from drivesplat.workflow.without_tracks import methods_of
 
 RULES_OF_EDITS = ("edit", "quad", "drive_folder", "scan_folder")
 """Rules that render an edit; the last two also render trajectories, which name no tracks."""
@@ -48,7 +49,7 @@ def track_references(
     films |= set(for_scene(config, scene).render.quad if "films" in chosen else ())
     every_edit = everything or bool({"edits", "drives", "mcap"} & chosen)
     pictured = everything or "looks" in chosen or any(path.stem in FILES_OF_SUBJECT for path in files)
-    editable = any(method.object_parts and method.tracks == tracks for method in config.methods.values())
+    editable = any(method.object_parts and method.tracks == tracks for method in methods_of(config, scene).values())
     edits = fitting_edits(config, scene, tracks) if editable else {}
     used = (_of_edit(name, edit) for name, edit in edits.items() if every_edit or name in films)
     named = [reference for references in used for reference in references]
@@ -80,7 +81,7 @@ def refuse_other_tracks(config: Config, scene: str, method: str, edit: str) -> N
         return
     able = [
         name
-        for name, other in config.methods.items()
+        for name, other in methods_of(config, scene).items()
         if other.object_parts and edit in fitting_edits(config, scene, other.tracks)
     ]
     named = dict.fromkeys(reference.track for reference in _of_edit(edit, scene_edits(config, scene)[edit]))
@@ -92,9 +93,11 @@ def refuse_other_tracks(config: Config, scene: str, method: str, edit: str) -> N
 
 def edits_left_out(config: Config, scenes: Iterable[str]) -> list[str]:
     """A sentence for each of these scenes with edits that fit the tracks of no method that can be edited."""
-    known: set[Tracks] = {method.tracks for method in config.methods.values() if method.object_parts}
     sentences = []
-    for scene in sorted(set(scenes)) if known else ():
+    for scene in sorted(set(scenes)):
+        known: set[Tracks] = {method.tracks for method in methods_of(config, scene).values() if method.object_parts}
+        if not known:
+            continue
         fitting = {name for tracks in known for name in fitting_edits(config, scene, tracks)}
         absent = [name for name in scene_edits(config, scene) if name not in fitting]
         if absent:

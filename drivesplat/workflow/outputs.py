@@ -28,6 +28,7 @@ from drivesplat.workflow.stages import (
     training_inputs,
 )
 from drivesplat.workflow.without_cameras import has_cameras, scene_methods
+from drivesplat.workflow.without_tracks import methods_of
 
 SCRIPTS = "workflow_scripts"
 LOOKS = ("ghost_panel.png", "removal.png")
@@ -211,9 +212,11 @@ class Outputs(Inputs):
 
     def looks(self, _: Any = None) -> list[str]:
         """The pictures of the batch's scenes and methods, and of the tracks of any method."""
-        known = dict.fromkeys(method.tracks for method in self.config.methods.values() if method.tracks != "none")
         places = (
-            Path(scene, TRACK_FOLDERS[own]) for scene in self._with_cameras(self.config.batch_scenes) for own in known
+            Path(scene, TRACK_FOLDERS[own])
+            for scene in self._with_cameras(self.config.batch_scenes)
+            for own in dict.fromkeys(method.tracks for method in methods_of(self.config, scene).values())
+            if own != "none"
         )
         tracks = [f"{self.config.results_dir}/{place}/tracks.png" for place in places]
 
@@ -254,6 +257,11 @@ class Outputs(Inputs):
         """The eval.json of every method of a scene."""
         folder = f"{self.config.results_dir}/{wildcards.scene}"
         return [f"{folder}/{method}/eval.json" for method in scene_methods(self.config, wildcards.scene)]
+
+    def checkpoints(self, wildcards: Any) -> list[str]:
+        """The checkpoints of every method of a scene."""
+        folder = f"{self.config.results_dir}/{wildcards.scene}"
+        return [f"{folder}/{method}/checkpoint.npz" for method in methods_of(self.config, wildcards.scene)]
 
     def _film_names(self, scene: str, method: str) -> list[str]:
         """The films of a method; those of some of its parts only if it has moving ones, those of images only of scenes

@@ -40,6 +40,7 @@ from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.runs_file import RUNS, no_such_run, runs_of
 from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
+from drivesplat.workflow.without_tracks import known_methods, methods_of
 from drivesplat.world.marker import refuse_foreign_data
 
 ABLATION_FILES = ("ablation.json", "ablation.csv")
@@ -114,19 +115,21 @@ class Plan(JobResources):
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError with the known names if a target names an unknown scene, method or film, or an ablation
         with a variant equal to the complete method."""
-        ablation, known = self.config.ablation, ", ".join(self.config.methods)
+        ablation = self.config.ablation
         for target in targets:
             scene, *rest = self._inside_results(target)
             if not rest:
                 continue
             self.config.dataset_of(scene)
+            methods = methods_of(self.config, scene)
             if rest[0] in ABLATION_FILES and not self.config.ablated:
                 raise ConfigError(
-                    f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: {known}"
+                    f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: "
+                    f"{', '.join(self.config.methods)}"
                 )
-            if len(rest) > 1 and rest[0] not in (*self.config.all_methods, *OTHER_TRACKS, "masks"):
+            if len(rest) > 1 and rest[0] not in (*known_methods(self.config, scene), *OTHER_TRACKS, "masks"):
                 more = f"; for the ablation: {ablation.job.name_pattern}" if self.config.ablated else ""
-                meant = suggestion(rest[0], self.config.methods)
+                meant, known = suggestion(rest[0], methods), ", ".join(methods)
                 raise ConfigError(f"method {rest[0]!r} is not in the config; {meant}there are: {known}{more}")
             films = (*for_scene(self.config, scene).render.trajectories, PARTS_FILM)
             refuse_image_results(self.config, scene, rest, films)
@@ -137,11 +140,12 @@ class Plan(JobResources):
                     f"on scene {scene} these variants take nothing out of {ablation.of!r} and would train it again as "
                     f"it is: {', '.join(idle)}; drop them with ablation: {{without: {{{drop}}}}}"
                 )
-            if len(rest) > 1 and rest[0] in self.config.all_methods:
+            if len(rest) > 1 and rest[0] in known_methods(self.config, scene):
                 self._refuse_unknown_film(scene, rest[0], rest[1:])
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
+        own = methods_of(self.config, scene)
         if len(path) > 1 and path[0] == RUNS:
             runs, name = runs_of(self.config, scene, method), path[1].rpartition(".")[0] if len(path) == 2 else path[1]
             if name not in runs:
@@ -152,7 +156,7 @@ class Plan(JobResources):
             return
         if path in ([f"{LIDAR}.png"], [f"{LIDAR}.mp4"], [f"{LIDAR}.json"]):
             if not self.renders_lidar(scene, method):
-                able = ", ".join(name for name in self.config.methods if self.renders_lidar(scene, name)) or "none"
+                able = ", ".join(name for name in own if self.renders_lidar(scene, name)) or "none"
                 raise ConfigError(
                     f"method {method!r} renders no LiDAR of scene {scene} (train.scans.per_image is 0); those do: "
                     f"{able} (docs/lidar.md; presets/lidar.yaml adds street_lidar)"
@@ -167,7 +171,7 @@ class Plan(JobResources):
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
         of_parts = film == PARTS_FILM or (trajectory is not None and trajectory.parts != "all")
         if of_parts and method not in self.methods_with_moving_parts:
-            able = ", ".join(name for name in self.methods_with_moving_parts if name in self.config.methods)
+            able = ", ".join(name for name in self.methods_with_moving_parts if name in own)
             raise ConfigError(
                 f"method {method!r} has no moving parts that could be shown apart; those do: {able or 'none'}"
             )
@@ -184,7 +188,7 @@ class Plan(JobResources):
             folder = "/".join([self.config.results_dir, scene, method, *path])
             raise ConfigError(f"{folder} is a folder; ask for the file {folder}/{rest[0]}.json")
         if rest[:1] == ["scans"] and not self.renders_lidar(scene, method):
-            able = [name for name in self.config.methods if self.renders_lidar(scene, name)]
+            able = [name for name in methods_of(self.config, scene) if self.renders_lidar(scene, name)]
             raise ConfigError(
                 f"method {method!r} does not render LiDAR, so it has no scans; those do: {', '.join(able) or 'none'} "
                 "(train.scans.per_image above 0, as in presets/lidar.yaml)"
@@ -203,7 +207,7 @@ class Plan(JobResources):
 
     def _refuse_unknown_edit(self, scene: str, method: str, edit: str) -> None:
         if method not in self.methods_with_actors:
-            able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
+            able = ", ".join(filter(methods_of(self.config, scene).__contains__, self.methods_with_actors)) or "none"
             raise ConfigError(f"method {method!r} knows no actors that could be edited; those do: {able}")
         if edit not in scene_edits(self.config, scene):
             raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
@@ -250,7 +254,7 @@ class Plan(JobResources):
                 continue
             if scene in self.config.scenes:
                 of_all = rest == ["metrics.json"]
-                own = scene_methods(self.config, scene)
+                own = scene_methods(self.config, scene) if of_all else known_methods(self.config, scene)
                 methods = [method for method in own if of_all or method in rest[:1]]
                 pairs |= {(scene, method) for method in ("", *methods)}
             else:

@@ -4,11 +4,9 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.readers.datasets import layout
 from drivesplat.readers.outline import (
     Outline,
     RecordedCamera,
@@ -23,6 +21,7 @@ from drivesplat.readers.outline import (
 from drivesplat.settings.config import for_scene
 from drivesplat.workflow.job_resources import JobResources
 from drivesplat.workflow.stages import SCANS, TRAIN, WORLD
+from drivesplat.workflow.without_tracks import recorded_outline
 from drivesplat.world.marker import WORLD_MARKER
 
 TRAINING_MB = 16_000
@@ -36,16 +35,6 @@ class Recordings:
 
     def __init__(self, plan: JobResources):
         self._config, self._plan = plan.config, plan
-        self._outlines: dict[str, Outline | None] = {}
-
-    def outline(self, scene: str) -> Outline | None:
-        """The outline of a scene's recording; None where its reader gives none."""
-        if scene not in self._outlines:
-            dataset = self._config.datasets[self._config.dataset_of(scene)]
-            read = None if dataset.world else getattr(layout(dataset.reader), "outline", None)
-            root = Path(self._plan.root(SimpleNamespace(scene=scene))) if read else None
-            self._outlines[scene] = read(root, dataset.version, scene) if read else None
-        return self._outlines[scene]
 
     def refuse_unfit(self, jobs: Iterable[Any]) -> None:
         """Raises ConfigError, with a sentence for each scene, where one of Snakemake's planned `jobs` would fail on
@@ -63,7 +52,8 @@ class Recordings:
     def image_gb(self, scene: str) -> float | None:
         """The size of a scene's training images in memory, in GB, of those at key frames as far as these are trained on
         and, where `sweeps` is set, of the others in proportion; None while the images are unknown."""
-        outline, frames, settings = self.outline(scene), self._frames(scene), for_scene(self._config, scene)
+        outline, frames = recorded_outline(self._config, scene), self._frames(scene)
+        settings = for_scene(self._config, scene)
         if outline is None:
             outline, frames = _extracted(Path(self._config.results_dir, scene, "scene.json")), None
         if outline is None or not outline.key_frames:
@@ -112,7 +102,7 @@ class Recordings:
 
     def _faults(self, scene: str, rules: set[str]) -> Iterator[str]:
         """What the recording of a scene lacks for the jobs of some rules, a sentence each."""
-        outline, settings = self.outline(scene), for_scene(self._config, scene)
+        outline, settings = recorded_outline(self._config, scene), for_scene(self._config, scene)
         if outline is None:
             return
         frames = self._frames(scene)

@@ -16,7 +16,9 @@ from drivesplat.settings import quoted, validated
 from drivesplat.settings.config import Config
 from drivesplat.settings.names import MAX_LENGTH, NAME
 from drivesplat.settings.simulate import RunSettings
+from drivesplat.settings.without_boxes import REPLACED
 from drivesplat.workflow.film_names import no_such_edit, scene_edits
+from drivesplat.workflow.without_tracks import in_place_of_street
 
 RUNS = "runs"
 """The folder of a method with its runs."""
@@ -47,9 +49,10 @@ def config_runs(config: Config) -> dict[str, RunSettings]:
 
 
 def runs_of(config: Config, scene: str, method: str) -> dict[str, RunSettings]:
-    """The runs of a method on a scene by name. Raises ConfigError where one names a scene, a method or an edit that is
-    not there."""
+    """The runs of a method on a scene by name; those of `street` are also runs of the method in its place, without
+    edits if it knows no objects. Raises ConfigError where one names a scene, a method or an edit that is not there."""
     found = {}
+    replaces, has_objects = in_place_of_street(config, scene) == method, config.all_methods[method].object_parts
     for name, run in config_runs(config).items():
         for other in run.scenes or ():
             config.dataset_of(other)
@@ -58,7 +61,8 @@ def runs_of(config: Config, scene: str, method: str) -> dict[str, RunSettings]:
             raise ConfigError(
                 f"run {name!r}: there is no method {unknown[0]!r}; there are: {', '.join(config.methods)}"
             )
-        if method not in run.methods or (run.scenes is not None and scene not in run.scenes):
+        by_replaced = replaces and REPLACED in run.methods and (run.edit is None or has_objects)
+        if not (method in run.methods or by_replaced) or (run.scenes is not None and scene not in run.scenes):
             continue
         edits = scene_edits(config, scene) if run.edit is not None else {}
         if run.edit is not None and run.edit not in edits:

@@ -53,6 +53,7 @@ from drivesplat.workflow.without_cameras import (
     has_cameras,
     no_camera,
 )
+from drivesplat.workflow.without_tracks import methods_of
 
 TRAIN, WORLD = "train", "demo_world"
 """The stages of a training and of a synthetic world."""
@@ -232,7 +233,7 @@ def _viewer(at: JobScope) -> dict[str, Any]:
         "time_s": export.time_s,
         "image_width": export.viewer_images,
         "edits": fitting_edits(at.config, at.scene, at.tracks) if editable else {},
-        "methods": tuple(sorted(at.config.methods)),
+        "methods": tuple(sorted(methods_of(at.config, at.scene))),
     }
 
 

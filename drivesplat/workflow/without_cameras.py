@@ -6,6 +6,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.report import HELD_OUT_PAIR, LOOKS
 from drivesplat.settings.tracks import OTHER_TRACKS
+from drivesplat.workflow.without_tracks import methods_of
 
 LIDAR_SCENE_STAGES = ("extract", "parser", "scene_metrics")
 LIDAR_METHOD_STAGES = ("train", "evaluate_scans")
@@ -37,9 +38,9 @@ def has_cameras(config: Config, scene: str) -> bool:
 
 
 def scene_methods(config: Config, scene: str) -> list[str]:
-    """The methods of a scene: without cameras those that render LiDAR."""
+    """The methods of a scene, without cameras those that render LiDAR."""
     every = has_cameras(config, scene)
-    return [method for method in config.methods if every or _renders_lidar(config, scene, method)]
+    return [method for method in methods_of(config, scene) if every or _renders_lidar(config, scene, method)]
 
 
 def _renders_lidar(config: Config, scene: str, method: str) -> bool:
@@ -83,7 +84,7 @@ def methods_left_out(config: Config, scenes: Iterable[str]) -> list[str]:
     first = {config.dataset_of(scene): scene for scene in scenes}
     sentences = []
     for dataset, scene in sorted(first.items()):
-        absent = [method for method in config.methods if method not in scene_methods(config, scene)]
+        absent = [method for method in methods_of(config, scene) if method not in scene_methods(config, scene)]
         if absent:
             sentences.append(
                 f"dataset {dataset} has no camera (cameras: []): methods that render images alone are left out there "

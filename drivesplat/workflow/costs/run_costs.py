@@ -28,6 +28,7 @@ from drivesplat.workflow.named_tracks import edits_left_out
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.snakemake_log import drop_foreign_records
 from drivesplat.workflow.without_cameras import methods_left_out
+from drivesplat.workflow.without_tracks import methods_of, methods_without_boxes
 
 COSTS, ESTIMATE = "costs", "estimate"
 """Targets that run no job: the first updates and prints costs.csv, the second prints the estimate."""
@@ -43,15 +44,17 @@ class RunCosts:
         self._ended: threading.Event | None = None
 
     def report_at_planning(self) -> None:
-        """Prints each setting that an override replaces for the scenes and methods of the targets, methods that
-        scenes without cameras leave out, and edits whose tracks no method has: `snakemake -n` and a run with nothing
+        """Prints each setting that an override replaces for the scenes and methods of the targets, the
+        methods of scenes without boxes, those that scenes without cameras leave out, and edits whose tracks no method has: `snakemake -n` and a run with nothing
         to do print them, too. Removes records on which Snakemake would fail, and prints which."""
         wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
         if wanted or COSTS not in self._targets:
             places = self._plan.scenes_and_methods(wanted)
             scenes = {scene for scene, _ in places}
-            absent = [*methods_left_out(self._plan.config, scenes), *edits_left_out(self._plan.config, scenes)]
-            for sentence in (*without_effect(self._plan.config, places), *absent):
+            config = self._plan.config
+            absent = [*methods_left_out(config, scenes), *edits_left_out(config, scenes)]
+            unboxed = methods_without_boxes(config, scenes - {""}, places)
+            for sentence in (*without_effect(config, places), *unboxed, *absent):
                 _say(sentence)
         sentence = drop_foreign_records()
         if sentence:
@@ -95,7 +98,10 @@ class RunCosts:
         if self._ended is not None:
             self._ended.set()
         try:
-            record = write_costs(self._results, list(self._plan.config.methods))
+            config = self._plan.config
+            ran = [scene for scene in config.scenes if (self._results / BENCHMARKS / scene).is_dir()]
+            of_scenes = {scene: list(methods_of(config, scene)) for scene in ran}
+            record = write_costs(self._results, list(config.methods), of_scenes)
         except (DriveSplatError, OSError) as error:
             _say(f"costs are not written: {error}")
             return
@@ -150,7 +156,7 @@ def without_effect(config: Config, places: Iterable[tuple[str, str]]) -> list[st
     for (dataset, method), scene in sorted(scenes.items()):
         below = given
         layers = [("dataset", dataset, for_scene(config, scene))]
-        if method in config.methods:
+        if method in {**methods_of(config, scene), **config.methods}:
             layers.append(("method", method, for_scene(config, scene, method)))
         for kind, name, there in layers:
             used = leaves(there.model_dump())

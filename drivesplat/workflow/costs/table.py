@@ -1,6 +1,6 @@
 """costs.csv and costs.json: a row per job that has run, and the total of each scene."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,15 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[str, Any]]:
+def scene_totals(
+    costs: Sequence[Cost], methods: Collection[str], of_scenes: Mapping[str, Collection[str]] | None = None
+) -> list[dict[str, Any]]:
     """The summed costs of each scene's jobs, which follow each other in `costs`, and whether they are under 90 minutes.
-    Counts the scene's stages and `methods`, without ablation variants; `complete`: whether all `methods` have been
-    trained."""
-    totals = []
+    Counts the scene's stages and its methods, without ablation variants: those that `of_scenes` has for it, otherwise
+    `methods`. `complete`: whether all of them have been trained."""
+    totals, every = [], methods
     for scene, own in groupby(costs, key=lambda c: c.job.scene):
+        methods = (of_scenes or {}).get(scene, every)
         counted = [c for c in own if c.job.method in methods or (not c.job.method and c.job.stage != ABLATION)]
         if not scene or not counted:
             continue
@@ -47,22 +50,27 @@ def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[s
     return totals
 
 
-def costs_record(results: Path, methods: Collection[str]) -> dict[str, Any]:
-    """The content of costs.json: `rows` as in costs.csv, totals of `scenes`, and sentences about `unreadable` files."""
+def costs_record(
+    results: Path, methods: Collection[str], of_scenes: Mapping[str, Collection[str]] | None = None
+) -> dict[str, Any]:
+    """The content of costs.json: `rows` as in costs.csv, totals of `scenes`, and sentences about `unreadable` files;
+    arguments as of `scene_totals`."""
     costs, complaints = read_costs(results)
-    scenes = scene_totals(costs, methods)
+    scenes = scene_totals(costs, methods, of_scenes)
     under = {total["scene"]: total["under_90_minutes"] for total in scenes}
     known = [{**vars(cost.job), **vars(cost), COLUMNS[-1]: under.get(cost.job.scene)} for cost in costs]
     rows = [{name: row[name] for name in COLUMNS} for row in known]
     return {"rows": rows, "scenes": scenes, "unreadable": complaints}
 
 
-def write_costs(results: Path, methods: Collection[str]) -> dict[str, Any]:
-    """Writes costs.csv and costs.json; returns the latter's content.
+def write_costs(
+    results: Path, methods: Collection[str], of_scenes: Mapping[str, Collection[str]] | None = None
+) -> dict[str, Any]:
+    """Writes costs.csv and costs.json; returns the latter's content. Arguments as of `scene_totals`.
 
     Raises ResultError where they cannot be written.
     """
-    record = costs_record(results, methods)
+    record = costs_record(results, methods, of_scenes)
     spelled = {None: None, True: "true", False: "false"}
     csv_rows = [{**row, COLUMNS[-1]: spelled[row[COLUMNS[-1]]]} for row in record["rows"]]
     write_csv(results / FILES[0], COLUMNS, csv_rows)
