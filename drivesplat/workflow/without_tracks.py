@@ -11,18 +11,12 @@ from drivesplat.readers.datasets import layout
 from drivesplat.readers.outline import Outline
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.method import MethodSettings
-from drivesplat.settings.without_boxes import DISCOVERED, DRIFTING, REPLACED, substitute
+from drivesplat.settings.without_boxes import DISCOVERED, HOW, REPLACED, reason, substitute
 
 ANNOTATED = "drivesplat.readers.*.annotated"
 """The module that tells whether a recording has tracks, of readers that know it at once."""
 MAX_NAMED = 4
 """Maximum number of scenes that a sentence names."""
-REASONS = {
-    DISCOVERED: ("no boxes", "its objects are found in LiDAR scans"),
-    DRIFTING: ("neither boxes nor LiDAR scans", "it takes images alone"),
-}
-"""What a drive lacks for which a method takes the place of `street`, and how the method does without."""
-HOW = "docs/without_boxes.md"
 
 
 def recorded_outline(config: Config, scene: str) -> Outline | None:
@@ -58,19 +52,14 @@ def _answer(config: Config, scene: str, ask: Callable[[Path, str, str], Any] | N
         return None
 
 
-def has_scans(outline: Outline | None) -> bool:
-    """Whether a recording gives LiDAR scans, for which the beams of every LiDAR have to be known: True where there is
-    no outline."""
-    return outline is None or (outline.sweeps > 0 and not outline.without_beams)
-
-
 def in_place_of_street(config: Config, scene: str) -> str | None:
     """The method that takes the place of the shipped `street` on a scene; None where `street` stays as it is, or is no
     method of the config."""
     there = for_scene(config, scene)
     if not (there.substitutes and there.cameras and there.replace_street and lacks_tracks(config, scene)):
         return None
-    return substitute(scans=has_scans(recorded_outline(config, scene)))
+    outline = recorded_outline(config, scene)
+    return DISCOVERED if outline is None else substitute(outline.sweeps, outline.without_beams)
 
 
 def methods_of(config: Config, scene: str) -> dict[str, MethodSettings]:
@@ -98,7 +87,7 @@ def methods_without_boxes(config: Config, scenes: Iterable[str], trained: Collec
         if not lacks_tracks(config, scene):
             continue
         own, other = methods_of(config, scene), in_place_of_street(config, scene)
-        if other:
+        if other and ((scene, other) in trained or (scene, REPLACED) not in trained):
             replaced[other, tuple(own)].append(scene)
         idle = tuple(
             name
@@ -109,8 +98,7 @@ def methods_without_boxes(config: Config, scenes: Iterable[str], trained: Collec
             empty[idle].append(scene)
     return [
         *(
-            f"{_named(found)} {REASONS[other][0]}: {other} takes the place of {REPLACED}, since {REASONS[other][1]}; "
-            f"methods there: {', '.join(own)} ({HOW})"
+            f"{_named(found)} {reason(other)}; methods there: {', '.join(own)} ({HOW})"
             for (other, own), found in replaced.items()
         ),
         *(

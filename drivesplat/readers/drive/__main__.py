@@ -12,6 +12,7 @@ from drivesplat.preprocess.intrinsics import intrinsics_warnings
 from drivesplat.preprocess.undistort import distortion_fault, undistorted
 from drivesplat.readers.drive.check import examine, summary
 from drivesplat.readers.drive.format import Drive, grouped
+from drivesplat.readers.drive.layout import outline
 from drivesplat.readers.drive.needed_settings import needed_settings
 from drivesplat.readers.drive.nerfstudio import add_command
 from drivesplat.readers.drive.sweep_file import columns_sentence
@@ -19,6 +20,8 @@ from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.drive_warnings import drive_warnings
 from drivesplat.readers.record_names import counted
 from drivesplat.scene.scene import UNPOSED, Scene, read_scene
+from drivesplat.settings.method import default_methods
+from drivesplat.settings.without_boxes import DRIFTING, HOW, REPLACED, reason, substitute
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -28,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     checking = commands.add_parser("check", help="list every fault of a drive folder, and draw a picture")
     checking.add_argument("folder", type=Path)
     checking.add_argument("--picture", type=Path, help="where the picture is written; by default {folder}/check.png")
-    checking.set_defaults(run=_check)
+    checking.set_defaults(run=lambda asked: run_check(asked.folder, asked.picture))
     schema = commands.add_parser("schema", help="print the JSON schema of drive.json")
     schema.set_defaults(run=lambda _: print(json.dumps(Drive.model_json_schema(by_alias=True), indent=2)))
     writing = commands.add_parser("write", help="write an extracted scene as a drive folder")
@@ -47,9 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
 
-def _check(asked: argparse.Namespace) -> int:
-    picture = asked.picture or asked.folder / "check.png"
-    found = examine(asked.folder, picture)
+def run_check(folder: Path, picture: Path | None = None) -> int:
+    """Checks a drive folder and prints what it found; by default the picture is {folder}/check.png. Returns the exit
+    status, 1 where there are faults."""
+    picture = picture or folder / "check.png"
+    found = examine(folder, picture)
     scene = found.scene
     cameras = scene.cameras if scene else ()
     faults = found.faults or [fault for camera in cameras if (fault := distortion_fault(camera))]
@@ -71,8 +76,18 @@ def _check(asked: argparse.Namespace) -> int:
         path = Path(next(sweep.path for sweep in scene.sweeps if sweep.lidar == lidar.name))
         print(f"LiDAR {lidar.name}: {path.name} {columns_sentence(path)}")
     print(summary(scene))
-    print(f"settings to copy:\n\n{needed_settings(scene, asked.folder)}", end="")
+    if scene.frames and not scene.tracks:
+        print(methods_sentence(folder))
+    print(f"settings to copy:\n\n{needed_settings(scene, folder)}", end="")
     return 0
+
+
+def methods_sentence(folder: Path) -> str:
+    """Which methods a drive folder without boxes gets by default, and why."""
+    found = outline(folder, "", folder.absolute().name)
+    method = substitute(found.sweeps, found.without_beams) if found else DRIFTING
+    names = [method if name == REPLACED else name for name in default_methods()]
+    return f"methods: {', '.join(names)} (the drive has {reason(method)}; {HOW})"
 
 
 def camera_warnings(scene: Scene) -> list[str]:

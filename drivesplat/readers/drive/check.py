@@ -105,7 +105,7 @@ def summary(scene: Scene) -> str:
         images if scene.frames else NO_IMAGES,
         counted(len(scene.sweeps), "LiDAR sweep") if scene.sweeps else "no LiDAR",
         *(["no poses: set refine_poses: {enabled: true, start: images}"] if scene.poses == UNPOSED else []),
-        counted(len(scene.tracks), "track") if scene.tracks else "no boxes: all is treated as static",
+        counted(len(scene.tracks), "track") if scene.tracks else "no boxes",
     ]
     return ", ".join(parts)
 

@@ -44,9 +44,10 @@ class RunCosts:
         self._ended: threading.Event | None = None
 
     def report_at_planning(self) -> None:
-        """Prints each setting that an override replaces for the scenes and methods of the targets, the
-        methods of scenes without boxes, those that scenes without cameras leave out, and edits whose tracks no method has: `snakemake -n` and a run with nothing
-        to do print them, too. Removes records on which Snakemake would fail, and prints which."""
+        """Prints each setting that an override replaces for the scenes and methods of the targets, the methods of
+        scenes without boxes, those that scenes without cameras leave out, and edits whose tracks no method has:
+        `snakemake -n` and a run with nothing to do print them, too. Removes records on which Snakemake would fail, and
+        prints which."""
         wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
         if wanted or COSTS not in self._targets:
             places = self._plan.scenes_and_methods(wanted)
