@@ -307,7 +307,11 @@ def test_the_converter_of_the_documentation_writes_a_sound_folder(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     exec(converter, {})
     assert main(["check", "monday"]) == 0
-    assert "5 key frames at 2 Hz, 5 images of 1 camera, 5 LiDAR sweeps, no boxes" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "5 key frames at 2 Hz, 5 images of 1 camera, 5 LiDAR sweeps, no boxes" in printed
+    assert re.search(
+        r"^methods: vanilla, drifting \(the drive has neither boxes nor LiDAR sweeps with known", printed, re.M
+    )
     scene = extract_scene(source(scene="monday", cameras=("front",)), tmp_path / "monday")
     np.testing.assert_allclose(scene.frames[2].camera_to_world[:3, 3], [9.7, 0.0, 1.5], atol=1e-9)
     np.testing.assert_allclose(scene.frames[2].camera_to_world[:3, 2], [1.0, 0.0, 0.0], atol=1e-9), "it looks ahead"

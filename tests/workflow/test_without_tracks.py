@@ -135,8 +135,8 @@ def test_planning_says_in_a_sentence_what_is_trained_and_why(drives):
     assert methods_without_boxes(made.config, scenes, made.scenes_and_methods([])) == [
         "scenes empty_list, scanned have no boxes: street_discovered takes the place of street, since its objects are "
         "found in LiDAR scans; methods there: vanilla, street_discovered (docs/without_boxes.md)",
-        "scenes no_lidar, solid_state have neither boxes nor LiDAR sweeps with known beams: drifting takes the place of "
-        "street, since it takes images alone; methods there: vanilla, drifting (docs/without_boxes.md)",
+        "scenes no_lidar, solid_state have neither boxes nor LiDAR sweeps with known beams: drifting takes the place "
+        "of street, since it takes images alone; methods there: vanilla, drifting (docs/without_boxes.md)",
     ]
     assert methods_without_boxes(made.config, ["boxed"], {("boxed", "street")}) == []
     (left_out,) = methods_left_out(made.config, scenes)
