@@ -120,7 +120,7 @@ class ScanKnowledge:
 
         >>> drive = drivesplat.open("results/demo/street_lidar")
         >>> known, world = ScanKnowledge.of_drive(drive), drive.state(4.2)
-        >>> known.validity(world, world.scan("LIDAR_TOP")).validity
+        >>> known.validity(world, world.scan(drive.lidars[0])).validity
         """
         if not drive.renders_lidar:
             raise RequestError(
