@@ -11,6 +11,7 @@ import torch
 
 from drivesplat.drive.packed_drive import packed_scene_id, unpack_drive
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
+from drivesplat.editing.ego import MAX_LEAD
 from drivesplat.errors import DeviceError, RequestError
 from drivesplat.model.checkpoint import model_file
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
@@ -108,19 +109,20 @@ class LoadedDrive:
     actors: Mapping[str, EditedActor]
 
     def seconds(self, times: FrameTimes) -> float:
-        """The time of the drive that a frame shows, seconds since its first image. Raises ServiceError (OUT_OF_RANGE)
-        for a time outside of the recording."""
+        """The time of the drive that a frame shows, seconds since its first image. Up to MAX_LEAD seconds before the
+        first image and after the last one, as the path of the vehicle is known and where its first and last exposures
+        begin and end, it is that of this image. Raises ServiceError (OUT_OF_RANGE) for a time farther outside."""
         scene = self.drive.scene
         doubled = 2 * times.start_us if times.at_start else times.start_us + times.end_us
         time = scene.seconds(doubled // 2) + 0.5e-6 * (doubled % 2)
-        if not 0.0 <= time <= self.drive.duration:
+        if not -MAX_LEAD <= time <= self.drive.duration + MAX_LEAD:
             stamps = self.recorded_us
             raise ServiceError(
                 "OUT_OF_RANGE",
                 f"{self.drive.where} was recorded from {stamps[0]} to {stamps[1]} us, and the frame is at "
                 f"{doubled / 2:.1f} us",
             )
-        return time
+        return min(max(time, 0.0), self.drive.duration)
 
     @property
     def recorded_us(self) -> tuple[int, int]:

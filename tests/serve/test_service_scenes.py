@@ -14,6 +14,7 @@ import drivesplat
 from drivesplat.drive.packed_drive import packed_members, packed_scene_id
 from drivesplat.errors import DeviceError, RequestError, ResultError
 from drivesplat.export.alpasim import drive_files, scene_id
+from drivesplat.export.alpasim_records import AlpasimScene
 from drivesplat.io.aligned_zip import write_aligned_zip
 from drivesplat.serve import scenes
 from drivesplat.serve.scenes import LoadedDrives, find_sources
@@ -173,3 +174,21 @@ def test_a_damaged_result_is_a_failed_precondition_and_others_go_on(results, str
             client.render_rgb(image_request("0001/street", (stamp, stamp), (np.eye(4), np.eye(4))))
         assert raised.value.code() == grpc.StatusCode.FAILED_PRECONDITION
         assert client.render_rgb(image_request("0002", (stamp, stamp), (np.eye(4), np.eye(4)))).image_bytes
+
+
+@pytest.mark.parametrize("scene", ["0001/street", "0002"])
+def test_all_images_that_a_scene_for_alpasim_lists_are_in_range(client, results, scene):
+    """The exposure of the first image begins before it, and that of the last one ends after it."""
+    drive = drivesplat.open(find_sources([results])[scene].folder, device="cpu")
+    request = sensorsim_pb2.AvailableCamerasRequest(scene_id=scene)
+    (camera,) = client.get_available_cameras(request).available_cameras
+    frames = AlpasimScene.of(drive, "x").images[CAMERA]
+    assert drive.scene.seconds(frames[0][0]) < 0.0 and drive.scene.seconds(frames[-1][1]) > drive.duration
+    for frame, stamp in ((frames[0], 0.0), (frames[-1], drive.duration)):
+        pose = drive.camera_to_world(CAMERA, stamp)
+        for start, end in (frame, (frame[0], frame[0] + 2000), (frame[1], frame[1])):
+            asked = image_request(scene, (start, end), (pose, pose), spec=camera.intrinsics)
+            assert client.render_rgb(asked).image_bytes
+    before = image_request(scene, (frames[0][0],) * 2, (pose, pose))
+    same = image_request(scene, (drive.scene.frames[0].timestamp,) * 2, (pose, pose))
+    assert client.render_rgb(before) == client.render_rgb(same), "the world of the first image"
