@@ -28,7 +28,7 @@ FILES = "drivesplat/results/"
 """Members of an archive: the list of files, and what precedes the names of the files."""
 METADATA = "metadata.yaml"
 SCHEMA = 1
-MAX_MANIFEST_BYTES = 64_000_000
+MAX_MANIFEST_BYTES, MAX_METADATA_BYTES = 64_000_000, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -102,10 +102,13 @@ def packed_scene_id(path: str | Path, checkpoint: Path | None = None) -> str | N
     try:
         with open_archive(regular_file(path)) as archive:
             manifest = _manifest(read_member(archive, MANIFEST, MAX_MANIFEST_BYTES))
-            found = yaml.safe_load(read_member(archive, METADATA, MAX_MANIFEST_BYTES))
+            found = yaml.safe_load(read_member(archive, METADATA, MAX_METADATA_BYTES))
+        own = found.get("scene_id") if isinstance(found, dict) else None
+        if not isinstance(own, str) or not own:  # what a few bytes of YAML repeat must not be written out
+            raise ArchiveError(f"has a damaged {METADATA} (it has no scene_id)")
         packed = manifest.files[f"{manifest.folder}/checkpoint.npz"]
-        return None if checkpoint is not None and sha256_file(checkpoint) != packed else str(found["scene_id"])
-    except (ArchiveError, OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        return None if checkpoint is not None and sha256_file(checkpoint) != packed else own
+    except (ArchiveError, OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         why = str(error) if isinstance(error, ArchiveError) else f"has a damaged {METADATA} ({error})"
         raise ResultError(f"{path}: {why}; export it again: the target 'alpasim' makes it") from None
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import drivesplat
-from drivesplat.drive.packed_drive import FILES, MANIFEST, SCHEMA, packed_members, unpack_drive
+from drivesplat.drive.packed_drive import FILES, MANIFEST, SCHEMA, packed_members, packed_scene_id, unpack_drive
 from drivesplat.errors import ResultError
 from drivesplat.io.aligned_zip import ALIGNMENT, write_aligned_zip
 
@@ -176,3 +176,22 @@ def test_a_cache_that_cannot_be_written_is_named(archive, tmp_path):
     (tmp_path / "cache").write_text("a file")
     with pytest.raises(ResultError, match=r"cache: cannot be written"):
         unpack_drive(archive, tmp_path / "cache")
+
+
+BOMB = b"a: &a [x, x]\n" + b"".join(b"%c: &%c [*%c, *%c]\n" % (c, c, c - 1, c - 1) for c in range(98, 110))
+"""Lists of lists: m has 2 to the power of 13 entries, and each further line twice as many."""
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        BOMB + b"scene_id: *m\n", b"scene_id: " + b"[" * 5000, b"scene_id: [a]\n", b"scene_id:\n", b"a: b\n",
+        b"- scene_id\n", b"", b"scene_id: [\n", b"\xff",
+    ],
+)  # fmt: skip
+def test_metadata_without_the_name_of_a_scene_is_damaged(archive, metadata):
+    path = rewritten(archive, lambda members: {**members, "metadata.yaml": metadata})
+    with pytest.raises(ResultError, match=r"other\.usdz: has a damaged metadata\.yaml \(.*; export it again"):
+        packed_scene_id(path)
+    named = rewritten(archive, lambda members: {**members, "metadata.yaml": b"scene_id: mine\n"})
+    assert packed_scene_id(named) == "mine"
