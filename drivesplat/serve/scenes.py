@@ -157,8 +157,13 @@ class LoadedDrives:
 
     @property
     def names(self) -> list[str]:
-        """The scene ids of the drives in memory."""
-        return scene_ids({name: self.offered[name] for name in self._loaded})
+        """The scene ids of the drives in memory; any thread may ask."""
+        loaded = list(self._loaded)  # in one step: another thread may load a drive meanwhile
+        return scene_ids({name: self.offered[name] for name in loaded})
+
+    def __len__(self) -> int:
+        """The number of drives in memory."""
+        return len(self._loaded)
 
     def get(self, scene_id: str) -> LoadedDrive:
         """A drive, which is loaded if it is not in memory. Raises ServiceError for an unknown scene, a result that
@@ -175,14 +180,16 @@ class LoadedDrives:
 
     def _opened(self, name: str) -> LoadedDrive:
         """Opens a drive; where memory is exhausted, again without any other."""
+        source, drive = self.offered[name], None
         try:
-            drive = self.offered[name].open(self._device)
+            drive = source.open(self._device)
         except DeviceError:
             if not self._loaded:
                 raise
+        if drive is None:  # here, since an error that is handled keeps what was opened in part
             while self._loaded:
                 self._unload()
-            drive = self.offered[name].open(self._device)
+            drive = source.open(self._device)
         return LoadedDrive(drive, {actor.id: actor for actor in drive.edited_actors})
 
     def _unload(self) -> None:

@@ -61,7 +61,7 @@ class SensorService:
     def __init__(self, sources: Mapping[str, DriveSource], options: ServiceOptions):
         self.options, self._sources = options, sources
         self._drives = LoadedDrives(sources, options.device, options.max_loaded)
-        self.figures = ServiceFigures(lambda: len(self._drives.names))
+        self.figures = ServiceFigures(lambda: len(self._drives))
         self._lock = threading.Lock()
         self._encoders = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="drivesplat-encode")
 

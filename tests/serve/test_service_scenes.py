@@ -58,10 +58,12 @@ def test_a_scene_for_alpasim_is_served_by_its_id_without_the_folder_of_results(r
     with served(results / "0002") as (_, client):
         expected = client.render_rgb(image_request("0002", *seen)).image_bytes
     for path in (archive, archive.parent):
-        with served(path) as (_, client):
+        with served(path) as (running, client):
             assert [*client.get_available_scenes(EMPTY).scene_ids] == ["0002", own]
             assert client.render_rgb(image_request(own, *seen)).image_bytes == expected
             assert [entry.scene_id for entry in client.get_loaded_scenes(EMPTY).scenes] == ["0002", own]
+            loaded = running.service.figures.registry.get_sample_value("drivesplat_loaded_scenes")
+            assert loaded == 1.0, "one scene by two names"
 
 
 def test_a_folder_of_results_knows_the_id_of_the_scene_that_it_exported(results, archive, tmp_path):
@@ -163,6 +165,40 @@ def test_where_memory_is_exhausted_a_scene_is_loaded_alone(results, monkeypatch)
     with pytest.raises(scenes.ServiceError, match="out of GPU memory") as raised:
         drives.get("0001/street")
     assert raised.value.code == "RESOURCE_EXHAUSTED" and drives.names == []
+
+
+class _Model:
+    """Something in memory."""
+
+
+def test_a_drive_that_was_opened_in_part_makes_place_for_the_second_attempt(results, monkeypatch):
+    drives, open_drive, partly = LoadedDrives(find_sources([results]), "cpu", 3), scenes.open_drive, []
+    drives.get("0001/street")
+
+    def full(folder, device):
+        if partly:
+            assert partly[0]() is None, "its memory is free"
+            return open_drive(folder, device)
+        model = _Model()
+        partly.append(weakref.ref(model))
+        raise DeviceError("out of GPU memory")
+
+    monkeypatch.setattr(scenes, "open_drive", full)
+    assert drives.get("0002").drive.cameras and len(partly) == 1
+
+
+def test_loaded_scenes_can_be_named_while_another_thread_loads_one(results):
+    class Offered(dict):
+        """Drives, of which another is loaded whenever one is looked up."""
+
+        def __getitem__(self, name):
+            drives._loaded.setdefault("0002", None)
+            return super().__getitem__(name)
+
+    drives = LoadedDrives(find_sources([results]), "cpu", 3)
+    drives.offered = Offered(drives.offered)
+    drives._loaded["0001/street"] = None
+    assert drives.names == ["0001/street"] and drives.names == ["0001/street", "0002"]
 
 
 def test_a_damaged_result_is_a_failed_precondition_and_others_go_on(results, street, tmp_path):
