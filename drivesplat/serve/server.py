@@ -90,8 +90,13 @@ class SensorServer:
         )
         self._server.add_generic_rpc_handlers([self._handlers()])
         self._health = self._add_health()
-        self.address = self._bound(host, port, tls)
+        # The address is last: gRPC keeps that of a server which does not start.
         self._page = None if metrics_port is None else _page(self.service, metrics_port)
+        try:
+            self.address = self._bound(host, port, tls)
+        except BaseException:
+            self.close(None)
+            raise
         self._server.start()
 
     @property
@@ -122,7 +127,8 @@ class SensorServer:
         except RuntimeError:
             bound = 0
         if not bound:
-            raise RequestError(f"the sensor service cannot listen at {where}:{port}: choose another --address")
+            other = "another --address" if tls is None else "a certificate and its key (PEM), or another --address"
+            raise RequestError(f"the sensor service cannot listen at {where}:{port}: choose {other}")
         return f"{where}:{bound}"
 
     def _handlers(self) -> Any:
@@ -203,8 +209,8 @@ def _require_free(host: str, port: int) -> None:
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(place)
-    except OSError as error:
-        reason = error.strerror or str(error)
+    except (OSError, UnicodeError) as error:  # UnicodeError: no name of a host
+        reason = getattr(error, "strerror", None) or str(error)
         raise RequestError(
             f"the sensor service cannot listen at {host}:{port} ({reason}); choose another --address"
         ) from None

@@ -104,9 +104,10 @@ def test_what_cannot_be_served_is_one_sentence(results, tmp_path, monkeypatch):
         for options, words in (
             ({"address": address}, address), ({"address": "nowhere"}, "--address"),
             ({"address": "h:99999"}, "--address"),
-            ({"address": "host.invalid:1"}, r"host\.invalid"), ({"max_loaded": 0}, "--max-loaded"),
+            ({"address": "host.invalid:1"}, r"host\.invalid"), ({"address": "a..b:1"}, r"a\.\.b"), ({"max_loaded": 0}, "--max-loaded"),
             ({"metrics_port": taken.getsockname()[1]}, "--metrics-port"),
             ({"tls": (tmp_path / "none.pem", tmp_path / "none.pem")}, r"none\.pem"),
+            ({"tls": (Path(__file__), Path(__file__))}, "a certificate and its key"),
         ):  # fmt: skip
             with pytest.raises(RequestError, match=words) as raised:
                 drivesplat.SensorServer([one], **{"address": "127.0.0.1:0", "device": "cpu", **options})
@@ -114,6 +115,26 @@ def test_what_cannot_be_served_is_one_sentence(results, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "grpc", None)
     with pytest.raises(RequestError, match=r"pip install 'drivesplat\[serve\]'"):
         drivesplat.SensorServer([one], "127.0.0.1:0", device="cpu")
+
+
+def test_a_server_that_cannot_start_leaves_its_addresses_free(results):
+    ports, one = [], results / "0002"
+    with socket.socket() as first, socket.socket() as second, socket.socket() as taken:
+        for own in (first, second, taken):
+            own.bind(("127.0.0.1", 0))
+            ports.append(own.getsockname()[1])
+        taken.listen()
+        first.close()
+        second.close()
+        address = f"127.0.0.1:{ports[0]}"
+        with pytest.raises(RequestError, match="--metrics-port"):
+            drivesplat.SensorServer([one], address, device="cpu", metrics_port=ports[2])
+        with pytest.raises(RequestError, match="certificate"):
+            no_key = Path(__file__), Path(__file__)
+            drivesplat.SensorServer([one], address, device="cpu", metrics_port=ports[1], tls=no_key)
+        server = drivesplat.SensorServer([one], address, device="cpu", metrics_port=ports[1])
+        assert server.address == address and server.metrics_address == f"http://127.0.0.1:{ports[1]}/metrics"
+        server.close(None)
 
 
 def test_the_command_refuses_half_of_an_encryption(results, capsys):
