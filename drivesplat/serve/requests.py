@@ -21,6 +21,8 @@ QUALITY = 95.0
 """JPEG quality of a request that states none."""
 MAX_REQUEST_PIXELS = 67_108_864
 """Pixels of all images of a request."""
+MAX_REQUEST_SCANS = 16
+"""Scans of a request: a scan may take 15 MB of a reply."""
 
 
 @dataclass(frozen=True)

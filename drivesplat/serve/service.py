@@ -22,7 +22,14 @@ from drivesplat.serve.faults import ServiceError, as_service_errors
 from drivesplat.serve.figures import ServiceFigures
 from drivesplat.serve.messages import wire
 from drivesplat.serve.poses import ListedObjects, pose_message
-from drivesplat.serve.requests import ImageRequest, RequestReader, ScanRequest, WorldKey, require_affordable
+from drivesplat.serve.requests import (
+    MAX_REQUEST_SCANS,
+    ImageRequest,
+    RequestReader,
+    ScanRequest,
+    WorldKey,
+    require_affordable,
+)
 from drivesplat.serve.scenes import DriveSource, LoadedDrive, LoadedDrives, scene_ids
 
 API_VERSION = 0, 54, 0
@@ -154,6 +161,11 @@ class SensorService:
     def render_aggregated(self, request: Any, active: IsActive) -> Any:
         """Images and scans; all of them, or the first error."""
         reader = RequestReader()
+        if len(request.lidar_requests) > MAX_REQUEST_SCANS:
+            raise ServiceError(
+                "RESOURCE_EXHAUSTED",
+                f"the request asks for {len(request.lidar_requests)} scans; it may ask for {MAX_REQUEST_SCANS}",
+            )
         scans = [reader.scan(own) for own in request.lidar_requests]
         images = [_or_raise(image) for image in self._images(request.rgb_requests, active)]
         return wire.AggregatedRenderReturn(

@@ -114,3 +114,10 @@ def test_what_cannot_be_scanned_is_one_sentence(client, start_us, pair, change, 
     with pytest.raises(grpc.RpcError, match=words) as raised:
         client.render_lidar(request)
     assert raised.value.code().name == code
+
+
+def test_many_scans_in_a_call_are_refused_before_any_is_rendered(client, start_us, pair):
+    request = scan_request(start_us, pair)
+    with pytest.raises(grpc.RpcError, match="asks for 17 scans; it may ask for 16") as raised:
+        client.render_aggregated(sensorsim_pb2.AggregatedRenderRequest(lidar_requests=[request] * 17))
+    assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
