@@ -33,9 +33,9 @@ from drivesplat.rasterization.scans import RayGrid
 from drivesplat.scene.scan import ScanRays
 from drivesplat.scene.scan_record import RecordedScan
 
-MAX_GRAPHS = 5
+MAX_GRAPHS = 12
 """The kinds of renderings whose graphs are kept: a kind is a size, a camera with an exposure of its own, the rays of a
-LiDAR, ..."""
+LiDAR, ... A rig of more sensors than that, in turns, would have none: each would make place for the next."""
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,11 @@ def test_every_kind_of_image_has_a_graph_of_its_own(gpu, monkeypatch):
     assert gpu.made(other, *kinds) == [RENDERED] + [REPLAYED] * 3 + [RENDERED], "the oldest kind was forgotten"
 
 
+def test_a_rig_of_eight_cameras_with_their_exposures_has_graphs(gpu):
+    rig = [replace(needing(100), camera=f"CAM_{i}") for i in range(8)]
+    assert gpu.made(*rig, *rig, *rig) == [RENDERED] * 8 + [REPLAYED] * 16
+
+
 def test_other_gaussians_of_the_same_number_are_of_the_same_kind(gpu):
     """Not the same as the model's own, which a graph reads where they are."""
     own = needing(100), [gpu.model.model.at(0.0)]
