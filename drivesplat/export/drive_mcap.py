@@ -62,11 +62,12 @@ def write_mcap(
 
     Args:
         folder: a drive folder (docs/own_data.md), recorded or rendered.
-        scans: the scans.json of rendered LiDAR scans of the same drive; None: the sweeps of the drive folder.
+        scans: the scans.json of rendered LiDAR scans of the same rendered drive; None: the sweeps of the drive folder.
         provenance: where the file comes from; it is written into it.
 
-    Raises DatasetError for a drive with faults, without poses, or whose files are missing or damaged; ResultError for
-    scans that cannot be read, and where `path` cannot be written; RequestError where rosbags is missing.
+    Raises DatasetError for a drive with faults, without poses, or whose files are missing or damaged, and for scans
+    beside a drive that states no origin, as rendered ones do; ResultError for scans that cannot be read, and where
+    `path` cannot be written; RequestError where rosbags is missing.
 
     >>> write_mcap(Path("results/demo/street/trajectories/original/drive"), Path("drive.mcap"))["/tf_static"]
     1
@@ -81,6 +82,11 @@ def write_mcap(
     if timeline.stamps[-1] >= END_OF_TIME:
         raise DatasetError(f"{folder / FILE}: its times are later than 2038, which ROS cannot state; move them back")
     own = scans is None
+    if not own and drive.origin is None:
+        raise DatasetError(
+            f"{folder / FILE}: it states no origin of its world, so that rendered scans may lie elsewhere; give the "
+            "folder of a rendered drive"
+        )
     sweeps = recorded_sweeps(drive, folder, timeline.path, timeline.origin) if own else rendered_sweeps(scans)
     source = {} if drive.rendered is None else drive.rendered.model_dump(mode="json", exclude={"provenance"})
     notes = {"description": drive.description, "licence": drive.licence, "rendered": json.dumps(source)}

@@ -540,6 +540,14 @@ def test_a_faulty_drive_is_refused_in_one_sentence_and_leaves_nothing(recorded, 
     assert not list(tmp_path.glob("out/*")) and not list(tmp_path.glob("out/.*"))
 
 
+def test_scans_beside_a_drive_in_another_world_are_refused(folder, tmp_path):
+    """Without an origin the map begins at the first pose of the drive, and the world of the scans at a key frame's."""
+    drive = changed(folder / "drive", tmp_path / "drive", lambda content: content.update(origin=None))
+    with pytest.raises(DatasetError, match="no origin of its world"):
+        write_mcap(drive, tmp_path / "own.mcap", folder / "scans/scans.json")
+    assert write_mcap(drive, tmp_path / "own.mcap")[IMAGES]
+
+
 def test_scans_without_times_or_damaged_are_refused(folder, tmp_path):
     record = json.loads((folder / "scans/scans.json").read_text())
     (tmp_path / "scans.json").write_text(json.dumps(record))
