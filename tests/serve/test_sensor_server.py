@@ -104,7 +104,8 @@ def test_what_cannot_be_served_is_one_sentence(results, tmp_path, monkeypatch):
         for options, words in (
             ({"address": address}, address), ({"address": "nowhere"}, "--address"),
             ({"address": "h:99999"}, "--address"),
-            ({"address": "host.invalid:1"}, r"host\.invalid"), ({"address": "a..b:1"}, r"a\.\.b"), ({"max_loaded": 0}, "--max-loaded"),
+            ({"address": "host.invalid:1"}, r"host\.invalid"), ({"address": "a..b:1"}, r"a\.\.b"),
+            ({"max_loaded": 0}, "--max-loaded"),
             ({"metrics_port": taken.getsockname()[1]}, "--metrics-port"),
             ({"tls": (tmp_path / "none.pem", tmp_path / "none.pem")}, r"none\.pem"),
             ({"tls": (Path(__file__), Path(__file__))}, "a certificate and its key"),
