@@ -1,5 +1,6 @@
 """Poses of requests: of sensors and objects, at the start and the end of a frame."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -112,7 +113,7 @@ class ListedObjects:
         """Raises ServiceError for malformed poses and for a track that is listed twice."""
         ids = tuple(message.track_id for message in messages)
         if len(set(ids)) < len(ids):
-            twice = next(name for i, name in enumerate(ids) if name in ids[:i])
+            twice = next(name for name, count in Counter(ids).items() if count > 1)
             raise invalid(f"dynamic_objects lists track {twice[:80]!r} twice")
         names = [f"the dynamic object {name[:80]!r}" for name in ids]
         return cls(ids, steady_poses([message.pose_pair for message in messages], names, times))
