@@ -32,6 +32,8 @@ REFINED = "scene_refined.json"
 class Frame:
     """One image. `camera` is a name in `Scene.cameras`; `camera_to_world` and `ego_to_world` hold at the image's own
     timestamp; `readout_middle_s` is the time in seconds from there to the middle of a rolling shutter's readout.
+    `camera_velocity` (6,) is `Shutter.velocity` where the dataset has the camera's motion during the readout; None: it
+    follows from the images before and after.
     `classes_path` is the dataset's own class map of the image (8 bits, 255: unlabelled), if it has one."""
 
     camera: str
@@ -47,6 +49,7 @@ class Frame:
     token: str
     classes_path: str | None = None
     readout_middle_s: float = 0.0
+    camera_velocity: Float64[np.ndarray, "6"] | None = None
 
     @property
     def camera_to_ego(self) -> np.ndarray:

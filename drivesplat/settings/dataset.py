@@ -27,7 +27,7 @@ DEMO_OVERRIDES = {
 
 
 class DatasetSettings(Settings):
-    reader: Literal["nuscenes", "drive", "waymo"] = "nuscenes"
+    reader: Literal["nuscenes", "drive", "waymo", "ncore"] = "nuscenes"
     """:printed: Dataset format: 'nuscenes', 'waymo' (docs/waymo.md), or 'drive', a folder that you write
     (docs/own_data.md)."""
     dataroot: str = "~/data/nuscenes/v1.0-mini"

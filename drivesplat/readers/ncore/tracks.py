@@ -1,0 +1,119 @@
+"""Cuboid observations of a clip as the tracks of a scene: brought into one world by the pose graph, merged by their
+track, and sampled at the key frames."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drivesplat.readers.checks import (
+    MAX_COORDINATE,
+    checked_box_size,
+    checked_numbers,
+    checked_text,
+    checked_timestamp,
+)
+from drivesplat.readers.ncore.object_classes import object_class
+from drivesplat.readers.ncore.pose_graph import PoseGraph
+from drivesplat.readers.record_names import named
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.rigid import interpolate, rigid
+from drivesplat.scene.scene import Track
+
+log = logging.getLogger(__name__)
+
+MIN_GAP_US, MAX_GAP_US, MAX_INTERVALS = 300_000, 1_000_000, 1.5
+"""A track is interpolated between two observations that are at most so many usual intervals apart, within these bounds
+in microseconds."""
+MAX_ANGLE = 100.0
+
+
+def tracks_of(
+    observations: Sequence[Any], poses: PoseGraph, world_to_scene: np.ndarray, key_times: np.ndarray
+) -> Iterator[Track]:
+    """The objects seen at any key frame, in the order of their first observation, each with the median size and the most
+    frequent label of its observations. Of several at one time, the one of the best source counts: manual labels before
+    automatic ones. Unknown labels are other_movable, which is logged. Raises DatasetError naming a damaged one."""
+    by_id: dict[str, dict[int, Any]] = {}
+    for observation in observations:
+        record = named("cuboid", observation.track_id)
+        time = checked_timestamp(observation.timestamp_us, record)
+        of_track = by_id.setdefault(checked_text(observation.track_id, record, "track_id"), {})
+        if time not in of_track or observation.source > of_track[time].source:
+            of_track[time] = observation
+    intervals = [np.diff(sorted(of_track)) for of_track in by_id.values() if len(of_track) > 1]
+    usual = float(np.median(np.concatenate(intervals))) if intervals else 0.0
+    max_gap = float(np.clip(MAX_INTERVALS * usual, MIN_GAP_US, MAX_GAP_US))
+    half = float(np.median(np.diff(key_times))) / 2 if len(key_times) > 1 else max_gap / 2
+    unknown: Counter[str] = Counter()
+    for id_, of_track in by_id.items():
+        times = np.array(sorted(of_track), dtype=np.int64)
+        ordered = [of_track[int(time)] for time in times]
+        label = Counter(checked_text(one.class_id, named("cuboid", id_), "class_id") for one in ordered)
+        category = label.most_common(1)[0][0]
+        kind = object_class(category)
+        sampled = sampled_poses(times, [world_to_scene @ pose_of(one, poses) for one in ordered], key_times, max_gap, half)
+        sizes = [checked_box_size(list(one.bbox3.dim), named("cuboid", id_)) for one in ordered]
+        if not sampled:
+            continue
+        if kind is None:
+            unknown[category] += 1
+        indices = list(sampled)
+        yield Track(
+            id=id_,
+            object_class=kind or ObjectClass.OTHER_MOVABLE,
+            category=category,
+            size=np.median(sizes, axis=0),
+            timestamps=key_times[indices],
+            sample_indices=np.array(indices, dtype=np.int64),
+            object_to_world=np.stack(list(sampled.values())),
+            visibility=np.zeros(len(indices), dtype=np.int64),
+        )
+    if unknown:
+        names = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
+        log.warning("cuboids have unknown labels, which are read as other_movable and count as static: %s", names)
+
+
+def pose_of(observation: Any, poses: PoseGraph) -> np.ndarray:
+    """The pose (4, 4) of a box in the world of the clip. Raises DatasetError naming the track."""
+    record = named("cuboid", observation.track_id)
+    frame = checked_text(observation.reference_frame_id, record, "reference_frame_id")
+    time = checked_timestamp(observation.reference_frame_timestamp_us, record)
+    center = checked_numbers(observation.bbox3.centroid, 3, MAX_COORDINATE, record, "centroid", "metres")
+    angles = checked_numbers(observation.bbox3.rot, 3, MAX_ANGLE, record, "rotation", "radians")
+    return poses.at(frame, "world", [time])[0] @ rigid(Rotation.from_euler("xyz", angles).as_matrix(), center)
+
+
+def sampled_poses(
+    times: np.ndarray, poses: Sequence[np.ndarray], key_times: np.ndarray, max_gap: float, reach: float
+) -> dict[int, np.ndarray]:
+    """The pose (4, 4) of an object at each key frame at which it is observed, by index. `poses` at increasing `times`
+    (n,) are interpolated where these are at most `max_gap` microseconds apart; beyond an end, up to `reach`
+    microseconds, the motion next to it continues, since boxes have the times at which a sensor met them."""
+    found: dict[int, np.ndarray] = {}
+    for index, key in enumerate(key_times.tolist()):
+        after = int(np.searchsorted(times, key))
+        if after < len(times) and times[after] == key:
+            found[index] = poses[after]
+        elif 0 < after < len(times) and times[after] - times[after - 1] <= max_gap:
+            share = float((key - times[after - 1]) / (times[after] - times[after - 1]))
+            found[index] = interpolate(poses[after - 1], poses[after], share)
+        else:
+            nearest = min((i for i in (after - 1, after) if 0 <= i < len(times)), key=lambda i: abs(times[i] - key))
+            if abs(int(times[nearest]) - key) <= reach:
+                found[index] = _continued(times, poses, nearest, key, max_gap)
+    return found
+
+
+def _continued(
+    times: np.ndarray, poses: Sequence[np.ndarray], nearest: int, key: int, max_gap: float
+) -> np.ndarray:
+    """The pose at `key` by the motion between the observation `nearest` to it and the one on its other side; that
+    observation where there is none within `max_gap`."""
+    other = nearest + (1 if key < times[nearest] else -1)
+    if not 0 <= other < len(times) or abs(times[other] - times[nearest]) > max_gap:
+        return poses[nearest]
+    return interpolate(poses[nearest], poses[other], float((key - times[nearest]) / (times[other] - times[nearest])))
