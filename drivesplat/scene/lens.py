@@ -37,8 +37,10 @@ MAX_FOCAL_RATIO = 1.1
 
 
 def central_intrinsics(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    """The matrix of the pinhole camera that images directions near the optical axis as this camera does."""
+    """The matrix of the pinhole camera that images directions near the optical axis as this camera does, but for
+    shear."""
     focal, k = camera.intrinsics[0, 0], camera.intrinsics.copy()
+    k[[0, 1], [1, 0]] = 0.0
     values = np.zeros(1) if camera.distortion is None else camera.distortion
     if camera.distortion_model in POLYNOMIALS:
         focal = values[0] if camera.distortion_model == "angle_to_radius" else 1.0 / values[0]

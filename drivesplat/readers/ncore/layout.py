@@ -184,7 +184,7 @@ def path_span(metadata: Metadata) -> tuple[float, float]:
             for edge in ("('rig', 'world')", "('world', 'rig')"):
                 times = content.get(edge, {}).get("timestamps_us")
                 if times:
-                    return times[0], times[-1]
+                    return float(times[0]), float(times[-1])
     return -math.inf, math.inf
 
 

@@ -6,6 +6,7 @@ is float64, whatever the type that is stored.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -31,10 +32,15 @@ class Edge:
         """The poses (m, 4, 4) at times (m,) within those known."""
         if self.times is None:
             return np.repeat(self.poses, len(times), axis=0)
-        known = (self.times - self.times[0]).astype(np.float64)
-        wanted = (times - self.times[0]).astype(np.float64)
-        turns = Slerp(known, Rotation.from_matrix(self.poses[:, :3, :3]))(wanted).as_matrix()
-        return rigid(turns, np.stack([np.interp(wanted, known, self.poses[:, i, 3]) for i in range(3)], axis=-1))
+        known, wanted = self._turns.times, (times - self.times[0]).astype(np.float64)
+        places = np.stack([np.interp(wanted, known, self.poses[:, i, 3]) for i in range(3)], axis=-1)
+        return rigid(self._turns(wanted).as_matrix(), places)
+
+    @cached_property
+    def _turns(self) -> Slerp:
+        """The rotation by time since the first pose."""
+        assert self.times is not None
+        return Slerp((self.times - self.times[0]).astype(np.float64), Rotation.from_matrix(self.poses[:, :3, :3]))
 
 
 def constant_edge(pose: np.ndarray, record: str) -> Edge:

@@ -38,12 +38,18 @@ def tracks_of(
     frequent label of its observations. Of several at one time, the one of the best source counts: manual labels before
     automatic ones. Unknown labels are other_movable, which is logged. Raises DatasetError naming a damaged one."""
     by_id: dict[str, dict[int, Any]] = {}
+    beyond = 0
     for observation in observations:
         record = named("cuboid", observation.track_id)
         time = checked_timestamp(observation.timestamp_us, record)
         of_track = by_id.setdefault(checked_text(observation.track_id, record, "track_id"), {})
-        if time not in of_track or observation.source > of_track[time].source:
+        if not is_known(observation, poses):
+            beyond += 1
+        elif time not in of_track or observation.source > of_track[time].source:
             of_track[time] = observation
+    if beyond:
+        log.warning("%d of %d cuboids lie beyond the known path; left out", beyond, len(observations))
+    by_id = {id_: of_track for id_, of_track in by_id.items() if of_track}
     intervals = [np.diff(sorted(of_track)) for of_track in by_id.values() if len(of_track) > 1]
     usual = float(np.median(np.concatenate(intervals))) if intervals else 0.0
     max_gap = float(np.clip(MAX_INTERVALS * usual, MIN_GAP_US, MAX_GAP_US))
@@ -77,11 +83,18 @@ def tracks_of(
         log.warning("cuboids have unknown labels, which are read as other_movable and count as static: %s", names)
 
 
+def is_known(observation: Any, poses: PoseGraph) -> bool:
+    """Whether the pose of an observation's frame of reference is known at its time. Raises DatasetError naming the
+    track where the clip has no such frame of reference."""
+    record = named("cuboid", observation.track_id)
+    first, last = poses.span(checked_text(observation.reference_frame_id, record, "reference_frame_id"), "world")
+    return first <= checked_timestamp(observation.reference_frame_timestamp_us, record) <= last
+
+
 def pose_of(observation: Any, poses: PoseGraph) -> np.ndarray:
     """The pose (4, 4) of a box in the world of the clip. Raises DatasetError naming the track."""
     record = named("cuboid", observation.track_id)
-    frame = checked_text(observation.reference_frame_id, record, "reference_frame_id")
-    time = checked_timestamp(observation.reference_frame_timestamp_us, record)
+    frame, time = observation.reference_frame_id, observation.reference_frame_timestamp_us
     center = checked_numbers(observation.bbox3.centroid, 3, MAX_COORDINATE, record, "centroid", "metres")
     angles = checked_numbers(observation.bbox3.rot, 3, MAX_ANGLE, record, "rotation", "radians")
     return poses.at(frame, "world", [time])[0] @ rigid(Rotation.from_euler("xyz", angles).as_matrix(), center)
