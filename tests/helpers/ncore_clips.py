@@ -6,6 +6,7 @@ boxes stand in the frame of the LiDAR.
 """
 
 import json
+import lzma
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene
-from helpers.drives import CAMERA, KEY_FRAME_US, LIDAR_AT, REACH, World, cast, rays_at, seconds_of
+from helpers.drives import CAMERA, LIDAR_AT, REACH, World, cast, rays_at, seconds_of
 
 NAME = "clip_0001"
 READOUT_US, SWEEP_US, POSE_US = 30_000, 100_000, 10_000
@@ -182,24 +183,33 @@ def _still(sweep: Any) -> Rays:
     )  # fmt: skip
 
 
-def turning_recording(world: World, start: int, sweeps: int = 5) -> tuple[Recording, dict[int, np.ndarray]]:
+def write_metadata(path: Path, metadata: dict[str, Any]) -> None:
+    """Writes the consolidated metadata of a store that is a folder."""
+    import cbor2
+
+    path.write_bytes(lzma.compress(cbor2.dumps({"zarr_consolidated_format": 1, "metadata": metadata}), preset=0))
+
+
+def turning_recording(
+    world: World, start: int, sweeps: int = 5, rays: tuple[int, int] = (ROWS, COLUMNS)
+) -> tuple[Recording, dict[int, np.ndarray]]:
     """A drive that turns, recorded by a rolling camera and a spinning LiDAR that sees the world as it is at the time of
     each column, and where its rays end (rows, columns, 3), by the ends of sweeps."""
     times = np.arange(start, start + sweeps * SWEEP_US + 1, POSE_US, dtype=np.int64)
     recording = Recording(times, np.stack([world.ego(time) for time in times]))
-    model = spinning_model()
+    model = spinning_model(*rays)
     found, hits = [], {}
     for number in range(sweeps):
         begin = start + number * SWEEP_US
-        rays, ends = _spun(world, begin, begin + SWEEP_US - 1, model)
-        found.append(rays)
-        hits[rays.end] = ends
-        middle = (rays.start + rays.end) // 2
+        sweep, ends = _spun(world, begin, begin + SWEEP_US - 1, model)
+        found.append(sweep)
+        hits[sweep.end] = ends
+        middle = (sweep.start + sweep.end) // 2
         for thing in world.things:
             met = middle + 7_000  # the time at which the sensor met it
             sensor = world.ego(begin + SWEEP_US - 1) @ LIDAR
             box = inverse(sensor) @ world.box(thing, met)
-            recording.boxes.append((thing.category, thing.category, met, "lidar", rays.end, box, thing.size, "EXTERNAL"))
+            recording.boxes.append((thing.category, thing.category, met, "lidar", sweep.end, box, thing.size, "EXTERNAL"))
     recording.lidars["lidar"] = LIDAR, model, found
     png = BytesIO()
     Image.new("RGB", (world.width, world.height), (90, 120, 60)).save(png, "PNG")
@@ -229,5 +239,3 @@ def _spun(world: World, start: int, end: int, model: Any) -> tuple[Rays, np.ndar
         elements,
     ), hits  # fmt: skip
 
-
-INTERVAL_US = KEY_FRAME_US

@@ -21,6 +21,7 @@ from helpers.ncore_clips import (
     tables_recording,
     turning_recording,
     write_clip,
+    write_metadata,
 )
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +30,7 @@ from drivesplat.preprocess.scans import scan_records
 from drivesplat.readers.ncore.calibration import camera_of
 from drivesplat.readers.ncore.layout import camera_names, find_root, outline, table_files
 from drivesplat.readers.ncore.object_classes import object_class
+from drivesplat.readers.ncore.store_metadata import METADATA, store_metadata
 from drivesplat.readers.sweeps import read_returns, read_scan
 from drivesplat.scene.lens import pixels_of
 from drivesplat.scene.object_class import ObjectClass
@@ -281,8 +283,6 @@ def test_a_frame_range_and_key_frames_alone(turning, tmp_path):
 def test_recordings_beyond_the_path_are_left_out(turning, tmp_path):
     _, recording, _, whole = turning
     root = write_clip(tmp_path / "clip", recording, store="directory", manifest=False)
-    from drivesplat.readers.ncore.store_metadata import METADATA, store_metadata
-
     store = next(root.glob("*.zarr"))
     metadata = store_metadata(store)
     edge = metadata["poses/default/dynamic_poses/.zattrs"]["('rig', 'world')"]
@@ -293,14 +293,6 @@ def test_recordings_beyond_the_path_are_left_out(turning, tmp_path):
     assert len(scene.sweeps) == 3 and len(scene.frames) < len(whole.frames)
     assert max(frame.timestamp for frame in scene.frames) <= recording.times[-16]
     assert len(outline(root, "", NAME).key_frames) == 3
-
-
-def write_metadata(path: Path, metadata: dict) -> None:
-    import lzma
-
-    import cbor2
-
-    path.write_bytes(lzma.compress(cbor2.dumps({"zarr_consolidated_format": 1, "metadata": metadata})))
 
 
 # Lenses
