@@ -28,15 +28,16 @@ DEMO_OVERRIDES = {
 
 class DatasetSettings(Settings):
     reader: Literal["nuscenes", "drive", "waymo", "ncore"] = "nuscenes"
-    """:printed: Dataset format: 'nuscenes', 'waymo' (docs/waymo.md), or 'drive', a folder that you write
-    (docs/own_data.md)."""
+    """:printed: Dataset format: 'nuscenes', 'waymo' (docs/waymo.md), 'ncore' (docs/ncore.md), or 'drive', a folder
+    that you write (docs/own_data.md)."""
     dataroot: str = "~/data/nuscenes/v1.0-mini"
     """:printed: Folder that contains the folder of tables (or that folder itself, or its grandparent)."""
     version: str = "v1.0-mini"
     """:printed: Name of the folder of tables: v1.0-mini, v1.0-trainval, ... Waymo: v1 or v2, needed only where both are
     there."""
     scenes: tuple[str, ...] = MINI_SCENES
-    """:printed: Scene numbers in quotes. YAML reads a bare 0061 as an octal number. Waymo: names of segments."""
+    """:printed: Scene numbers in quotes. YAML reads a bare 0061 as an octal number. Waymo: names of segments; NCore:
+    of clips."""
     frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
     """:printed: Range of key frames to use, by scene: [first, last + 1). They are then counted from 0. Other scenes are
     used completely."""

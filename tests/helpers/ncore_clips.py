@@ -1,5 +1,5 @@
-"""Writes clips of NCore V4 with NVIDIA's library: the tiny drive of nuScenes' tables, and a drive past tiny things whose
-camera and LiDAR record while the vehicle turns.
+"""Writes clips of NCore V4 with NVIDIA's library: the tiny drive of nuScenes' tables, and a drive past tiny things
+whose camera and LiDAR record while the vehicle turns.
 
 Poses are stored as NCore's converters do: the world begins at the first pose, `world_global` is the dataset's, and
 boxes stand in the frame of the LiDAR.
@@ -63,8 +63,7 @@ def write_clip(
     manifest: bool = True, separate: bool = False,
 ) -> Path:  # fmt: skip
     """Writes a clip to `folder`, with a store for each sensor if `separate`; returns the folder."""
-    from ncore.data import BBox3, CuboidTrackObservation, LabelSource
-    from ncore.data import v4
+    from ncore.data import BBox3, CuboidTrackObservation, LabelSource, v4
     from ncore.impl.common.transformations import HalfClosedInterval
     from upath import UPath
 
@@ -209,7 +208,9 @@ def turning_recording(
             met = middle + 7_000  # the time at which the sensor met it
             sensor = world.ego(begin + SWEEP_US - 1) @ LIDAR
             box = inverse(sensor) @ world.box(thing, met)
-            recording.boxes.append((thing.category, thing.category, met, "lidar", sweep.end, box, thing.size, "EXTERNAL"))
+            recording.boxes.append(
+                (thing.category, thing.category, met, "lidar", sweep.end, box, thing.size, "EXTERNAL")
+            )
     recording.lidars["lidar"] = LIDAR, model, found
     png = BytesIO()
     Image.new("RGB", (world.width, world.height), (90, 120, 60)).save(png, "PNG")
@@ -238,4 +239,3 @@ def _spun(world: World, start: int, end: int, model: Any) -> tuple[Rays, np.ndar
         start, end, direction.reshape(-1, 3), np.tile(stamps, rows), values, np.where(np.isnan(values), np.nan, 0.25),
         elements,
     ), hits  # fmt: skip
-

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.scans import scan_records
+from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.ncore.calibration import camera_of
 from drivesplat.readers.ncore.layout import camera_names, find_root, outline, table_files
 from drivesplat.readers.ncore.object_classes import object_class
@@ -65,7 +66,7 @@ def same(request, tables, tmp_path_factory) -> Scene:
 
 
 def test_the_scene_is_that_of_the_tables(same, tables, tmp_path):
-    """Poses within 0.1 micrometres, intrinsics within single precision. Sweeps are key frames in a clip: all of them."""
+    """Poses within 0.1 micrometres, intrinsics within single precision. All sweeps of a clip are key frames."""
     assert same.poses == "ncore" and same.version == "v4" and NAME in same.description
     np.testing.assert_array_equal(same.key_frame_timestamps, [sweep.timestamp for sweep in tables.sweeps])
     first = tables.sweeps[0].sensor_to_world[:3, 3] - drives.LIDAR_AT + tables.origin
@@ -262,12 +263,23 @@ def test_single_precision_poses_stay_rigid(turning, tmp_path):
 
 def test_scans_of_a_clip_are_resolved(turning):
     from drivesplat.settings.images import HoldoutSettings
-    from drivesplat.settings.scans import ScansJob, ScanSettings
+    from drivesplat.settings.scans import ScanSettings, ScansJob
 
     job = ScansJob(scans=ScanSettings(), on_missing="stop", own_car_radius=2.0, holdout=HoldoutSettings())
     records = scan_records(turning[3], job).scans
     assert len(records) == 5 and all(record.scan.returned.any() for record in records)
     assert max(int(record.objects.max()) for record in records) >= 0, "some rays meet boxes"
+
+
+def test_as_a_drive_folder_a_clip_keeps_its_velocities_and_returns(turning, tmp_path):
+    scene = turning[3]
+    write_drive(scene, tmp_path / "folder")
+    again = extract_scene(source(reader="drive", scene="folder"), tmp_path)
+    for mine, theirs in zip(again.frames, scene.frames, strict=True):
+        for name in ("camera_velocity", "camera_to_world", "ego_to_world"):
+            np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
+    for mine, theirs in zip(again.sweeps, scene.sweeps, strict=True):
+        np.testing.assert_allclose(read_returns(mine).points, read_returns(theirs).points, atol=1e-5)
 
 
 def test_a_frame_range_and_key_frames_alone(turning, tmp_path):
@@ -415,7 +427,7 @@ def test_a_windshield_is_named(caplog):
 
 def test_a_global_shutter_has_the_pose_of_the_start(turning, tmp_path):
     world, recording, _, _ = turning
-    mount, model, images = recording.cameras["front"]
+    mount, _, images = recording.cameras["front"]
     still = pinhole(world.intrinsics, (world.width, world.height), "GLOBAL")
     alone = Recording(recording.times, recording.rig_to_global, {"front": (mount, still, images)})
     scene = extract_scene(source(), write_clip(tmp_path / "clip", alone), None, tmp_path / "out")

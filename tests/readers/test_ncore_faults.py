@@ -122,7 +122,9 @@ def test_a_missing_package_is_named_with_what_installs_it(roots, tmp_path, monke
 def test_the_doctor_names_a_missing_package(monkeypatch):
     assert missing_package("ncore") is None
     monkeypatch.setattr("drivesplat.readers.ncore.layout.find_spec", lambda name: None if name == "zarr" else name)
-    assert missing_package("ncore") == "zarr, which reads NCore clips, is not installed: pip install 'drivesplat[ncore]'"
+    assert (
+        missing_package("ncore") == "zarr, which reads NCore clips, is not installed: pip install 'drivesplat[ncore]'"
+    )
 
 
 def test_no_clips_and_unknown_scenes_are_refused(roots, tmp_path):

@@ -67,6 +67,24 @@ def refusal(made: Plan, *rules: str, scene: str = "one") -> str | None:
 ALL = ("extract", "own_car", "lidar_seed", "scans", "train")
 
 
+def test_a_clip_of_ncore_is_planned_by_its_metadata(tmp_path, tiny_scene):
+    """Its LiDAR has no rows: no scans, and all else works."""
+    pytest.importorskip("ncore")
+    from helpers.ncore_clips import tables_recording, write_clip
+
+    root = write_clip(tmp_path / "clips" / "one", tables_recording(tiny_scene)).parent
+    mine = {"reader": "ncore", "dataroot": str(root), "scenes": ["one"]}
+    config = {"datasets": {"mine": mine}, "cameras": ["front"], "eval_camera": "front"}
+    made = Plan({**config, "results_dir": str(tmp_path / "results")}, str(REPOSITORY))
+    assert refusal(made, "extract", "lidar_seed", "train") is None
+    assert "scene one, LiDAR top: its returns have no rings" in refusal(made, "scans")
+    made = Plan(
+        {**config, "cameras": ["rear"], "eval_camera": "rear", "results_dir": str(tmp_path / "results")},
+        str(REPOSITORY),
+    )
+    assert "the drive has no camera 'rear'; there are: front" in refusal(made, "extract")
+
+
 def test_images_alone_are_refused_where_the_seed_needs_lidar(tmp_path):
     drive = changed(sweeps=[], lidars=None)
     made = plan(tmp_path, {"one": drive})

@@ -123,6 +123,9 @@ class DriveFrame(DriveRecord):
     """The camera's own pose. null: ego pose and sensor_to_ego."""
     ego_to_world: Pose | None = None
     """The ego vehicle's pose at the image's time. null: by ego_poses, or by camera_to_world where that is given."""
+    camera_velocity: tuple[float, float, float, float, float, float] | None = None
+    """The camera's linear (m/s), then angular velocity (rad/s) during the readout, along its own axes. null: by the
+    images before and after."""
 
 
 class DriveSweep(DriveRecord):

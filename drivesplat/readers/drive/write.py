@@ -98,7 +98,7 @@ def drive_record(
     scene: Scene, frames: Iterable[tuple[Frame, str]], sweeps: Iterable[tuple[Sweep, str]], licence: str
 ) -> dict[str, Any]:
     """The content of drive.json for a scene, with these images and sweeps by path."""
-    written = list(frames)
+    written, rolling = list(frames), {camera.name for camera in scene.cameras if camera.readout_s}
     return {
         "format": "drivesplat drive",
         "version": 1,
@@ -123,6 +123,7 @@ def drive_record(
                 "key_frame": frame.is_key_frame,
                 "camera_to_world": pose_record(frame.camera_to_world),
                 "ego_to_world": pose_record(frame.ego_to_world),
+                "camera_velocity": _velocity(frame) if frame.camera in rolling else None,
             }
             for frame, name in written
         ],
@@ -155,6 +156,10 @@ def _camera(camera: Camera, frames: Iterable[tuple[Frame, str]]) -> dict[str, An
         "readout_s": camera.readout_s,
         "readout_direction": camera.readout_direction,
     }
+
+
+def _velocity(frame: Frame) -> list[float] | None:
+    return None if frame.camera_velocity is None else frame.camera_velocity.tolist()
 
 
 def _track(track: Track) -> dict[str, Any]:

@@ -47,7 +47,9 @@ def refusing(record: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())[:200]
-        raise DatasetError(f"{record} cannot be read ({type(error).__name__}: {reason}); copy the clip again") from error
+        raise DatasetError(
+            f"{record} cannot be read ({type(error).__name__}: {reason}); copy the clip again"
+        ) from error
 
 
 def open_clip(files: ClipFiles) -> Clip:
@@ -88,7 +90,7 @@ def rays_of(clip: Clip, lidar: str, end: int) -> dict[str, np.ndarray]:
             key: reader.get_frame_ray_bundle_return_data(end, key, return_index=None)
             for key in ("distance_m", "intensity")
         }
-    count = len(found["timestamp_us"])
+    count = found["timestamp_us"].size
     shapes = {"direction": (count, 3), "timestamp_us": (count,), "model_element": (count, 2)}
     distances, intensities = returns.values()
     fits = all(values.shape == shapes[key] and values.dtype.kind in "fiu" for key, values in found.items())

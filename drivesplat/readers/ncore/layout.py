@@ -74,7 +74,9 @@ def clip_files(root: Path, scene: str) -> ClipFiles:
         wrong = "begins the names of several clips" if found else "is not there"
         known = sorted(found or clips)
         more = f" and {len(known) - MAX_NAMED} more" if len(known) > MAX_NAMED else ""
-        raise DatasetError(f"scene {scene} {wrong}; in {root} there are: {', '.join(known[:MAX_NAMED]) or 'none'}{more}")
+        raise DatasetError(
+            f"scene {scene} {wrong}; in {root} there are: {', '.join(known[:MAX_NAMED]) or 'none'}{more}"
+        )
     (name, stores), *_ = found.items()
     manifest, listed = _manifest(name, stores)
     _require_version(scene, listed)
@@ -100,7 +102,9 @@ def camera_names(root: Path, version: str) -> list[str]:
     for name, stores in _clips(root).items():
         try:
             manifest, listed = _manifest(name, stores)
-            names |= dict.fromkeys(cameras_in(clip_metadata(listed)) if manifest is None else _manifest_cameras(manifest))
+            names |= dict.fromkeys(
+                cameras_in(clip_metadata(listed)) if manifest is None else _manifest_cameras(manifest)
+            )
         except DatasetError as error:
             fault = error
     if fault is not None and not names:
@@ -230,9 +234,7 @@ def _folders(root: Path) -> Iterator[Path]:
     """A folder, its folders and theirs, without those that are stores."""
     yield root
     for pattern in ("*/", "*/*/"):
-        yield from (
-            folder for folder in sorted(root.glob(pattern)) if ".zarr" not in folder.name + folder.parent.name
-        )
+        yield from (folder for folder in sorted(root.glob(pattern)) if ".zarr" not in folder.name + folder.parent.name)
 
 
 def _names(name: str, stores: Sequence[Path], clips: dict[str, list[Path]]) -> list[str]:

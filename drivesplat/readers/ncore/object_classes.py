@@ -17,15 +17,17 @@ _NAMES = {
     ),
     ObjectClass.MOTORCYCLE: "motorbike",
     ObjectClass.BICYCLE: "bike wheeled_device",
-    ObjectClass.RIDER: "cyclist bicyclist motorcyclist wheeled_rider bicycle_rider motorcycle_rider person_on_rideables",
+    ObjectClass.RIDER: (
+        "cyclist bicyclist motorcyclist wheeled_rider bicycle_rider motorcycle_rider person_on_rideables"
+    ),
     ObjectClass.PEDESTRIAN: (
         "person human walker adult child person_sitting official_signaler construction_worker police_officer "
         "personal_mobility"
     ),
     ObjectClass.ANIMAL: "dog",
     ObjectClass.OTHER_MOVABLE: (
-        "protruding_object stroller wheelchair sign unknown misc dontcare bollard construction_cone construction_barrel "
-        "traffic_cone trafficcone barrier stop_sign mobile_pedestrian_crossing_sign pushable_pullable debris "
+        "protruding_object stroller wheelchair sign unknown misc dontcare bollard construction_cone "
+        "construction_barrel traffic_cone trafficcone barrier stop_sign mobile_pedestrian_crossing_sign pushable_pullable debris "
         "bicycle_rack traffic_light_trailer"
     ),
 }

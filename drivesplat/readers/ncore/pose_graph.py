@@ -90,11 +90,11 @@ class PoseGraph:
         return found
 
     def span(self, source: str, target: str) -> tuple[float, float]:
-        """The first and the last time at which the pose of `source` in `target` is known; infinite if it is constant."""
+        """The first and the last time at which the pose of `source` in `target` is known; infinite where it is
+        constant."""
         moving = [edge.times for edge, _ in self._path(source, target) if edge.times is not None]
-        return max((float(times[0]) for times in moving), default=-np.inf), min(
-            (float(times[-1]) for times in moving), default=np.inf
-        )
+        first = max((float(times[0]) for times in moving), default=-np.inf)
+        return first, min((float(times[-1]) for times in moving), default=np.inf)
 
     def times_between(self, source: str, target: str, start: int, end: int) -> list[int]:
         """The times of the poses stored between `source` and `target` after `start` and before `end`, in order."""
@@ -108,7 +108,8 @@ class PoseGraph:
             if frame not in self._edges:
                 known = ", ".join(sorted(self._edges))[:200]
                 raise DatasetError(
-                    f"clip {self._name}: its poses have no frame of reference {shown(frame)}; there are: {known or 'none'}"
+                    f"clip {self._name}: its poses have no frame of reference {shown(frame)}; there are: "
+                    f"{known or 'none'}"
                 )
         paths: dict[str, list[tuple[Edge, bool]]] = {source: []}
         for frame in (queue := [source]):

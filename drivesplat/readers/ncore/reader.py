@@ -57,7 +57,9 @@ def scene_of(clip: Clip, source: SceneSource) -> Scene:
         raise DatasetError(fault)
     key_sensor = key_frame_sensor(clip.metadata)
     if key_sensor is None:
-        raise DatasetError(f"scene {source.scene}: no image and no sweep of the clip is recorded on the path of its rig")
+        raise DatasetError(
+            f"scene {source.scene}: no image and no sweep of the clip is recorded on the path of its rig"
+        )
     every = [middle(*frame) for frame in known_frames(clip.metadata, *key_sensor)]
     component, name = key_sensor
     key_times = require_increasing(every, [str(time) for time in every], f"frame of {component[:-1]} {name} at")
@@ -188,8 +190,8 @@ class _ClipReading:
 
 
 def velocity_between(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
-    """The velocity (6,), linear (m/s) and angular (rad/s), that leads from one pose (4, 4) to another, along the axes of
-    the pose between them."""
+    """The velocity (6,), linear (m/s) and angular (rad/s), that leads from one pose (4, 4) to another in `seconds`,
+    along the axes of the pose between them."""
     turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
     between = interpolate(start, end, 0.5)
     return np.concatenate([between[:3, :3].T @ (end[:3, 3] - start[:3, 3]), turn]) / seconds

@@ -34,8 +34,8 @@ MAX_ANGLE = 100.0
 def tracks_of(
     observations: Sequence[Any], poses: PoseGraph, world_to_scene: np.ndarray, key_times: np.ndarray
 ) -> Iterator[Track]:
-    """The objects seen at any key frame, in the order of their first observation, each with the median size and the most
-    frequent label of its observations. Of several at one time, the one of the best source counts: manual labels before
+    """The objects seen at any key frame, in the order of their first observation, each with the median size and the
+    most frequent label of its observations. Of several at one time, the one of the best source counts: manual labels before
     automatic ones. Unknown labels are other_movable, which is logged. Raises DatasetError naming a damaged one."""
     by_id: dict[str, dict[int, Any]] = {}
     beyond = 0
@@ -61,7 +61,9 @@ def tracks_of(
         label = Counter(checked_text(one.class_id, named("cuboid", id_), "class_id") for one in ordered)
         category = label.most_common(1)[0][0]
         kind = object_class(category)
-        sampled = sampled_poses(times, [world_to_scene @ pose_of(one, poses) for one in ordered], key_times, max_gap, half)
+        sampled = sampled_poses(
+            times, [world_to_scene @ pose_of(one, poses) for one in ordered], key_times, max_gap, half
+        )
         sizes = [checked_box_size(list(one.bbox3.dim), named("cuboid", id_)) for one in ordered]
         if not sampled:
             continue
@@ -121,9 +123,7 @@ def sampled_poses(
     return found
 
 
-def _continued(
-    times: np.ndarray, poses: Sequence[np.ndarray], nearest: int, key: int, max_gap: float
-) -> np.ndarray:
+def _continued(times: np.ndarray, poses: Sequence[np.ndarray], nearest: int, key: int, max_gap: float) -> np.ndarray:
     """The pose at `key` by the motion between the observation `nearest` to it and the one on its other side; that
     observation where there is none within `max_gap`."""
     other = nearest + (1 if key < times[nearest] else -1)
