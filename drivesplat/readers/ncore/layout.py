@@ -268,7 +268,8 @@ def _manifest(name: str, stores: Sequence[Path]) -> tuple[Path | None, list[Path
                 raise DatasetError(f"{file} is not JSON; copy the clip again")
             if listed is None:
                 continue
-            paths = [entry.get("path") if isinstance(entry, dict) else None for entry in listed or ()]
+            entries = listed if isinstance(listed, list) else []
+            paths = [entry.get("path") if isinstance(entry, dict) else None for entry in entries]
             if not paths or not all(isinstance(path, str) and re.fullmatch(r"[^/\\\0]+", path) for path in paths):
                 raise DatasetError(f"{file}: its component_stores must be stores beside it, each with its path")
             if file.stem == name or known & set(paths):

@@ -27,8 +27,8 @@ _NAMES = {
     ObjectClass.ANIMAL: "dog",
     ObjectClass.OTHER_MOVABLE: (
         "protruding_object stroller wheelchair sign unknown misc dontcare bollard construction_cone "
-        "construction_barrel traffic_cone trafficcone barrier stop_sign mobile_pedestrian_crossing_sign pushable_pullable debris "
-        "bicycle_rack traffic_light_trailer"
+        "construction_barrel traffic_cone trafficcone barrier stop_sign mobile_pedestrian_crossing_sign "
+        "pushable_pullable debris bicycle_rack traffic_light_trailer"
     ),
 }
 """Other names of classes: those of Physical AI AV, Waymo, Argoverse 2, KITTI and nuScenes."""

@@ -35,21 +35,9 @@ def tracks_of(
     observations: Sequence[Any], poses: PoseGraph, world_to_scene: np.ndarray, key_times: np.ndarray
 ) -> Iterator[Track]:
     """The objects seen at any key frame, in the order of their first observation, each with the median size and the
-    most frequent label of its observations. Of several at one time, the one of the best source counts: manual labels before
-    automatic ones. Unknown labels are other_movable, which is logged. Raises DatasetError naming a damaged one."""
-    by_id: dict[str, dict[int, Any]] = {}
-    beyond = 0
-    for observation in observations:
-        record = named("cuboid", observation.track_id)
-        time = checked_timestamp(observation.timestamp_us, record)
-        of_track = by_id.setdefault(checked_text(observation.track_id, record, "track_id"), {})
-        if not is_known(observation, poses):
-            beyond += 1
-        elif time not in of_track or observation.source > of_track[time].source:
-            of_track[time] = observation
-    if beyond:
-        log.warning("%d of %d cuboids lie beyond the known path; left out", beyond, len(observations))
-    by_id = {id_: of_track for id_, of_track in by_id.items() if of_track}
+    most frequent label of its observations. Unknown labels are other_movable, which is logged. Raises DatasetError
+    naming a damaged observation."""
+    by_id = merged(observations, poses)
     intervals = [np.diff(sorted(of_track)) for of_track in by_id.values() if len(of_track) > 1]
     usual = float(np.median(np.concatenate(intervals))) if intervals else 0.0
     max_gap = float(np.clip(MAX_INTERVALS * usual, MIN_GAP_US, MAX_GAP_US))
@@ -83,6 +71,24 @@ def tracks_of(
     if unknown:
         names = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
         log.warning("cuboids have unknown labels, which are read as other_movable and count as static: %s", names)
+
+
+def merged(observations: Sequence[Any], poses: PoseGraph) -> dict[str, dict[int, Any]]:
+    """The observations of each track by their times. Of several at one time, the one of the best source counts: manual
+    labels before automatic ones. Those beyond the known path are left out, which is logged."""
+    by_id: dict[str, dict[int, Any]] = {}
+    beyond = 0
+    for observation in observations:
+        record = named("cuboid", observation.track_id)
+        time = checked_timestamp(observation.timestamp_us, record)
+        of_track = by_id.setdefault(checked_text(observation.track_id, record, "track_id"), {})
+        if not is_known(observation, poses):
+            beyond += 1
+        elif time not in of_track or observation.source > of_track[time].source:
+            of_track[time] = observation
+    if beyond:
+        log.warning("%d of %d cuboids lie beyond the known path; left out", beyond, len(observations))
+    return {id_: of_track for id_, of_track in by_id.items() if of_track}
 
 
 def is_known(observation: Any, poses: PoseGraph) -> bool:
