@@ -141,11 +141,12 @@ def spinning_model(rows: int = ROWS, columns: int = COLUMNS) -> Any:
     )  # fmt: skip
 
 
-def tables_recording(scene: Scene) -> Recording:
-    """The scene of nuScenes' tables as a clip: an image lasts READOUT_US about its time, sweeps are at one time."""
+def tables_recording(scene: Scene, readout_us: int = READOUT_US) -> Recording:
+    """The scene of nuScenes' tables as a clip: an image lasts `readout_us` about its time, sweeps are at one time."""
     ends = [recording.timestamp for recording in (*scene.frames, *scene.sweeps)]
     times = np.arange(min(ends) - 50_000, max(ends) + 50_001, POSE_US, dtype=np.int64)
-    times = np.unique([*times, *ends, *(time - READOUT_US // 2 for time in ends), *(t + READOUT_US // 2 for t in ends)])
+    half = readout_us // 2
+    times = np.unique([*times, *ends, *(time - half for time in ends), *(time + half for time in ends)])
     known = {frame.timestamp: frame.ego_to_world for frame in scene.frames}
     stamps = np.array(sorted(known))
     places = np.stack([known[int(stamp)][:3, 3] + scene.origin for stamp in stamps])
@@ -153,8 +154,7 @@ def tables_recording(scene: Scene) -> Recording:
     rig = rigid(known[int(stamps[0])][:3, :3], places[0] + (times - stamps[0])[:, None] * slope)
     frame, camera = scene.frames[0], scene.cameras[0]
     images = [
-        (one.timestamp - READOUT_US // 2, one.timestamp + READOUT_US // 2, Path(one.image_path).read_bytes(), "jpeg")
-        for one in scene.frames
+        (one.timestamp - half, one.timestamp + half, Path(one.image_path).read_bytes(), "jpeg") for one in scene.frames
     ]
     recording = Recording(times, rig)
     model = pinhole(camera.intrinsics, (camera.width, camera.height))
