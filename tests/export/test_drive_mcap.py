@@ -576,7 +576,7 @@ def test_without_rosbags_one_sentence_says_how_to_install_it(recorded, tmp_path,
     ros_messages.ros_types.cache_clear()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(
-        DriveSplatError, match=r"^MCAP files need the package rosbags: pip install 'drivesplat\[mcap\]'$"
+        DriveSplatError, match=r"^MCAP files need the package rosbags: pip install 'drivesplat\[ros]'$"
     ):
         write_mcap(recorded, tmp_path / "own.mcap")
     assert not list(tmp_path.iterdir())
