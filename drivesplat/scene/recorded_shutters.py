@@ -35,8 +35,8 @@ def shutter_of(scene: Scene, frame: Frame) -> Shutter | None:
 
 
 def _velocity(frame: Frame, times: np.ndarray, ego_to_world: np.ndarray) -> np.ndarray | None:
-    """`Shutter.velocity` (6,): the image's own, or by the ego poses (n, 4, 4) at increasing `times` (n,) in microseconds
-    around it; None where there are none."""
+    """`Shutter.velocity` (6,): the image's own, or by the ego poses (n, 4, 4) at increasing `times` (n,) in
+    microseconds around it; None where there are none."""
     if frame.camera_velocity is not None:
         return frame.camera_velocity
     from scipy.spatial.transform import Rotation  # here: planning imports this module, and scipy takes long

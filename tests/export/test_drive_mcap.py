@@ -575,9 +575,7 @@ def test_a_folder_that_cannot_be_written_is_named(recorded, tmp_path):
 def test_without_rosbags_one_sentence_says_how_to_install_it(recorded, tmp_path, monkeypatch):
     ros_messages.ros_types.cache_clear()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(
-        DriveSplatError, match=r"^MCAP files need the package rosbags: pip install 'drivesplat\[ros]'$"
-    ):
+    with pytest.raises(DriveSplatError, match=r"^MCAP files need the package rosbags: pip install 'drivesplat\[ros]'$"):
         write_mcap(recorded, tmp_path / "own.mcap")
     assert not list(tmp_path.iterdir())
 
