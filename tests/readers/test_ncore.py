@@ -35,9 +35,9 @@ from drivesplat.readers.ncore.store_metadata import METADATA, store_metadata
 from drivesplat.readers.sweeps import read_returns, read_scan
 from drivesplat.scene.lens import pixels_of
 from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.recorded_shutters import shutter_of
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, read_scene, write_scene
-from drivesplat.scene.shutter import shutter_of
 from drivesplat.settings.extract import SceneSource
 
 pytest.importorskip("ncore")

@@ -123,7 +123,7 @@ class _ClipReading:
         """A camera, with the median readout time of its images."""
         durations = [end - start for start, end in frame_times(self.clip.metadata, "cameras", name)]
         readout_s = float(np.median(durations)) * 1e-6 if durations else None
-        return camera_of(name, self._parameters(name), readout_s)
+        return camera_of(name, self._camera_model(name), readout_s)
 
     def lidar(self, name: str) -> Any:
         """A LiDAR."""
@@ -132,7 +132,7 @@ class _ClipReading:
 
     def frames(self, camera: Camera, between: bool) -> Iterator[Frame]:
         """The images of a camera at key frames and, if asked for, between them."""
-        at_start = is_global(self._parameters(camera.name))
+        at_start = is_global(self._camera_model(camera.name))
         intrinsics = central_intrinsics(camera)
         recorded = known_frames(self.clip.metadata, "cameras", camera.name)
         times = [start if at_start else middle(start, end) for start, end in recorded]
@@ -184,7 +184,7 @@ class _ClipReading:
         """A frame of reference in the world of the scene (n, 4, 4)."""
         return self.world_to_scene @ self.clip.poses.at(frame, WORLD, times)
 
-    def _parameters(self, camera: str) -> Any:
+    def _camera_model(self, camera: str) -> Any:
         with refusing(f"camera {camera}: its model"):
             return self.clip.intrinsics.get_camera_model_parameters(camera)
 
