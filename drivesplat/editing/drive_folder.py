@@ -8,13 +8,13 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
-from PIL import Image
 
 from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.drive_labels import labelled
 from drivesplat.editing.film import edited_frames
 from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.render_plan import ImageRenderPlan, image_render_plan
+from drivesplat.io.jpeg import encoded_jpeg
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.storage import Provenance, atomic_write, write_json
 from drivesplat.machine.device import explain_out_of_memory
@@ -31,8 +31,6 @@ from drivesplat.settings.export import DriveJob, DriveLabel
 
 TABLES, VERSION = "nuscenes", "v1.0-rendered"
 """The folder of the nuScenes dataset in a drive folder, and the name of its version."""
-QUALITY = 95
-"""JPEG quality of the images, with colours at full resolution."""
 
 
 def write_rendered_drive(
@@ -65,7 +63,7 @@ def write_rendered_drive(
                 pictures = film_frames(model, ((view, None) for view in views))
             for frame, pixels in zip(drive.scene.frames, prefetch_items(pictures), strict=True):
                 with atomic_write(Path(frame.image_path)) as file:
-                    Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)
+                    file.write(encoded_jpeg(pixels))
             instances = _write_label_images(folder, drive, job.labels, device)
             trained_until = last_training_timestamp(scene, job.eval_camera, job.holdout)
             drive, labels = labelled(scene, drive, trained_until, device, what)

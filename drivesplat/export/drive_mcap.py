@@ -10,7 +10,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.export import ros_messages as ros
 from drivesplat.export.drive_clouds import TimedSweep, recorded_sweeps, rendered_sweeps
 from drivesplat.export.mcap_file import LATCHED, mcap_file
+from drivesplat.io.jpeg import encoded_jpeg
 from drivesplat.io.storage import Provenance
 from drivesplat.io.unique_names import unique_names
 from drivesplat.readers.drive.faults import faults_of, is_unposed
@@ -33,8 +33,6 @@ from drivesplat.scene.images import DECODING_ERRORS, read_image
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.trajectories.camera_path import smooth_path
 
-QUALITY = 95
-"""JPEG quality of images that are no JPEG files, with colours at full resolution."""
 ORIENTATION = 0x0112
 """The EXIF tag of how to turn an image, which ROS's decoders follow and drive folders do not."""
 HALF_SPAN = 0.05
@@ -278,9 +276,7 @@ def jpeg_bytes(path: Path, size: tuple[int, int]) -> bytes:
         raise DatasetError(f"image {path} cannot be read ({error}); restore it, or take it out of drive.json") from None
     if found != size:
         raise DatasetError(f"image {path} is {found[0]}x{found[1]}, but its camera has {size[0]}x{size[1]}")
-    encoded = BytesIO()
-    Image.fromarray(read_image(path)).save(encoded, format="JPEG", quality=QUALITY, subsampling=0)
-    return encoded.getvalue()
+    return encoded_jpeg(read_image(path))
 
 
 def _optical(name: str) -> str:

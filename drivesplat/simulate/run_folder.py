@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from drivesplat.drive.cameras import PoseableCamera
 from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
+from drivesplat.io.jpeg import encoded_jpeg
 from drivesplat.io.storage import Provenance, atomic_write
 from drivesplat.readers.drive.reader import READER
 from drivesplat.readers.drive.write import write_record, write_sweep
@@ -28,8 +28,6 @@ from drivesplat.simulate.trust import Trust
 
 log = logging.getLogger(__name__)
 
-QUALITY = 95
-"""JPEG quality of the images, with colours at full resolution."""
 SAME_M = 0.01
 """Metres between the paths of two runs from which on they are not the same."""
 SIMULATED = "simulated"
@@ -103,7 +101,7 @@ class _Recorder:
         now, time = self._simulation, self.times[-1]
         file = self._folder / "images" / name / f"{time}.jpg"
         with atomic_write(file) as opened:
-            Image.fromarray(pixels).save(opened, format="JPEG", quality=QUALITY, subsampling=0)
+            opened.write(encoded_jpeg(pixels))
         pose, mount = now.ego_to_world, camera.camera_to_ego
         assert mount is not None
         seen_from = now.drive.camera_to_world(name, now.time) if now.follows else pose @ mount

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from drivesplat.errors import DatasetError
+from drivesplat.io.jpeg import encoded_jpeg
 from drivesplat.readers.drive.bag.bag_map import Calibration
 from drivesplat.readers.drive.format import Distortion
 from drivesplat.readers.record_names import shown
@@ -16,8 +17,6 @@ from drivesplat.scene.images import DECODING_ERRORS
 
 RAW_IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-QUALITY = 95
-"""JPEG quality of images that were recorded without compression, with colours at full resolution."""
 JPEG_BEGIN, JPEG_END, TAIL = b"\xff\xd8\xff", b"\xff\xd9", 4096
 """How JPEG files begin and end, and in how many last bytes the end is searched: cameras pad files."""
 MAX_SIDE = 20_000
@@ -117,13 +116,12 @@ def _pixels(message: Any) -> np.ndarray:
 
 def _encoded(pixels: np.ndarray, raw: str) -> EncodedImage:
     """Pixels (h, w, 3) RGB or (h, w) as a file."""
+    size, is_grey = (pixels.shape[1], pixels.shape[0]), pixels.ndim == 2
+    if raw != "png":
+        return EncodedImage(".jpg", encoded_jpeg(pixels), size, is_grey)
     file = BytesIO()
-    if raw == "png":
-        Image.fromarray(pixels).save(file, format="PNG", compress_level=1)
-    else:
-        Image.fromarray(pixels).save(file, format="JPEG", quality=QUALITY, subsampling=0)
-    size = (pixels.shape[1], pixels.shape[0])
-    return EncodedImage(".png" if raw == "png" else ".jpg", file.getvalue(), size, pixels.ndim == 2)
+    Image.fromarray(pixels).save(file, format="PNG", compress_level=1)
+    return EncodedImage(".png", file.getvalue(), size, is_grey)
 
 
 def calibration_of(message: Any, rectified: bool) -> tuple[Calibration, np.ndarray]:
