@@ -27,9 +27,10 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from benchmarks.command import argument_parser
+from drivesplat.scene.pose_path import PosePath
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.scene.tracks import box_at
@@ -150,9 +151,7 @@ class RigRequests:
 
     def _rigs(self, stamps: np.ndarray) -> np.ndarray:
         """Poses (n, 4, 4) of the vehicle."""
-        turns = Slerp(self.stamps, Rotation.from_matrix(self.path[:, :3, :3]))(stamps).as_matrix()
-        places = [np.interp(stamps, self.stamps, self.path[:, axis, 3]) for axis in range(3)]
-        return rigid(turns, np.stack(places, axis=1))
+        return PosePath(self.stamps, self.path).at(stamps)
 
     def _objects(self, start: int) -> list[Any]:
         """All tracks that are there, half a metre to their left."""

@@ -3,9 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
-from drivesplat.scene.rigid import interpolate, inverse, rigid
+from drivesplat.scene.pose_path import PosePath
+from drivesplat.scene.rigid import interpolate, inverse
 from drivesplat.scene.scene import UNPOSED, Scene
 
 
@@ -51,12 +52,7 @@ class Corrections:
 
     def _interpolated(self, transforms: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
         """`transforms` (n, 4, 4), one per image, interpolated at `timestamps` (m,): (m, 4, 4)."""
-        within = np.clip(timestamps, self.timestamps[0], self.timestamps[-1])
-        positions = [np.interp(within, self.timestamps, transforms[:, axis, 3]) for axis in range(3)]
-        rotations = Rotation.from_matrix(transforms[:, :3, :3])
-        if len(self.timestamps) > 1:
-            rotations = Slerp(self.timestamps.astype(np.float64), rotations)(within.astype(np.float64))
-        return rigid(rotations.as_matrix(), np.stack(positions, axis=-1))
+        return PosePath(self.timestamps, transforms).at(timestamps)
 
 
 def magnitudes(corrections: np.ndarray) -> dict[str, dict[str, float]]:

@@ -10,12 +10,12 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial.transform import Rotation, Slerp
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import checked_timestamp, checked_transform, require_increasing
 from drivesplat.readers.record_names import shown
-from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.pose_path import PosePath
+from drivesplat.scene.rigid import inverse
 
 UPRIGHT = 0.94
 """Cosine of the largest angle between two vertical axes that are one up to a slope: 20 degrees."""
@@ -32,15 +32,12 @@ class Edge:
         """The poses (m, 4, 4) at times (m,) within those known."""
         if self.times is None:
             return np.repeat(self.poses, len(times), axis=0)
-        known, wanted = self._turns.times, (times - self.times[0]).astype(np.float64)
-        places = np.stack([np.interp(wanted, known, self.poses[:, i, 3]) for i in range(3)], axis=-1)
-        return rigid(self._turns(wanted).as_matrix(), places)
+        return self._path.at(times)
 
     @cached_property
-    def _turns(self) -> Slerp:
-        """The rotation by time since the first pose."""
+    def _path(self) -> PosePath:
         assert self.times is not None
-        return Slerp((self.times - self.times[0]).astype(np.float64), Rotation.from_matrix(self.poses[:, :3, :3]))
+        return PosePath(self.times, self.poses)
 
 
 def constant_edge(pose: np.ndarray, record: str) -> Edge:

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive.bag.bag_file import BagFile, BagMessage, frame_name, header_stamp, listed, microseconds
 from drivesplat.readers.drive.poses import KNOT_US, MAX_POSE_GAP
+from drivesplat.scene.pose_path import PosePath
 from drivesplat.scene.rigid import interpolate, inverse, rigid
 
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -49,17 +50,12 @@ class FrameEdge:
         return len(self.stamps) > 1 and bool(same.all() and (np.ptp(self.places, axis=0) < CONSTANT).all())
 
     @cached_property
-    def _slerp(self) -> Slerp:
-        return Slerp(self.stamps, Rotation.from_quat(self.turns))
+    def _path(self) -> PosePath:
+        return PosePath(self.stamps, rigid(Rotation.from_quat(self.turns).as_matrix(), self.places))
 
     def poses(self, stamps: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 4 4"]:
         """The poses at times: linear position and slerp, outside the recorded times the nearest."""
-        if len(self.stamps) == 1:
-            pose = rigid(Rotation.from_quat(self.turns[0]).as_matrix(), self.places[0])
-            return np.tile(pose, (len(stamps), 1, 1))
-        within = np.clip(stamps, self.stamps[0], self.stamps[-1])
-        places = np.stack([np.interp(within, self.stamps, self.places[:, i]) for i in range(3)], axis=1)
-        return rigid(self._slerp(within).as_matrix(), places)
+        return self._path.at(stamps)
 
 
 class TransformTree:
@@ -191,9 +187,7 @@ class EgoTrack:
 
     def at(self, stamps: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 4 4"]:
         """The poses at times within those of the track: linear position and slerp."""
-        turns = Slerp(self.stamps, Rotation.from_matrix(self.poses[:, :3, :3]))(stamps)
-        places = np.stack([np.interp(stamps, self.stamps, self.poses[:, i, 3]) for i in range(3)], axis=1)
-        return rigid(turns.as_matrix(), places)
+        return PosePath(self.stamps, self.poses).at(stamps)
 
     def covers(self, stamp: int) -> bool:
         """Whether there is a pose at a time: between two that are at most MAX_POSE_GAP apart, or at most
