@@ -145,9 +145,8 @@ class LoadedDrives:
         self._loaded: dict[str, LoadedDrive] = {}  # the one used last is the last
 
     def name_of(self, scene_id: str) -> str:
-        """The scene id of a request as it is offered; `scene/method` also names a scene of one method, and the
-        id of its archive any scene. Raises
-        ServiceError (NOT_FOUND) for a scene that is not served."""
+        """The scene id of a request as it is offered; `scene/method` also names a scene of one method, and the id of
+        its archive any scene. Raises ServiceError (NOT_FOUND) for a scene that is not served."""
         name = scene_id if scene_id in self.offered else self._aliases.get(scene_id)
         if name is None:
             raise ServiceError(

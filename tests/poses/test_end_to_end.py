@@ -158,4 +158,4 @@ class TestAmongTheOtherStages:
 
 
 def _inputs(job: str) -> str:
-    return next(line for line in job.splitlines() if line.strip().startswith("input:"))
+    return next((line for line in job.splitlines() if line.strip().startswith("input:")), "")
