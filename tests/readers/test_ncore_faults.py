@@ -155,6 +155,14 @@ def test_a_missing_store_is_named(roots, tmp_path):
     assert f"has no {METADATA}; copy the whole clip again" in refusal(root, tmp_path)
 
 
+def test_a_store_whose_name_cannot_be_printed_is_refused(roots, tmp_path):
+    root = Path(shutil.copytree(roots["itar"], tmp_path / "clip"))
+    content = json.loads((root / f"{NAME}.json").read_text())
+    content["component_stores"][0]["path"] = "\ud800"
+    (root / f"{NAME}.json").write_text(json.dumps(content))
+    assert "must be stores beside it" in refusal(root, tmp_path)
+
+
 def test_other_versions_are_refused(roots, tmp_path):
     root = Path(shutil.copytree(roots["itar"], tmp_path / "manifest"))
     content = json.loads((root / f"{NAME}.json").read_text())

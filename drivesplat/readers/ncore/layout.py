@@ -19,6 +19,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.regular_file import regular_file
 from drivesplat.readers.ncore.store_metadata import METADATA, Metadata, store_metadata
 from drivesplat.readers.outline import Outline, RecordedCamera
+from drivesplat.readers.record_names import text_fault
 
 HOW = "docs/ncore.md says what a clip is; set datasets.<name>.dataroot to the folder of the clip, or to one above"
 EXTRA = "pip install 'drivesplat[ncore]'"
@@ -270,7 +271,7 @@ def _manifest(name: str, stores: Sequence[Path]) -> tuple[Path | None, list[Path
                 continue
             entries = listed if isinstance(listed, list) else []
             paths = [entry.get("path") if isinstance(entry, dict) else None for entry in entries]
-            if not paths or not all(isinstance(path, str) and re.fullmatch(r"[^/\\\0]+", path) for path in paths):
+            if not paths or not all(text_fault(path) is None and re.fullmatch(r"[^/\\\0]+", path) for path in paths):
                 raise DatasetError(f"{file}: its component_stores must be stores beside it, each with its path")
             if file.stem == name or known & set(paths):
                 if content.get("version") != f"v{VERSION}":
