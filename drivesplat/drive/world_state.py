@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import overload
 
 import numpy as np
@@ -94,30 +95,34 @@ class SampledWorld:
         known = {item.object_class.value for item in (*self.actors, *self.static.others)}
         return (SKY, *(part.name for part in self.model.parts if not part.has_objects), *sorted(known))
 
-    def image(self, placed: PlacedCamera, outputs: Collection[str]) -> DriveView:
-        """What a camera sees."""
-        camera, view = placed.camera, placed.view(self.device)
+    def images(self, cameras: Sequence[PlacedCamera], outputs: Collection[str]) -> list[DriveView]:
+        """What cameras see."""
+        if "boxes" in outputs and any(placed.camera.distorted for placed in cameras):
+            raise RequestError("boxes are those of a pinhole camera: leave them out for a distorted one")
+        views = [placed.view(self.device) for placed in cameras]
+        pinholes = [_pinholes(placed.camera, view) for placed, view in zip(cameras, views, strict=True)]
+        shown = iter(self._tensors([pinhole for own in pinholes for pinhole in own], outputs))
+        return [
+            self._image(placed.camera, view, list(islice(shown, len(own))), outputs)
+            for placed, view, own in zip(cameras, views, pinholes, strict=True)
+        ]
+
+    def _image(
+        self, camera: PoseableCamera, view: View, shown: Sequence[dict[str, Tensor]], outputs: Collection[str]
+    ) -> DriveView:
+        """The image of a camera, of what its `_pinholes` show."""
+        parts = {name: [own[name] for own in shown] for name in shown[0]}
         if camera.distorted:
-            if "boxes" in outputs:
-                raise RequestError("boxes are those of a pinhole camera: leave them out for a distorted one")
-            faces = camera.faces
-            shown = [self._tensors(face.view(view), outputs) for face in faces]
             found = {
-                name: resampled(faces, [own[name] for own in shown], name not in INTERPOLATED, name == "depth")
-                for name in shown[0]
+                name: resampled(camera.faces, own, name not in INTERPOLATED, name == "depth")
+                for name, own in parts.items()
             }
-            seen = torch.stack([face.shows for face in faces]).any(dim=0).to(self.device)
         else:
-            rows = max(1, MAX_PIXELS // view.width)
-            bands = [(top, min(rows, view.height - top)) for top in range(0, view.height, rows)]
-            if len(bands) == 1:
-                found = self._tensors(view, outputs)
-            else:
-                parts = [self._tensors(view.cropped(0, top, view.width, height), outputs) for top, height in bands]
-                found = {name: torch.cat([own[name] for own in parts]) for name in parts[0]}
-            seen = torch.ones(view.height, view.width, dtype=torch.bool, device=self.device)
+            found = {name: torch.cat(own) if len(own) > 1 else own[0] for name, own in parts.items()}
         if "valid" in outputs:
-            found["valid"] = seen & torch.from_numpy(camera.uncovered()).to(self.device)
+            found["valid"] = torch.from_numpy(camera.uncovered()).to(self.device)
+            if camera.distorted:
+                found["valid"] &= torch.stack([face.shows for face in camera.faces]).any(dim=0).to(self.device)
         boxes = tuple(self._boxes(view)) if "boxes" in outputs else None
         return DriveView(self._ids, **found, boxes=boxes, classes=self.classes if "semantic" in outputs else ())
 
@@ -136,18 +141,14 @@ class SampledWorld:
     def _ids(self) -> tuple[str, ...]:
         return tuple(actor.id for actor in self.actors)
 
-    def _tensors(self, view: View, outputs: Collection[str]) -> dict[str, Tensor]:
-        found: dict[str, Tensor] = {}
+    def _tensors(self, views: Sequence[View], outputs: Collection[str]) -> list[dict[str, Tensor]]:
+        """The outputs of each view, but for `valid` and boxes."""
+        makers = {"depth": self.shown.surface_depth, "instance": self.placed.objects_in, "semantic": self._classes}
+        found = [{name: make(view) for name, make in makers.items() if name in outputs} for view in views]
         if "rgb" in outputs or "alpha" in outputs:
-            picture = self.shown.render(view)
-            found |= {"rgb": picture.image, "alpha": picture.alpha}
-        if "depth" in outputs:
-            found["depth"] = self.shown.surface_depth(view)
-        if "instance" in outputs:
-            found["instance"] = self.placed.objects_in(view)
-        if "semantic" in outputs:
-            found["semantic"] = self._classes(view)
-        return {name: values for name, values in found.items() if name in outputs}
+            for own, picture in zip(found, self.shown.render_all(views), strict=True):
+                own |= {"rgb": picture.image, "alpha": picture.alpha}
+        return [{name: own[name] for name in outputs if name in own} for own in found]
 
     def _classes(self, view: View) -> Int16[Tensor, "h w"]:
         gaussians = self.placed.gaussians_in(view)
@@ -176,6 +177,18 @@ class SampledWorld:
             if item is not None:
                 own = box.category, box.size.copy(), box.object_to_world
                 yield ObjectBox(item.id, *own, item.corners, item.visible)
+
+
+def _pinholes(camera: PoseableCamera, view: View) -> list[View]:
+    """The pinhole views that make up the view of a camera: its faces where it is distorted, otherwise bands of lines
+    that are not too large."""
+    if camera.distorted:
+        return [face.view(view) for face in camera.faces]
+    rows = max(1, MAX_PIXELS // view.width)
+    if rows >= view.height:
+        return [view]
+    tops = range(0, view.height, rows)
+    return [view.cropped(0, top, view.width, min(rows, view.height - top)) for top in tops]
 
 
 class WorldState:
@@ -303,7 +316,7 @@ class WorldState:
             raise RequestError(f"a camera at {other[0]:g} s cannot show a world at {self.time:g} s")
         world = self._sampled()
         with explain_out_of_memory(lambda: len(self._fixed.model)):
-            return [world.image(one, outputs) for one in cameras]
+            return world.images(cameras, outputs)
 
     @torch.no_grad()
     def scan(

@@ -63,6 +63,10 @@ class PlacedModel:
         """What a camera sees."""
         return self.fixed.render(view, self.sets_in(view), with_surface_depth)
 
+    def render_all(self, views: Sequence[View]) -> list[RenderedImage]:
+        """What cameras see. A GPU is waited for once for all of them."""
+        return self.fixed.render_all([(view, self.sets_in(view)) for view in views])
+
     def surface_depth(self, view: View) -> Float[Tensor, "h w"]:
         """The depth in metres along the camera's axis of the surfaces that an image shows; 0 where there are none."""
         depth = self.render(view, with_surface_depth=True).surface_depth

@@ -119,7 +119,13 @@ class FixedModel:
         if with_surface_depth:
             picture = self.model.render(view, gaussians=sets, with_surface_depth=True)
             return RenderedImage(picture.image, picture.alpha, picture.surface_depth)
-        return self._finished(view, sets, self._image)
+        return self.render_all([(view, sets)])[0]
+
+    @torch.no_grad()
+    def render_all(self, wanted: Sequence[tuple[View, Sequence[Gaussians]]]) -> list[RenderedImage]:
+        """Renders each view of its own set of Gaussians of each part, as `render` does. Waits for a GPU once for all of
+        them."""
+        return self._finished(wanted, self._image)
 
     def scan_view(self, sensor: RecordedScan, beam_spread: tuple[float, float]) -> ScanView:
         """The rays of a recorded scan as a view of the model. `beam_spread` in radians. What follows from rays alone is
@@ -135,7 +141,7 @@ class FixedModel:
     def scan(self, view: ScanView, sets: Sequence[Gaussians]) -> ScanPicture:
         """What a LiDAR measures of a set of Gaussians of each part. Waits for a GPU. Raises ResultError for Gaussians
         of a model that was trained without LiDAR."""
-        return self._finished(view, sets, self._scan)
+        return self._finished([(view, sets)], self._scan)[0]
 
     @torch.no_grad()
     def submit(self, view: View, sets: Sequence[Gaussians]) -> Pending[RenderedImage]:
@@ -149,13 +155,25 @@ class FixedModel:
     def _scan(self, view: ScanView, sets: Sequence[Gaussians]) -> ScanPicture:
         return self.model.scan(view, gaussians=sets)
 
-    def _finished(self, view: Sensor, sets: Sequence[Gaussians], render: Rendering[Sensor, Shown]) -> Shown:
-        if not self._captures:
-            return render(view, sets)
+    def _finished(
+        self, wanted: Sequence[tuple[Sensor, Sequence[Gaussians]]], render: Rendering[Sensor, Shown]
+    ) -> list[Shown]:
+        """Renderings without missing Gaussians, in memory of their own."""
+        if not self._captures or not wanted:
+            return [render(view, sets) for view, sets in wanted]
+        started = [self._started(view, sets, render) for view, sets in wanted]
+        needs = torch.cat([one.needed for one in started]).cpu()  # waits for the GPU
+        return [
+            one.retry().rendered if overflowed(needed.tolist(), one.capacities) else one.rendered
+            for one, needed in zip(started, needs.split([len(one.capacities) for one in started]), strict=True)
+        ]
+
+    def _started(self, view: Sensor, sets: Sequence[Gaussians], render: Rendering[Sensor, Shown]) -> Pending[Shown]:
+        """A rendering that later ones do not overwrite."""
         pending = self._without_graphs_if_full(partial(self._planned, view, sets, render))
-        while overflowed(pending.needed.tolist(), pending.capacities):
-            pending = pending.retry()
-        return pending.rendered.copied()
+        return replace(
+            pending, rendered=pending.rendered.copied(), needed=pending.needed.to(_inputs(view)[0].device, copy=True)
+        )
 
     def _planned(self, view: Sensor, sets: Sequence[Gaussians], render: Rendering[Sensor, Shown]) -> Pending[Shown]:
         """A rendering with planned capacities, by the entries that earlier ones of its kind needed."""

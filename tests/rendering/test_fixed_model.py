@@ -108,6 +108,13 @@ def test_images_whose_lists_overflow_are_rendered_again_and_captured_anew(gpu):
     assert gpu.captured == [[100], [160]]
 
 
+def test_images_that_are_made_together_are_those_made_one_by_one(gpu):
+    views = [needing(entries) for entries in (100, 90, 160, 100)]
+    images = gpu.model.render_all([(view, gpu.model.sample_in(view)) for view in views])
+    assert [float(own.image[0, 0, 0]) for own in images] == [RENDERED, REPLAYED, RENDERED, REPLAYED]
+    assert gpu.captured == [[100]] and gpu.model.render_all([]) == []
+
+
 def test_a_refused_capture_is_not_tried_again(gpu):
     gpu.refuses = True
     assert gpu.made(*[needing(100)] * 4) == [RENDERED] * 4 and len(gpu.captured) == 1
