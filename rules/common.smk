@@ -17,6 +17,7 @@ from drivesplat.settings.config import in_current_names
 from drivesplat.workflow.costs.run_costs import COSTS, ESTIMATE, RunCosts
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.this_copy import in_this_copy
+from drivesplat.workflow.long_drives import LongDrives
 from drivesplat.workflow.module_use import module_config, stop_at_absent_data, take_prefix
 from drivesplat.workflow.named_tracks import run_targets
 from drivesplat.workflow.plan import Plan, let_scripts_import
@@ -71,7 +72,7 @@ if workflow.pathvars.get("results") != plan.config.results_dir:
 
 
 wildcard_constraints:
-    scene=plan.known(plan.config.scenes),
+    scene="|".join([plan.known(plan.config.scenes), plan.blocks]),
     method=plan.known(plan.config.all_methods),
     tracks=plan.known(["", *plan.other_tracks]),
     trajectory=plan.known(plan.all_trajectories),

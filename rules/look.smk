@@ -64,6 +64,8 @@ rule film:
         "<logs>/{scene}/{method}/film_{trajectory}.log",
     benchmark:
         "<benchmarks>/{scene}/{method}/film_{trajectory}.tsv"
+    wildcard_constraints:
+        scene=plan.trained(),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=8)

@@ -54,7 +54,7 @@ rule evaluate:
     benchmark:
         "<benchmarks>/{scene}/{method}/evaluate.tsv"
     wildcard_constraints:
-        scene=plan.known(plan.scenes(cameras=True)),
+        scene=plan.trained(cameras=True),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=4)
@@ -112,7 +112,7 @@ rule evaluate_scans:
     benchmark:
         "<benchmarks>/{scene}/{method}/evaluate_scans.tsv"
     wildcard_constraints:
-        scene=plan.known(plan.scenes(cameras=False)),
+        scene=plan.trained(cameras=False),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=4)

@@ -22,6 +22,8 @@ rule extract:
         "<logs>/{scene}/extract.log",
     benchmark:
         "<benchmarks>/{scene}/extract.tsv"
+    wildcard_constraints:
+        scene=plan.known(plan.config.scenes),
     conda:
         "../envs/drivesplat.yaml"
     resources:
@@ -78,6 +80,8 @@ rule refine_poses:
         "<logs>/{scene}/refine_poses.log",
     benchmark:
         "<benchmarks>/{scene}/refine_poses.tsv"
+    wildcard_constraints:
+        scene=plan.known(plan.config.scenes),
     conda:
         "../envs/drivesplat.yaml"
     threads: 4
@@ -265,7 +269,7 @@ rule light:
     benchmark:
         "<benchmarks>/{scene}/light.tsv"
     wildcard_constraints:
-        scene=plan.known(plan.scenes(cameras=True)),
+        scene=plan.trained(cameras=True),
     conda:
         "../envs/drivesplat.yaml"
     threads: 2

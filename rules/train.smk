@@ -25,6 +25,8 @@ rule train:
         "<logs>/{scene}/{method}/train.log",
     benchmark:
         "<benchmarks>/{scene}/{method}/train.tsv"
+    wildcard_constraints:
+        scene=plan.whole,
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=2)

@@ -111,7 +111,8 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     known = known_truth(inputs, job)
     with explain_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
-        groups, objects = measure_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths, known)
+        measured = measure_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths, known)
+        groups = {group: own.metrics for group, own in measured.items()}
         if inputs.scans is not None:
             spread = inputs.checkpoint.job.train.scans.beam_spread_rad
             lidar = lidar_metrics(model, inputs.recording.scene, inputs.scans, spread, device)
@@ -135,7 +136,9 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
             **({"lpips_unavailable": unavailable} if unavailable else {}),
         },
     }
-    return Evaluation(record, {**header, "groups": objects}, sample)
+    objects = {group: own.objects for group, own in measured.items()}
+    frames = {group: own.frames for group, own in measured.items()}
+    return Evaluation(record, {**header, "groups": objects, "frames": frames}, sample)
 
 
 def known_truth(inputs: EvaluationInputs, job: EvaluateJob) -> DriveTruth | None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -44,7 +44,17 @@ def evaluate_groups(
 ) -> dict[str, dict[str, Any]]:
     """The metrics of every held-out group by region. With LiDAR `depths` of images, by index, also `depth`; with
     several cameras also `overlap` and `no_overlap`, the static pixels that other cameras see as well, and the rest."""
-    return measure_groups(model, recording, camera, lpips_map, device, depths)[0]
+    measured = measure_groups(model, recording, camera, lpips_map, device, depths)
+    return {group: own.metrics for group, own in measured.items()}
+
+
+class GroupMeasurement(NamedTuple):
+    """The record of a group of images, the records of its objects (`by_object`), and the errors of every image by
+    region."""
+
+    metrics: dict[str, Any]
+    objects: list[dict[str, Any]]
+    frames: dict[str, list[FrameErrors]]
 
 
 def measure_groups(
@@ -55,16 +65,13 @@ def measure_groups(
     device: torch.device,
     depths: Mapping[int, PixelDepths],
     truth: DriveTruth | None = None,
-) -> tuple[dict[str, dict[str, Any]], dict[str, list[dict[str, Any]]]]:
-    """`evaluate_groups`, and for every group the records of its objects (`by_object`). With the `truth` of a synthetic
-    world that has class images of this camera also its SURFACES."""
+) -> dict[str, GroupMeasurement]:
+    """What `evaluate_groups` gives, with objects and single images. With the `truth` of a synthetic world that has
+    class images of this camera also its SURFACES."""
     classes = truth.class_images(camera) if truth else {}
     of_group = partial(_group_metrics, model, recording, lpips_map, device, depths)
     surfaces = (lambda index, static: truth.surfaces(classes[index], static)) if truth and classes else None
-    measured = {
-        group: of_group(images, surfaces) for group, images in measured_images(recording.record, camera).items()
-    }
-    return {group: own for group, (own, _) in measured.items()}, {group: own for group, (_, own) in measured.items()}
+    return {group: of_group(images, surfaces) for group, images in measured_images(recording.record, camera).items()}
 
 
 def side_camera_metrics(
@@ -76,7 +83,7 @@ def side_camera_metrics(
     left_out = [int(i) for i in record.splits[SIDE_CAMERA] if record.is_key_frame[i]]
     cameras = sorted({record.camera_name(index) for index in left_out})
     images = {camera: [i for i in left_out if record.camera_name(i) == camera] for camera in cameras}
-    return {name: _group_metrics(model, recording, lpips_map, device, {}, own)[0] for name, own in images.items()}
+    return {name: _group_metrics(model, recording, lpips_map, device, {}, own).metrics for name, own in images.items()}
 
 
 def _group_metrics(
@@ -87,8 +94,8 @@ def _group_metrics(
     depths: Mapping[int, PixelDepths],
     images: list[int],
     surfaces: Callable[[int, np.ndarray], dict[str, np.ndarray]] | None = None,
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The metrics of a held-out group of `images`, and of its objects. `surfaces` gives the masks of SURFACES of an
+) -> GroupMeasurement:
+    """The metrics of a held-out group of `images`. `surfaces` gives the masks of SURFACES of an
     image, by its index and its static pixels."""
     record = recording.record
     several_cameras = len(record.camera_names) > 1
@@ -119,7 +126,8 @@ def _group_metrics(
     for frame, of_objects in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(frame)
         objects += of_objects
-    return {**with_gap(metrics.summary()), **depth_summary(depth_errors)}, by_object(objects)
+    whole = {**with_gap(metrics.summary()), **depth_summary(depth_errors)}
+    return GroupMeasurement(whole, by_object(objects), metrics.frames)
 
 
 def held_out_depths(recording: EvaluationData, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:

@@ -113,7 +113,7 @@ class RegionMetrics:
     """
 
     def __init__(self, lpips_map: LpipsMap | None, regions: Iterable[str] = REGIONS):
-        self._lpips_map = lpips_map
+        self._lpips_map, self._with_lpips = lpips_map, lpips_map is not None
         self._frames: dict[str, list[FrameErrors]] = {region: [] for region in regions}
 
     def measure(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> dict[str, FrameErrors]:
@@ -144,6 +144,11 @@ class RegionMetrics:
         for region, frames in self._frames.items():
             frames.append(frame[region])
 
+    @property
+    def frames(self) -> dict[str, list[FrameErrors]]:
+        """The errors of every frame that was added, by region."""
+        return self._frames
+
     def summary(self) -> dict[str, dict[str, Any] | None]:
         """A record per region; None for a region with too few pixels."""
         records: dict[str, dict[str, Any] | None] = {}
@@ -162,10 +167,18 @@ class RegionMetrics:
                 "psnr_frame_mean": float(np.mean(known)) if known else None,
                 "psnr_cc": None if pooled is None else psnr(corrected_error / pixels),
                 "ssim": ssim / pixels,
-                "lpips": lpips / pixels if self._lpips_map else None,
+                "lpips": lpips / pixels if self._with_lpips else None,
                 "pixels": int(pixels),
             }
         return records
+
+    @classmethod
+    def of_frames(cls, frames: Mapping[str, Iterable[Sequence[float]]], with_lpips: bool) -> "RegionMetrics":
+        """Metrics of frames that were measured before, by region; `FrameErrors` or sequences of its fields."""
+        found = cls(None, frames)
+        found._with_lpips = with_lpips
+        found._frames = {region: [FrameErrors(*frame) for frame in own] for region, own in frames.items()}
+        return found
 
 
 def with_gap(regions: dict[str, dict[str, Any] | None]) -> dict[str, Any]:

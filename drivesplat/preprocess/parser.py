@@ -58,7 +58,7 @@ def training_record(scene: Scene, seed: PointCloud | None, job: ParserJob) -> Tr
         points_rgb=seed.colors,
         scene_scale=max(1.0, float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())),
         splits=splits,
-        held_out_frames=held_out_key_frames(len(scene.key_frame_timestamps), job.holdout),
+        held_out_frames=held_out_key_frames(scene, job.holdout),
         scene=SceneInfo(
             name=scene.name,
             dataset=scene.dataset,

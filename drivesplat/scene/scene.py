@@ -100,7 +100,8 @@ class Scene:
     where the poses come from (a reader, 'refined', 'images', UNPOSED); `key_frame_hz` is the nominal rate of key
     frames; `key_frame_range` the dataset's key frames [first, last + 1) that were read, None for all. `cameras` and
     `lidars` are the sensors that frames and sweeps name; `licence` says who may use the recording, where it is known;
-    `sky_class` is the sky in class maps of the dataset.
+    `sky_class` is the sky in class maps of the dataset; `held_out` are the key frames of each group that is not
+    trained on (`drivesplat.scene.splits.Group`), of a block of a longer drive; None: the settings say.
     """
 
     name: str
@@ -121,6 +122,7 @@ class Scene:
     provenance: Provenance = field(default_factory=no_provenance)
     licence: str = ""
     sky_class: int | None = None
+    held_out: dict[str, list[int]] | None = None
 
     @property
     def key_frame_interval(self) -> float:

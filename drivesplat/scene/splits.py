@@ -1,7 +1,7 @@
 """The split of images and LiDAR sweeps: key frames are held out as a whole, and recordings near them excluded."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,9 +14,12 @@ SIDE_CAMERA: Group = "side_camera"
 """The group of images of `holdout.cameras` at times at which other cameras have training images."""
 
 
-def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[int]]:
-    """Held-out indices by group, of `count` key frames."""
-    return holdout.held_out(count)
+def held_out_key_frames(scene: Scene, holdout: HoldoutSettings) -> dict[str, list[int]]:
+    """The held-out key frames of a scene by group: those of the scene itself, where it has some, else of the
+    settings."""
+    if scene.held_out is None:
+        return holdout.held_out(len(scene.key_frame_timestamps))
+    return {group: scene.held_out.get(group, []) for group in HELD_OUT_GROUPS}
 
 
 def frame_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
@@ -51,14 +54,14 @@ def _groups(scene: Scene, records: Sequence[Frame | Sweep], holdout: HoldoutSett
 
     The neighbourhood is half a key-frame interval below NEIGHBOURHOOD_HZ, else `holdout.neighbourhood_s`.
     """
-    held_out = held_out_key_frames(len(scene.key_frame_timestamps), holdout)
+    held_out = held_out_key_frames(scene, holdout) if scene.held_out is None else scene.held_out
     group_of_key_frame = {i: group for group, indices in held_out.items() for i in indices}
     held_out_times = scene.key_frame_timestamps[sorted(group_of_key_frame)]
     dense = scene.key_frame_hz >= NEIGHBOURHOOD_HZ
     neighbourhood = holdout.neighbourhood_s * 1e6 if dense else scene.key_frame_interval / 2.0
     groups: list[Group] = []
     for record in records:
-        held = group_of_key_frame.get(record.sample_index) if record.is_key_frame else None
+        held: Any = group_of_key_frame.get(record.sample_index) if record.is_key_frame else None
         may_be_near = not record.is_key_frame or dense
         if held is None and may_be_near and np.any(np.abs(held_out_times - record.timestamp) < neighbourhood):
             held = "excluded"

@@ -15,6 +15,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
 from drivesplat.settings.ablation import AblationSettings
 from drivesplat.settings.actor_seed import ActorSeedSettings
+from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.dataset import DatasetSettings, default_datasets
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.discover import DiscoverSettings
@@ -256,12 +257,26 @@ class Config(Settings):
 
     def dataset_of(self, scene: str) -> str:
         """The name of a scene's dataset. Raises ConfigError, with the list of scenes, for an unknown scene."""
-        if scene not in self.dataset_names:
+        drive = scene if scene in self.dataset_names else drive_of(scene)
+        if drive not in self.dataset_names or (drive != scene and not self.is_cut(drive)):
             raise ConfigError(
                 f"scene {scene!r} is not in the config; {suggestion(scene, self.scenes)}"
                 f"there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
             )
-        return self.dataset_names[scene]
+        return self.dataset_names[drive]
+
+    def is_cut(self, scene: str) -> bool:
+        """Whether a configured scene is cut into blocks."""
+        return self.datasets[self.dataset_names[scene]].blocks is not None
+
+    def is_scene(self, name: str) -> bool:
+        """Whether this is the name of a configured scene, or that of a block of one."""
+        return name in self.dataset_names or self.is_block(name)
+
+    def is_block(self, name: str) -> bool:
+        """Whether this is the name of a block of a scene that is cut into blocks, which need not exist."""
+        drive = drive_of(name)
+        return name not in self.dataset_names and drive in self.dataset_names and self.is_cut(drive)
 
 
 def in_current_names(values: Mapping[Any, Any]) -> tuple[dict[Any, Any], list[str]]:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.blocks import BlockSettings, drive_of
 from drivesplat.settings.names import require_text
 from drivesplat.settings.world import WorldSettings
 
@@ -45,6 +46,9 @@ class DatasetSettings(Settings):
     """:printed: Edits file, by scene (docs/editing.md)."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """:printed: Settings that differ for this dataset, as a tree: {images: {width: 800}}."""
+    blocks: BlockSettings | None = None
+    """:printed: Cut each drive into blocks along its path, which are trained one by one (docs/long_drives.md):
+    {length_m: 150}. null = a drive is trained as a whole."""
     batch: bool = True
     """:printed: Include its scenes in a bare `snakemake` and in the report."""
     world: WorldSettings | None = None
@@ -74,6 +78,9 @@ class DatasetSettings(Settings):
                 raise ValueError(f"frames names scene {scene!r}, which is not in scenes")
             if not 0 <= first < last:
                 raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
+        for scene in self.scenes if self.blocks else ():
+            if drive_of(scene) in self.scenes and drive_of(scene) != scene:
+                raise ValueError(f"scene {scene!r} has the name of a block of scene {drive_of(scene)!r}; rename it")
         for scene in self.edits:
             if scene not in self.scenes:
                 raise ValueError(f"edits names scene {scene!r}, which is not in scenes")

@@ -130,7 +130,9 @@ class Inputs:
         return f"{self.config.datasets[dataset].world_root}/{TRUTH_FILE}"
 
     def truth(self, wildcards: Any) -> list[str]:
-        """The ground truth of a scene; none for recorded drives."""
+        """The ground truth of a scene; none for recorded drives, and for blocks."""
+        if self.config.is_block(wildcards.scene):
+            return []
         name = self.config.dataset_of(wildcards.scene)
         return [self.truth_file(name)] if name in self.worlds else []
 

@@ -1,6 +1,7 @@
 """The results of the configured scenes, and the settings and code that each should come from."""
 
 import json
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ from drivesplat.workflow.without_cameras import has_cameras, scene_methods
 from drivesplat.workflow.without_tracks import methods_of
 
 SCRIPTS = "workflow_scripts"
+NOTHING = "(?!)"
+"""A wildcard constraint that nothing matches."""
 LOOKS = ("ghost_panel.png", "removal.png")
 LIDAR = "lidar"
 """The name of the picture and of the film of LiDAR scans of a method that renders them."""
@@ -124,7 +127,16 @@ class Outputs(Inputs):
         compared = [scene for scene in self._with_cameras(chosen) if for_scene(self.config, scene).render.compare]
         of_methods = self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], chosen, False)
         of_edits = self.of_methods(lambda *at: [f"{QUAD}/{edit}.mp4" for edit in self._quad_names(*at)], chosen)
-        return [*(f"{self.config.results_dir}/{scene}/{COMPARE_FILM}" for scene in compared), *of_methods, *of_edits]
+        whole = [scene for scene in compared if not self.config.is_cut(scene)]
+        of_drives = [
+            f"{self.config.results_dir}/{scene}/{method}/{film}.mp4"
+            for scene in self._with_cameras(one for one in chosen if self.config.is_cut(one))
+            for method in scene_methods(self.config, scene)
+            for film, trajectory in for_scene(self.config, scene).render.trajectories.items()
+            if trajectory.parts == "all"
+        ]
+        films = [f"{self.config.results_dir}/{scene}/{COMPARE_FILM}" for scene in whole]
+        return [*films, *of_drives, *of_methods, *of_edits]
 
     def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
         """The films of every edit of `scenes`, by default the batch's, by every method that can be edited. Raises
@@ -215,6 +227,7 @@ class Outputs(Inputs):
         places = (
             Path(scene, TRACK_FOLDERS[own])
             for scene in self._with_cameras(self.config.batch_scenes)
+            if not self.config.is_cut(scene)
             for own in dict.fromkeys(method.tracks for method in methods_of(self.config, scene).values())
             if own != "none"
         )
@@ -240,15 +253,37 @@ class Outputs(Inputs):
         self, names: Callable[[str, str], Iterable[str]], scenes: Iterable[str] | None = None, cameras: bool = True
     ) -> list[str]:
         """The files below the folders of all methods of `scenes`, by default the batch's; `names` gives those of one
-        scene and method. With `cameras` without those that have no camera."""
+        scene and method. With `cameras` without those that have no camera. Without drives that are cut into blocks."""
         results, chosen = self.config.results_dir, self.config.batch_scenes if scenes is None else scenes
-        shown = self._with_cameras(chosen) if cameras else chosen
+        shown = [one for one in (self._with_cameras(chosen) if cameras else chosen) if not self.config.is_cut(one)]
         places = ((scene, method) for scene in shown for method in scene_methods(self.config, scene))
         return [f"{results}/{scene}/{method}/{name}" for scene, method in places for name in names(scene, method)]
 
-    def scenes(self, cameras: bool) -> list[str]:
-        """All scenes with `cameras`, or all without."""
-        return [scene for scene in self.config.scenes if has_cameras(self.config, scene) == cameras]
+    def trained(self, cameras: bool | None = None) -> str:
+        """The wildcard constraint of scenes with a model: those that are not cut into blocks, and blocks. With
+        `cameras` those that have some, or those that have none."""
+        scenes = [one for one in self.config.scenes if cameras in (None, has_cameras(self.config, one))]
+        return self._any_of(
+            *(rf"{re.escape(one)}\.\d\d\d+" if self.config.is_cut(one) else re.escape(one) for one in scenes)
+        )
+
+    @property
+    def whole(self) -> str:
+        """The wildcard constraint of scenes that are not cut into blocks."""
+        return self._any_of(*(re.escape(one) for one in self.config.scenes if not self.config.is_cut(one)))
+
+    @property
+    def cut(self) -> str:
+        """The wildcard constraint of drives that are cut into blocks."""
+        return self._any_of(*(re.escape(one) for one in self.config.scenes if self.config.is_cut(one)))
+
+    @property
+    def blocks(self) -> str:
+        """The wildcard constraint of their blocks."""
+        return self._any_of(*(rf"{re.escape(one)}\.\d\d\d+" for one in self.config.scenes if self.config.is_cut(one)))
+
+    def _any_of(self, *patterns: str) -> str:
+        return "|".join(patterns) or NOTHING
 
     def _with_cameras(self, scenes: Iterable[str]) -> list[str]:
         return [scene for scene in scenes if has_cameras(self.config, scene)]

@@ -52,7 +52,8 @@ class Recordings:
     def image_gb(self, scene: str) -> float | None:
         """The size of a scene's training images in memory, in GB, of those at key frames as far as these are trained on
         and, where `sweeps` is set, of the others in proportion; None while the images are unknown."""
-        outline, frames = recorded_outline(self._config, scene), self._frames(scene)
+        is_block = self._config.is_block(scene)
+        outline, frames = None if is_block else recorded_outline(self._config, scene), self._frames(scene)
         settings = for_scene(self._config, scene)
         if outline is None:
             outline, frames = _extracted(Path(self._config.results_dir, scene, "scene.json")), None
@@ -103,7 +104,7 @@ class Recordings:
     def _faults(self, scene: str, rules: set[str]) -> Iterator[str]:
         """What the recording of a scene lacks for the jobs of some rules, a sentence each."""
         outline, settings = recorded_outline(self._config, scene), for_scene(self._config, scene)
-        if outline is None:
+        if outline is None or self._config.is_block(scene):
             return
         frames = self._frames(scene)
         beyond = frames_beyond(scene, len(outline.key_frames), frames)

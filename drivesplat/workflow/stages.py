@@ -14,6 +14,7 @@ from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.asset_references import asset_names, asset_of_results
+from drivesplat.settings.blocks import BlocksJob
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.discover import DiscoverJob
@@ -117,8 +118,10 @@ def _record(stage: str, place: JobScope) -> Settings:
 
 
 def refines_poses(config: Config, scene: str) -> bool:
-    """Whether a scene's poses are refined before all other stages."""
-    return _refines(JobScope(for_scene(config, scene), config.dataset_of(scene), scene, "", ""))
+    """Whether a scene's poses are refined before all other stages. A block has those of its drive."""
+    return not config.is_block(scene) and _refines(
+        JobScope(for_scene(config, scene), config.dataset_of(scene), scene, "", "")
+    )
 
 
 def _refines(at: JobScope) -> bool:
@@ -131,9 +134,11 @@ def _refines(at: JobScope) -> bool:
 def stages_of_metrics(config: Config, scene: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The stages of a scene, and those of each of its methods, behind its metrics.json."""
     refinement = ("refine_poses",) if refines_poses(config, scene) else ()
+    cut = not config.is_block(scene) and config.is_cut(scene)
+    of_blocks, of_their_methods = (("block",), ("join_block", "evaluate_blocks")) if cut else ((), ())
     if not has_cameras(config, scene):
-        return (*LIDAR_SCENE_STAGES, *refinement), LIDAR_METHOD_STAGES
-    return (*SCENE_STAGES, *refinement), METHOD_STAGES
+        return (*LIDAR_SCENE_STAGES, *refinement, *of_blocks), (*LIDAR_METHOD_STAGES, *of_their_methods)
+    return (*SCENE_STAGES, *refinement, *of_blocks), (*METHOD_STAGES, *of_their_methods)
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
@@ -342,6 +347,8 @@ def _encoding(at: JobScope) -> dict[str, Any]:
 _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] = {
     "demo_world": (WorldJob, _world),
     "extract": (SceneSource, _scene_source),
+    **dict.fromkeys(("blocks", "block", "evaluate_blocks"), (BlocksJob, lambda at: {"blocks": at.dataset.blocks})),
+    "join_block": (Settings, _nothing),
     "own_car": (EgoMaskJob, _ego_mask),
     "refine_poses": (RefinePosesJob, _lidar_rays),
     "lidar_seed": (SeedJob, _nothing),

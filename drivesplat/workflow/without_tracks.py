@@ -9,6 +9,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.readers.by_name import dataset_module, has_module
 from drivesplat.readers.datasets import layout
 from drivesplat.readers.outline import Outline
+from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.method import MethodSettings
 from drivesplat.settings.without_boxes import DISCOVERED, HOW, REPLACED, reason, substitute
@@ -20,7 +21,9 @@ MAX_NAMED = 4
 
 
 def recorded_outline(config: Config, scene: str) -> Outline | None:
-    """The outline of a scene's recording; None where its reader gives none, or the recording is absent."""
+    """The outline of a scene's recording, of a block that of its drive; None where its reader gives none, or the
+    recording is absent."""
+    scene = drive_of(scene) if config.is_block(scene) else scene
     if scene not in config.outlines:
         module = layout(_reader(config, scene))
         config.outlines[scene] = _answer(config, scene, getattr(module, "outline", None))
@@ -28,7 +31,9 @@ def recorded_outline(config: Config, scene: str) -> Outline | None:
 
 
 def lacks_tracks(config: Config, scene: str) -> bool:
-    """Whether a scene's recording has no annotated track, as far as its reader tells before it is read."""
+    """Whether a scene's recording, of a block that of its drive, has no annotated track, as far as its reader tells
+    before it is read."""
+    scene = drive_of(scene) if config.is_block(scene) else scene
     if scene not in config.untracked:
         reader = _reader(config, scene)
         ask = dataset_module(ANNOTATED, reader).has_tracks if has_module(ANNOTATED, reader) else None

@@ -45,7 +45,7 @@ def test_a_batch_measures_it_by_the_methods_that_render_lidar_and_shows_its_scan
     scans = {"there/a2/with_lidar/lidar.png", "there/a2/with_lidar/lidar.mp4"}
     assert of_alone == {*scans, "there/a2/index.html"}, "the page of its films"
     assert "there/a1/vanilla/ghost_panel.png" in shown and "there/a1/street/original.mp4" in shown
-    assert made.scenes(cameras=True) == ["a1"] and made.scenes(cameras=False) == ["a2"]
+    assert made.trained(cameras=True) == "a1" and made.trained(cameras=False) == "a2"
 
 
 def test_its_training_takes_no_result_of_images_and_fits_scans_alone():

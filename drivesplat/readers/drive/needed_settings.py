@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 
 from drivesplat.scene.scene import UNPOSED, Scene
-from drivesplat.scene.splits import held_out_key_frames, training_images
+from drivesplat.scene.splits import training_images
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.names import require_name
 
@@ -51,7 +51,7 @@ def needed_settings(scene: Scene, folder: Path) -> str:
             holdout = HoldoutSettings(**changes)
             chosen = (scene.frames[i] for i in training_images(scene, holdout))
             trained = {frame.sample_index for frame in chosen if frame.camera == settings["eval_camera"]}
-            held_out = np.concatenate(list(held_out_key_frames(len(scene.key_frame_timestamps), holdout).values()))
+            held_out = np.concatenate(list(holdout.held_out(len(scene.key_frame_timestamps)).values()))
             if len(trained) >= MIN_TRAINING and len(held_out):
                 break
         else:

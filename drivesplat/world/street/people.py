@@ -5,7 +5,6 @@ from itertools import count
 
 import numpy as np
 
-from drivesplat.scene.splits import held_out_key_frames
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.world import WalkwayPlace, WorldSettings
 from drivesplat.world.layout import CYCLE_LANE, ROADSIDE, SIDEWALK_PATH, WALL_SIDE
@@ -104,7 +103,7 @@ def people(
 def encounters(world: WorldSettings, number: int) -> list[Encounter]:
     """When each of so many people is met: one half at frames that the default protocol holds out between training
     frames, the other at frames of its last block."""
-    groups = held_out_key_frames(world.key_frames, HoldoutSettings())
+    groups = HoldoutSettings().held_out(world.key_frames)
     between, last = groups["interpolation"], groups["extrapolation"]
     half = -(-number // 2) if between else 0
     shares = ((between, half), (last, number - half))

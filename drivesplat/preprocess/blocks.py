@@ -1,0 +1,250 @@
+"""The stages `blocks` and `block`: cuts a long drive into blocks along its path, and makes the scene of each."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float64, Int, Int64
+from scipy.spatial import cKDTree
+
+from drivesplat.errors import DatasetError
+from drivesplat.io.storage import canonical_json
+from drivesplat.io.typed_record import field_values
+from drivesplat.scene.blocks import Block, Blocks, within
+from drivesplat.scene.scene import Frame, Scene, Sweep, Track
+from drivesplat.settings.blocks import BlockSettings, BlocksJob
+from drivesplat.settings.images import HoldoutSettings
+
+STEP = 1.0
+"""Metres between the places of a path: smaller movements of a vehicle that stands count for nothing."""
+MAX_SPEED, SLACK = 70.0, 5.0
+"""A vehicle that moves by more than MAX_SPEED (m/s) and SLACK (m) between recordings has jumped."""
+
+
+def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
+    """The blocks of a drive. A part of the path is new, or one that the vehicle has driven before; new ones are cut by
+    length, and the recordings of others belong to the blocks that they pass again. Where the vehicle jumps, as on a
+    ferry, a block ends.
+
+    Earlier blocks do not depend on how the drive goes on, unless it comes back to them.
+
+    Raises DatasetError for a drive without poses.
+    """
+    times, places = _ego_places(scene)
+    anchors = _anchors(times, places)
+    owners = _owners(places[anchors], _jumps(times, places)[anchors], job.blocks)
+    runs = [0, *(np.flatnonzero(np.diff(owners)) + 1).tolist(), len(owners)]
+    first, last = _span(scene)
+    starts = times[anchors]
+    starts[0] = first
+    blocks = []
+    for number in range(owners.max() + 1):
+        own = [(a, b) for a, b in pairwise(runs) if owners[a] == number]
+        core = np.array([[starts[a], starts[b] if b < len(starts) else last + 1] for a, b in own])
+        used = _extended(own, times, places, anchors, job.blocks.overlap_m, core)
+        blocks.append(Block(core, used, places[anchors[owners == number]]))
+    whole = Blocks(scene.name, tuple(blocks))
+    return replace(whole, blocks=tuple(replace(own, digest=_digest(scene, own, job)) for own in whole.blocks))
+
+
+def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSettings) -> Scene:
+    """The scene of a block: its recordings, with key frames counted from 0 and the world's origin on its path. Held-out
+    key frames are those of the whole drive; those of blocks beside it are excluded.
+
+    Raises DatasetError where the block has no key frame.
+    """
+    block = blocks.blocks[number]
+    kept = np.flatnonzero(within(scene.key_frame_timestamps, block.used))
+    if len(kept) == 0:
+        raise DatasetError(f"scene {blocks.names[number]}: the block has no key frame; make blocks longer (length_m)")
+    own = np.flatnonzero(within(scene.key_frame_timestamps, block.core))
+    held_out: dict[str, list[int]] = {"excluded": []}
+    for group, indices in holdout.held_out(len(scene.key_frame_timestamps)).items():
+        held_out[group] = np.searchsorted(kept, np.intersect1d(indices, own)).tolist()
+        others = np.setdiff1d(np.intersect1d(indices, kept), own)
+        held_out["excluded"] += np.searchsorted(kept, others).tolist()
+    frames = tuple(_renumbered(frame, kept) for frame in _used(scene.frames, block))
+    sweeps = tuple(_renumbered(sweep, kept) for sweep in _used(scene.sweeps, block))
+    cameras, lidars = {frame.camera for frame in frames}, {sweep.lidar for sweep in sweeps}
+    return _moved(
+        replace(
+            scene,
+            name=blocks.names[number],
+            description=f"block {number} of {len(blocks.blocks)} of {scene.name}",
+            key_frame_timestamps=scene.key_frame_timestamps[kept],
+            frames=frames,
+            sweeps=sweeps,
+            tracks=tuple(_tracks(scene, block, kept)),
+            cameras=tuple(camera for camera in scene.cameras if camera.name in cameras),
+            lidars=tuple(lidar for lidar in scene.lidars if lidar.name in lidars),
+            key_frame_range=[int(kept[0]), int(kept[-1]) + 1] if len(kept) == kept[-1] - kept[0] + 1 else None,
+            held_out=held_out,
+        ),
+        block.origin,
+    )
+
+
+def _ego_places(scene: Scene) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 2"]]:
+    """The timestamps of images (of sweeps, without images), in order, and the places of the vehicle."""
+    if scene.frames:
+        found = {frame.timestamp: frame.ego_to_world[:2, 3] for frame in scene.frames}
+    else:
+        found = {sweep.timestamp: sweep.sensor_to_world[:2, 3] for sweep in scene.sweeps}
+    times = np.array(sorted(found), dtype=np.int64)
+    places = np.stack([found[time] for time in times.tolist()])
+    if len(places) < 2 or not np.ptp(places, axis=0).any():
+        raise DatasetError(f"scene {scene.name}: blocks follow the path of the vehicle, and it has none (poses)")
+    return times, places
+
+
+def _jumps(times: np.ndarray, places: np.ndarray) -> Int[np.ndarray, " n"]:
+    """How often the vehicle has jumped up to each place."""
+    moved, passed = np.linalg.norm(np.diff(places, axis=0), axis=1), np.diff(times) * 1e-6
+    return np.append(0, np.cumsum(moved > SLACK + MAX_SPEED * passed))
+
+
+def _anchors(times: np.ndarray, places: np.ndarray) -> Int[np.ndarray, " a"]:
+    """The first place, and each that lies STEP or more from the one before it."""
+    found = [0]
+    for i, place in enumerate(places):
+        if np.linalg.norm(place - places[found[-1]]) >= STEP:
+            found.append(i)
+    return np.array(found)
+
+
+def _arcs(places: np.ndarray) -> Float64[np.ndarray, " n"]:
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+
+
+def _owners(places: np.ndarray, jumps: np.ndarray, settings: BlockSettings) -> Int[np.ndarray, " a"]:
+    """The number of the block of every anchor."""
+    arcs = _arcs(places)
+    before = _driven_before(places, arcs, settings)
+    owners, count = np.full(len(places), -1), 0
+    limits = np.flatnonzero((np.diff(before >= 0)) | (np.diff(jumps) > 0)) + 1
+    for a, b in pairwise([0, *limits.tolist(), len(places)]):
+        if before[a] >= 0:
+            owners[a:b] = owners[before[a:b]]
+            continue
+        length = arcs[b - 1] - arcs[a]
+        number = max(1, int(length / settings.length_m + 0.5))
+        owners[a:b] = count + np.minimum((arcs[a:b] - arcs[a]) / settings.length_m, number - 1).astype(int)
+        count += number
+    return owners
+
+
+def _driven_before(places: np.ndarray, arcs: np.ndarray, settings: BlockSettings) -> Int[np.ndarray, " a"]:
+    """For anchors in a street that was driven before, the earliest anchor there; -1 for others. Passages shorter than
+    the overlap count for nothing."""
+    apart = 4.0 * settings.same_place_m
+    near = cKDTree(places).query_ball_point(places, settings.same_place_m)
+    found = np.full(len(places), -1)
+    for i, others in enumerate(near):
+        earlier = [j for j in others if arcs[i] - arcs[j] > apart]
+        found[i] = min(earlier, default=-1)
+    for again in (True, False):  # gaps between passages first, then short passages
+        limits = [0, *(np.flatnonzero(np.diff(found >= 0)) + 1).tolist(), len(found)]
+        for a, b in pairwise(limits):
+            short = arcs[b - 1] - arcs[a] < max(settings.overlap_m, apart)
+            if (found[a] < 0) == again and short and a > 0 and (b < len(found) or not again):
+                found[a:b] = found[a - 1] if again else -1
+    for i in np.flatnonzero(found >= 0):  # the first time of what was itself driven again
+        if found[found[i]] >= 0:
+            found[i] = found[found[i]]
+    return found
+
+
+def _extended(
+    runs: list[tuple[int, int]],
+    times: np.ndarray,
+    places: np.ndarray,
+    anchors: np.ndarray,
+    overlap: float,
+    core: np.ndarray,
+) -> Int64[np.ndarray, "u 2"]:
+    """The intervals of runs of anchors, and of the overlap before and after each, up to a jump."""
+    arcs, jumps, starts = _arcs(places[anchors]), _jumps(times, places)[anchors], times[anchors]
+    found: list[list[int]] = []
+    for (a, b), (first, end) in zip(runs, core.tolist(), strict=True):
+        before = np.flatnonzero((arcs[:a] > arcs[a] - overlap) & (jumps[:a] == jumps[a]))
+        after = np.flatnonzero((arcs[b:] >= arcs[b - 1] + overlap) | (jumps[b:] != jumps[b - 1]))
+        first = int(starts[before[0]]) if len(before) else first
+        last = b + int(after[0]) if len(after) else len(starts)
+        end = int(starts[last]) if last < len(starts) else int(max(end, times[-1] + 1))
+        if found and first <= found[-1][1]:
+            found[-1][1] = max(end, found[-1][1])
+        else:
+            found.append([first, end])
+    return np.array(found, dtype=np.int64)
+
+
+def _span(scene: Scene) -> tuple[int, int]:
+    """The first and the last timestamp of a drive."""
+    every = [recording.timestamp for recording in (*scene.frames, *scene.sweeps)]
+    every += scene.key_frame_timestamps.tolist()
+    return min(every), max(every)
+
+
+def _used(recordings: tuple, block: Block) -> Iterator:
+    stamps = np.array([recording.timestamp for recording in recordings], dtype=np.int64)
+    return (recordings[i] for i in np.flatnonzero(within(stamps, block.used)))
+
+
+def _renumbered(recording: Frame | Sweep, kept: np.ndarray) -> Frame | Sweep:
+    """A recording whose key frame is counted among those that are kept; the nearest one where its own is not."""
+    nearest = int(np.argmin(np.abs(kept - recording.sample_index)))
+    is_key_frame = recording.is_key_frame and kept[nearest] == recording.sample_index
+    return replace(recording, sample_index=nearest, is_key_frame=bool(is_key_frame))
+
+
+def _tracks(scene: Scene, block: Block, kept: np.ndarray) -> Iterator[Track]:
+    """The tracks of a block's recordings."""
+    for track in scene.tracks:
+        own = within(track.timestamps, block.used) & np.isin(track.sample_indices, kept)
+        if own.any():
+            yield replace(
+                track,
+                timestamps=track.timestamps[own],
+                sample_indices=np.searchsorted(kept, track.sample_indices[own]),
+                object_to_world=track.object_to_world[own],
+                visibility=track.visibility[own],
+            )
+
+
+def _moved(scene: Scene, origin: np.ndarray) -> Scene:
+    """A scene whose world has its origin at a place (3,) of this one."""
+
+    def moved(poses: np.ndarray) -> np.ndarray:
+        found = poses.copy()
+        found[..., :3, 3] -= origin
+        return found
+
+    return replace(
+        scene,
+        origin=scene.origin + origin,
+        frames=tuple(
+            replace(own, camera_to_world=moved(own.camera_to_world), ego_to_world=moved(own.ego_to_world))
+            for own in scene.frames
+        ),
+        sweeps=tuple(replace(own, sensor_to_world=moved(own.sensor_to_world)) for own in scene.sweeps),
+        tracks=tuple(replace(own, object_to_world=moved(own.object_to_world)) for own in scene.tracks),
+    )
+
+
+def _digest(scene: Scene, block: Block, job: BlocksJob) -> str:
+    """That of all that a block's scene depends on: of the recordings, the tracks and the held-out key frames."""
+    held_out = job.holdout.held_out(len(scene.key_frame_timestamps))
+    stamps = {group: scene.key_frame_timestamps[indices] for group, indices in held_out.items()}
+    own = {group: times[within(times, block.used)].tolist() for group, times in stamps.items()}
+    digest = hashlib.blake2b(canonical_json(own).encode(), digest_size=16)
+    kept = np.flatnonzero(within(scene.key_frame_timestamps, block.used))
+    for record in (*_used(scene.frames, block), *_used(scene.sweeps, block), *_tracks(scene, block, kept)):
+        digest.update(json.dumps(field_values(record), default=_plain).encode())
+    return digest.hexdigest()
+
+
+def _plain(value: object) -> object:
+    return value.tolist() if isinstance(value, np.ndarray) else field_values(value)

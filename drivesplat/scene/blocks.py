@@ -1,0 +1,97 @@
+"""Blocks of a long drive: stretches of its path, each of which is a scene of its own."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int, Int64
+from scipy.spatial import cKDTree
+
+from drivesplat.io.json_record import read_typed_json, write_typed_json
+from drivesplat.io.storage import Provenance, no_provenance
+from drivesplat.settings.blocks import block_scene_name
+
+SCHEMA = 1
+RULE = "blocks"
+BLOCKS = "blocks.json"
+
+
+@dataclass(frozen=True)
+class Block:
+    """A stretch of a drive's path. The vehicle is in it during the `core` intervals [first, end) of microseconds; its
+    scene has the recordings of the `used` intervals, which reach into the blocks before and after. `path` (n, 2) are
+    places of the vehicle about a metre apart, in metres of the drive's world, and `digest` is that of its recordings.
+    """
+
+    core: Int64[np.ndarray, "c 2"]
+    used: Int64[np.ndarray, "u 2"]
+    path: Float64[np.ndarray, "n 2"]
+    digest: str = ""
+
+    @property
+    def origin(self) -> Float64[np.ndarray, "3"]:
+        """The origin of its scene's world, in metres of the drive's world."""
+        return np.append(self.path[0], 0.0)
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """All blocks of the drive `scene`, by number. Their cores divide its time. Block i is the scene `names[i]`."""
+
+    scene: str
+    blocks: tuple[Block, ...]
+    provenance: Provenance = field(default_factory=no_provenance)
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the blocks' scenes."""
+        return [block_scene_name(self.scene, number) for number in range(len(self.blocks))]
+
+    def at(self, timestamp: int) -> int:
+        """The number of the block in which the vehicle is at a timestamp (microseconds); for one outside of the drive
+        the first or the last interval's."""
+        firsts = [(int(first), number) for number, block in enumerate(self.blocks) for first in block.core[:, 0]]
+        before = [pair for pair in firsts if pair[0] <= timestamp]
+        return max(before)[1] if before else min(firsts)[1]
+
+    def nearest(self, places: Float64[np.ndarray, "n 2"], numbers: Sequence[int]) -> Int[np.ndarray, " n"]:
+        """The one of some blocks, by number, whose path is nearest to each place in the drive's world (metres)."""
+        paths = [self.blocks[number].path for number in numbers]
+        owners = np.repeat(numbers, [len(path) for path in paths])
+        return owners[cKDTree(np.concatenate(paths)).query(places)[1]]
+
+    def beside(self, number: int) -> list[int]:
+        """The numbers of the other blocks whose recordings a block uses some of, or that use some of its own."""
+        own = self.blocks[number]
+        return [
+            other
+            for other, block in enumerate(self.blocks)
+            if other != number and (_meet(own.used, block.core) or _meet(block.used, own.core))
+        ]
+
+
+def within(timestamps: Int64[np.ndarray, " n"], intervals: Int64[np.ndarray, "i 2"]) -> Bool[np.ndarray, " n"]:
+    """Whether timestamps lie in any of some intervals [first, end)."""
+    at = np.asarray(timestamps)[:, None]
+    return ((at >= intervals[:, 0]) & (at < intervals[:, 1])).any(axis=1)
+
+
+def _meet(some: np.ndarray, others: np.ndarray) -> bool:
+    firsts, ends = np.maximum.outer(some[:, 0], others[:, 0]), np.minimum.outer(some[:, 1], others[:, 1])
+    return bool((firsts < ends).any())
+
+
+def write_blocks(path: str | Path, blocks: Blocks) -> None:
+    """Writes blocks.json."""
+    write_typed_json(path, blocks, SCHEMA)
+
+
+def read_blocks(path: str | Path) -> Blocks:
+    """Reads blocks.json. Raises ResultError that names the file and its rule if it is invalid.
+
+    >>> blocks = read_blocks("results/commute/blocks.json")
+    >>> blocks.names, blocks.at(1_532_402_927_647_951)
+    (['commute.000', 'commute.001', 'commute.002'], 1)
+    """
+    return read_typed_json(path, RULE, Blocks, SCHEMA, "a record of blocks")

@@ -1,0 +1,168 @@
+# Long drives: cut into blocks along the path, each of which is a scene that the other rules train and measure; and the
+# results of the drive, made from those of its blocks.
+#
+# REQUIRED INPUTS: <results>/{scene}/scene.json of a drive of a dataset with `blocks`.
+# OUTPUTS: <results>/{scene}/blocks.json; of every block <results>/{scene}.{number}/scene.json and
+# {method}/own/checkpoint.npz; {method}/checkpoint.npz, which joins it with the blocks beside it; of the drive
+# {method}/eval.json, eval_objects.json and films.
+
+long_drives = LongDrives(plan, lambda drive: checkpoints.blocks.get(scene=drive).output.blocks)
+
+
+checkpoint blocks:
+    """
+    Cuts a drive into blocks along its path: places that the vehicle passes again belong to the block of the first time.
+    """
+    input:
+        scene=plan.annotated_scene,
+    output:
+        blocks="<results>/{scene}/blocks.json",
+    log:
+        "<logs>/{scene}/blocks.log",
+    benchmark:
+        "<benchmarks>/{scene}/blocks.tsv"
+    wildcard_constraints:
+        scene=plan.cut,
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        settings=plan.settings("blocks"),
+        code=plan.code("blocks"),
+    script:
+        "../workflow_scripts/blocks.py"
+
+
+rule block:
+    """
+    Makes the scene of a block from that of its drive. A block whose recordings have not changed is not made again.
+    """
+    input:
+        ancient(long_drives.of_block),
+    output:
+        scene="<results>/{scene}/scene.json",
+    log:
+        "<logs>/{scene}/block.log",
+    benchmark:
+        "<benchmarks>/{scene}/block.tsv"
+    wildcard_constraints:
+        scene=plan.blocks,
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        settings=plan.settings("block"),
+        recordings=long_drives.digest,
+        code=plan.code("block"),
+    script:
+        "../workflow_scripts/block.py"
+
+
+use rule train as train_block with:
+    output:
+        checkpoint="<results>/{scene}/{method}/own/checkpoint.npz",
+        summary="<results>/{scene}/{method}/own/train.json",
+    wildcard_constraints:
+        scene=plan.blocks,
+
+
+rule join_block:
+    """
+    Joins the static Gaussians of a block with those of the blocks beside it: every place has those of one block.
+    """
+    input:
+        blocks=ancient(long_drives.of_block),
+        checkpoints=long_drives.own_checkpoints,
+        summary="<results>/{scene}/{method}/own/train.json",
+    output:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        summary="<results>/{scene}/{method}/train.json",
+    log:
+        "<logs>/{scene}/{method}/join_block.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/join_block.tsv"
+    wildcard_constraints:
+        scene=plan.blocks,
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=8000,
+        runtime=30,
+    params:
+        settings=plan.settings("join_block"),
+        paths=long_drives.joined_digest,
+        code=plan.code("join_block"),
+    script:
+        "../workflow_scripts/join_block.py"
+
+
+rule evaluate_blocks:
+    """
+    Combines the measurements of all blocks of a drive: the pixels of all held-out images count alike.
+    """
+    input:
+        scene=plan.annotated_scene,
+        evals=long_drives.results("{method}/eval.json"),
+        objects=long_drives.results("{method}/eval_objects.json"),
+    output:
+        metrics="<results>/{scene}/{method}/eval.json",
+        objects="<results>/{scene}/{method}/eval_objects.json",
+    log:
+        "<logs>/{scene}/{method}/evaluate_blocks.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/evaluate_blocks.tsv"
+    wildcard_constraints:
+        scene=plan.cut,
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        settings=plan.settings("evaluate_blocks"),
+        code=plan.code("evaluate_blocks"),
+    script:
+        "../workflow_scripts/evaluate_blocks.py"
+
+
+rule film_blocks:
+    """
+    Renders a film of a drive, block after block.
+    """
+    input:
+        scene=plan.annotated_scene,
+        blocks="<results>/{scene}/blocks.json",
+        scenes=long_drives.results("scene.json"),
+        checkpoints=long_drives.results("{method}/checkpoint.npz"),
+    output:
+        film=report(
+            "<results>/{scene}/{method}/{trajectory}.mp4",
+            caption="../report/film.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "film: {trajectory}"},
+        ),
+        cameras="<results>/{scene}/{method}/{trajectory}.cameras.json",
+    log:
+        "<logs>/{scene}/{method}/film_{trajectory}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/film_{trajectory}.tsv"
+    wildcard_constraints:
+        scene=plan.cut,
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=240,
+    params:
+        settings=plan.settings("film"),
+        code=plan.code("film_blocks"),
+    script:
+        "../workflow_scripts/film_blocks.py"
