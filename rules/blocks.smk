@@ -2,9 +2,8 @@
 # results of the drive, made from those of its blocks.
 #
 # REQUIRED INPUTS: <results>/{scene}/scene.json of a drive of a dataset with `blocks`.
-# OUTPUTS: <results>/{scene}/blocks.json; of every block <results>/{scene}.{number}/scene.json and
-# {method}/own/checkpoint.npz; {method}/checkpoint.npz, which joins it with the blocks beside it; of the drive
-# {method}/eval.json, eval_objects.json and films.
+# OUTPUTS: <results>/{scene}/blocks.json; of every block <results>/{scene}.{number}/scene.json, from which the rules of
+# scenes go on; of the drive {method}/eval.json, eval_objects.json and films.
 
 long_drives = LongDrives(plan, lambda drive: checkpoints.blocks.get(scene=drive).output.blocks)
 
@@ -40,7 +39,7 @@ rule block:
     Makes the scene of a block from that of its drive. A block whose recordings have not changed is not made again.
     """
     input:
-        ancient(long_drives.of_block),
+        ancient(long_drives.inputs_of_block),
     output:
         scene="<results>/{scene}/scene.json",
     log:
@@ -60,44 +59,6 @@ rule block:
         code=plan.code("block"),
     script:
         "../workflow_scripts/block.py"
-
-
-use rule train as train_block with:
-    output:
-        checkpoint="<results>/{scene}/{method}/own/checkpoint.npz",
-        summary="<results>/{scene}/{method}/own/train.json",
-    wildcard_constraints:
-        scene=plan.blocks,
-
-
-rule join_block:
-    """
-    Joins the static Gaussians of a block with those of the blocks beside it: every place has those of one block.
-    """
-    input:
-        blocks=ancient(long_drives.of_block),
-        checkpoints=long_drives.own_checkpoints,
-        summary="<results>/{scene}/{method}/own/train.json",
-    output:
-        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
-        summary="<results>/{scene}/{method}/train.json",
-    log:
-        "<logs>/{scene}/{method}/join_block.log",
-    benchmark:
-        "<benchmarks>/{scene}/{method}/join_block.tsv"
-    wildcard_constraints:
-        scene=plan.blocks,
-    conda:
-        "../envs/drivesplat.yaml"
-    resources:
-        mem_mb=8000,
-        runtime=30,
-    params:
-        settings=plan.settings("join_block"),
-        paths=long_drives.joined_digest,
-        code=plan.code("join_block"),
-    script:
-        "../workflow_scripts/join_block.py"
 
 
 rule evaluate_blocks:
@@ -131,7 +92,7 @@ rule evaluate_blocks:
 
 rule film_blocks:
     """
-    Renders a film of a drive, block after block.
+    Renders a film of a drive, block after block. Near a border the images of both blocks are blended.
     """
     input:
         scene=plan.annotated_scene,

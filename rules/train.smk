@@ -26,7 +26,7 @@ rule train:
     benchmark:
         "<benchmarks>/{scene}/{method}/train.tsv"
     wildcard_constraints:
-        scene=plan.whole,
+        scene=plan.trained(),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=2)

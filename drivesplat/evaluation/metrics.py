@@ -136,7 +136,7 @@ class RegionMetrics:
         for region in self._frames:
             mask = masks[region]
             sums = [float(values[mask].sum(dtype=np.float64)) for values in maps]
-            found[region] = FrameErrors(np.count_nonzero(mask), *sums)
+            found[region] = FrameErrors(int(np.count_nonzero(mask)), *sums)
         return found
 
     def add(self, frame: Mapping[str, FrameErrors]) -> None:

@@ -1,11 +1,12 @@
 """The stage `film_blocks`: the film of a long drive, of which one block at a time is in memory."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -14,13 +15,74 @@ from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import open_model, read_checkpoint
 from drivesplat.rendering.captions import drive_captions
 from drivesplat.rendering.film import Shot, encode_film, shot_of
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
-from drivesplat.scene.blocks import Blocks
+from drivesplat.scene.blocks import Blocks, within
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob
-from drivesplat.trajectories.camera_path import film_path
+from drivesplat.trajectories.camera_path import CameraPath, film_path
+
+BLEND_M = 5.0
+"""Metres of path before and after a border between blocks in which images of both are blended."""
+
+
+@dataclass(frozen=True)
+class BlockShare:
+    """What the block of a frame contributes to it: all, or `weight` beside what the block `other` contributes."""
+
+    number: int
+    other: int | None = None
+    weight: float = 1.0
+
+
+def block_shares(blocks: Blocks, path: CameraPath) -> list[BlockShare]:
+    """The blocks of each frame of a path: from BLEND_M before a border to BLEND_M behind it, one block fades into the
+    other, as far as both have recordings there."""
+    places, stamps = path.camera_to_world[:, :3, 3], path.timestamps
+    arcs = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    numbers = [blocks.at(int(timestamp)) for timestamp in stamps]
+    shares = [BlockShare(number) for number in numbers]
+    for after in (np.flatnonzero(np.diff(numbers)) + 1).tolist():
+        border = 0.5 * (arcs[after - 1] + arcs[after])
+        for i in np.flatnonzero(np.abs(arcs - border) < BLEND_M).tolist():
+            own, other = (after - 1, after) if i < after else (after, after - 1)
+            known = within(stamps[i : i + 1], blocks.blocks[numbers[other]].used)[0]
+            if numbers[i] == numbers[own] and known:
+                weight = 0.5 + 0.5 * abs(arcs[i] - border) / BLEND_M
+                shares[i] = BlockShare(numbers[i], numbers[other], float(weight))
+    return shares
+
+
+class _OpenBlocks:
+    """The models of a drive's blocks, of which the last two that were used are in memory."""
+
+    def __init__(self, scenes: Sequence[str], checkpoints: Sequence[str], device_settings: DeviceSettings):
+        self._scenes, self._checkpoints, self._device_settings = scenes, checkpoints, device_settings
+        self._open: dict[int, tuple[FixedModel, Scene, torch.device]] = {}
+        self.provenances: dict[int, Provenance] = {}
+
+    def __len__(self) -> int:
+        return sum(len(fixed.model) for fixed, *_ in self._open.values())
+
+    def frames(self, shot: Shot, number: int, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        """Some frames of a shot, as a block shows them."""
+        fixed, scene, device = self._block(number)
+        within = _in_block(shot, slice(indices[0], indices[-1] + 1), scene)
+        fixed.model.precompute(within.seconds)
+        return film_frames(fixed, ((view, None) for view in within.views(device)))
+
+    def _block(self, number: int) -> tuple[FixedModel, Scene, torch.device]:
+        if number not in self._open:
+            while len(self._open) > 1:
+                self._open.pop(next(iter(self._open)))
+            checkpoint = read_checkpoint(self._checkpoints[number])
+            self.provenances[number] = checkpoint.provenance
+            model, device = open_model(checkpoint, self._device_settings)
+            self._open[number] = FixedModel(model), read_scene(self._scenes[number]), device
+        self._open[number] = self._open.pop(number)
+        return self._open[number]
 
 
 def render_block_film(
@@ -37,30 +99,28 @@ def render_block_film(
     shot = shot_of(scene, film_path(scene, job.camera, job.fps, job.trajectory), job)
     panels = Panels((f"{path.parent.name}: {job.trajectory.in_words}",), shot.size)
     captions = drive_captions(panels.labels, shot.seconds, shot.trained_until)
-    largest, upstream = [0], []
-
-    def pictures() -> Iterator[np.ndarray]:
-        numbers = [blocks.at(int(timestamp)) for timestamp in shot.cameras.timestamps]
-        for number, frames in groupby(range(len(numbers)), numbers.__getitem__):
-            indices = list(frames)
-            checkpoint = read_checkpoint(checkpoints[number])
-            upstream.append(checkpoint.provenance)
-            model, device = open_model(checkpoint, device_settings)
-            largest[0] = len(model)
-            within = _part_of(shot, slice(indices[0], indices[-1] + 1), read_scene(scenes[number]))
-            model.precompute(within.seconds)
-            yield from film_frames(model, ((view, None) for view in within.views(device)))
-            del model
-            if device.type == "cuda":
-                torch.cuda.empty_cache()
-
-    with explain_out_of_memory(lambda: largest[0]):
-        figures = encode_film(path, zip(pictures(), captions, strict=True), len(captions), panels, shot.format)
+    opened = _OpenBlocks(scenes, checkpoints, device_settings)
+    with explain_out_of_memory(lambda: len(opened)):
+        frames = zip(_pictures(shot, blocks, opened), captions, strict=True)
+        figures = encode_film(path, frames, len(captions), panels, shot.format)
     offset = job.trajectory.model_dump(exclude={"parts"})
-    return {**shot.record(), "offset": offset, "parts": "all", **figures}, upstream
+    record = {**shot.record(), "offset": offset, "parts": "all", **figures}
+    return record, list(opened.provenances.values())
 
 
-def _part_of(shot: Shot, frames: slice, block: Scene) -> Shot:
+def _pictures(shot: Shot, blocks: Blocks, opened: _OpenBlocks) -> Iterator[np.ndarray]:
+    shares = block_shares(blocks, shot.cameras)
+    for (number, other), run in groupby(range(len(shares)), lambda i: (shares[i].number, shares[i].other)):
+        indices = list(run)
+        own = opened.frames(shot, number, indices)
+        if other is None:
+            yield from own
+            continue
+        for i, one, two in zip(indices, own, opened.frames(shot, other, indices), strict=True):
+            yield cv2.addWeighted(one, shares[i].weight, two, 1.0 - shares[i].weight, 0.0)
+
+
+def _in_block(shot: Shot, frames: slice, block: Scene) -> Shot:
     """Some frames of a shot, in the world of a block's scene."""
     cameras = shot.cameras[frames]
     poses = cameras.camera_to_world.copy()

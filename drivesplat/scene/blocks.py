@@ -1,12 +1,10 @@
 """Blocks of a long drive: stretches of its path, each of which is a scene of its own."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int, Int64
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float64, Int64
 
 from drivesplat.io.json_record import read_typed_json, write_typed_json
 from drivesplat.io.storage import Provenance, no_provenance
@@ -55,31 +53,11 @@ class Blocks:
         before = [pair for pair in firsts if pair[0] <= timestamp]
         return max(before)[1] if before else min(firsts)[1]
 
-    def nearest(self, places: Float64[np.ndarray, "n 2"], numbers: Sequence[int]) -> Int[np.ndarray, " n"]:
-        """The one of some blocks, by number, whose path is nearest to each place in the drive's world (metres)."""
-        paths = [self.blocks[number].path for number in numbers]
-        owners = np.repeat(numbers, [len(path) for path in paths])
-        return owners[cKDTree(np.concatenate(paths)).query(places)[1]]
-
-    def beside(self, number: int) -> list[int]:
-        """The numbers of the other blocks whose recordings a block uses some of, or that use some of its own."""
-        own = self.blocks[number]
-        return [
-            other
-            for other, block in enumerate(self.blocks)
-            if other != number and (_meet(own.used, block.core) or _meet(block.used, own.core))
-        ]
-
 
 def within(timestamps: Int64[np.ndarray, " n"], intervals: Int64[np.ndarray, "i 2"]) -> Bool[np.ndarray, " n"]:
     """Whether timestamps lie in any of some intervals [first, end)."""
     at = np.asarray(timestamps)[:, None]
     return ((at >= intervals[:, 0]) & (at < intervals[:, 1])).any(axis=1)
-
-
-def _meet(some: np.ndarray, others: np.ndarray) -> bool:
-    firsts, ends = np.maximum.outer(some[:, 0], others[:, 0]), np.minimum.outer(some[:, 1], others[:, 1])
-    return bool((firsts < ends).any())
 
 
 def write_blocks(path: str | Path, blocks: Blocks) -> None:

@@ -268,11 +268,6 @@ class Outputs(Inputs):
         )
 
     @property
-    def whole(self) -> str:
-        """The wildcard constraint of scenes that are not cut into blocks."""
-        return self._any_of(*(re.escape(one) for one in self.config.scenes if not self.config.is_cut(one)))
-
-    @property
     def cut(self) -> str:
         """The wildcard constraint of drives that are cut into blocks."""
         return self._any_of(*(re.escape(one) for one in self.config.scenes if self.config.is_cut(one)))

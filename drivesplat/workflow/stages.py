@@ -135,7 +135,7 @@ def stages_of_metrics(config: Config, scene: str) -> tuple[tuple[str, ...], tupl
     """The stages of a scene, and those of each of its methods, behind its metrics.json."""
     refinement = ("refine_poses",) if refines_poses(config, scene) else ()
     cut = not config.is_block(scene) and config.is_cut(scene)
-    of_blocks, of_their_methods = (("block",), ("join_block", "evaluate_blocks")) if cut else ((), ())
+    of_blocks, of_their_methods = (("block",), ("evaluate_blocks",)) if cut else ((), ())
     if not has_cameras(config, scene):
         return (*LIDAR_SCENE_STAGES, *refinement, *of_blocks), (*LIDAR_METHOD_STAGES, *of_their_methods)
     return (*SCENE_STAGES, *refinement, *of_blocks), (*METHOD_STAGES, *of_their_methods)
@@ -348,7 +348,6 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "demo_world": (WorldJob, _world),
     "extract": (SceneSource, _scene_source),
     **dict.fromkeys(("blocks", "block", "evaluate_blocks"), (BlocksJob, lambda at: {"blocks": at.dataset.blocks})),
-    "join_block": (Settings, _nothing),
     "own_car": (EgoMaskJob, _ego_mask),
     "refine_poses": (RefinePosesJob, _lidar_rays),
     "lidar_seed": (SeedJob, _nothing),
