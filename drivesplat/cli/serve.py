@@ -33,6 +33,10 @@ def add_parser(commands: Any) -> None:
         "--max-loaded", type=int, default=2, metavar="N", help="number of scenes in memory at a time (2)"
     )
     parser.add_argument(
+        "--max-calls", type=int, default=64, metavar="N",
+        help="number of calls in progress at a time; further ones are refused at once (64)",
+    )  # fmt: skip
+    parser.add_argument(
         "--unlisted", default="removed", choices=["removed", "recorded"],
         help="what a request without any dynamic object shows of those that it could list (removed)",
     )  # fmt: skip
@@ -53,8 +57,8 @@ def run_serve(parsed: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     server = drivesplat.SensorServer(
-        parsed.paths, parsed.address, device=parsed.device, max_loaded=parsed.max_loaded, unlisted=parsed.unlisted,
-        jpeg=parsed.jpeg, metrics_port=parsed.metrics_port,
+        parsed.paths, parsed.address, device=parsed.device, max_loaded=parsed.max_loaded,
+        max_calls=parsed.max_calls, unlisted=parsed.unlisted, jpeg=parsed.jpeg, metrics_port=parsed.metrics_port,
         tls=None if parsed.tls_cert is None else (parsed.tls_cert, parsed.tls_key),
     )  # fmt: skip
     if server.device.type == "cpu":

@@ -1,7 +1,7 @@
 """Cameras of requests: from the parameters of a message to a camera that can be rendered, and back."""
 
+import threading
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,11 @@ MAX_PIXELS = 16_777_216
 """Pixels of an image, and of what a lens is resampled from."""
 FOCAL_RANGE = 0.01, 100.0
 """Focal lengths in image widths."""
-MAX_CAMERAS = 16
-"""Cameras that are kept: the directions of a lens take long to compute, and some 30 bytes for each pixel."""
+MAX_CAMERAS = 64
+"""Number of cameras that are kept."""
+MAX_KEPT_BYTES = 2 << 30
+"""Memory of the cameras that are kept. The directions of a lens take seconds to compute, and 14 bytes for each pixel,
+50 with a rolling shutter."""
 READOUTS = {
     wire.ShutterType.ROLLING_TOP_TO_BOTTOM: (0.0, 1.0),
     wire.ShutterType.ROLLING_BOTTOM_TO_TOP: (0.0, -1.0),
@@ -47,11 +50,66 @@ def camera_of(spec: Any, width: int, height: int, length_us: int) -> PoseableCam
     if width * height > MAX_PIXELS:
         raise ServiceError("RESOURCE_EXHAUSTED", f"an image of {width}x{height} has more than {MAX_PIXELS} pixels")
     rolling = any(READOUTS[spec.shutter_type])
-    return _camera(spec.SerializeToString(deterministic=True), width, height, length_us if rolling else 0)
+    return _kept.camera((spec.SerializeToString(deterministic=True), width, height, length_us if rolling else 0))
 
 
-@lru_cache(maxsize=MAX_CAMERAS)
+CameraKey = tuple[bytes, int, int, int]
+"""What a camera is made of: a serialized `CameraSpec`, width and height in pixels, and the length of a frame in
+microseconds, which is 0 without a rolling shutter."""
+
+
+class KeptCameras:
+    """The cameras that were used last: at most `max_count`, of at most `max_bytes`, and always the last one.
+
+    A camera that makes place gives up the directions of its lens; a request that still has it computes them again when
+    it is rendered. So calls that wait hold no memory of lenses. Any thread may call `camera`.
+    """
+
+    def __init__(self, max_bytes: int = MAX_KEPT_BYTES, max_count: int = MAX_CAMERAS):
+        self._max_bytes, self._max_count = max_bytes, max_count
+        self._cameras: dict[CameraKey, tuple[PoseableCamera, int]] = {}  # the one used last is the last
+        self._lock, self._computing = threading.Lock(), threading.Lock()
+
+    @property
+    def size(self) -> int:
+        """Bytes of all cameras: of their specifications, and of the directions of their lenses."""
+        return sum(size for _, size in self._cameras.values())
+
+    def camera(self, key: CameraKey) -> PoseableCamera:
+        """The camera of a key. Lenses are computed one at a time, each of them once, while others are looked
+        up. Raises ServiceError for what is no camera."""
+        found = self._use(key)
+        if found is None:
+            found = _camera(*key)
+            if found.distorted:
+                with self._computing:
+                    found = self._use(key) or found
+                    self._keep(key, found, len(key[0]) + _lens_bytes(found))
+            else:
+                self._keep(key, found, len(key[0]))
+        return found
+
+    def _use(self, key: CameraKey) -> PoseableCamera | None:
+        with self._lock:
+            if key not in self._cameras:
+                return None
+            self._cameras[key] = self._cameras.pop(key)
+            return self._cameras[key][0]
+
+    def _keep(self, key: CameraKey, camera: PoseableCamera, size: int) -> None:
+        with self._lock:
+            self._cameras.pop(key, None)
+            self._cameras[key] = camera, size
+            while len(self._cameras) > 1 and (self.size > self._max_bytes or len(self._cameras) > self._max_count):
+                dropped, _ = self._cameras.pop(next(iter(self._cameras)))
+                vars(dropped).pop("faces", None)  # which is a cached property
+
+
+_kept = KeptCameras()
+
+
 def _camera(serialized: bytes, width: int, height: int, length_us: int) -> PoseableCamera:
+    """A camera, without the directions of its lens."""
     spec = wire.CameraSpec.FromString(serialized)
     kind = spec.WhichOneof("camera_param")
     if kind is None:
@@ -68,11 +126,17 @@ def _camera(serialized: bytes, width: int, height: int, length_us: int) -> Posea
     _require_sound(kind, lens["K"], width, height)
     readout = 1e-6 * length_us * np.array([*READOUTS[spec.shutter_type], 0.0])
     with as_service_errors():
-        camera = PoseableCamera(width, height, **lens, exposure_of=spec.logical_id or None, readout_s=readout)
-        faces = camera.faces if camera.distorted else []
+        return PoseableCamera(width, height, **lens, exposure_of=spec.logical_id or None, readout_s=readout)
+
+
+def _lens_bytes(camera: PoseableCamera) -> int:
+    """Computes the directions of a lens, and returns the bytes that they take. Raises ServiceError for a lens without
+    any, and for one that is resampled from too many pixels."""
+    with as_service_errors():
+        faces = camera.faces
     if sum(face.width * face.height for face in faces) > MAX_PIXELS:
-        raise ServiceError("RESOURCE_EXHAUSTED", f"{kind}: the lens is resampled from more than {MAX_PIXELS} pixels")
-    return camera
+        raise ServiceError("RESOURCE_EXHAUSTED", f"the lens is resampled from more than {MAX_PIXELS} pixels")
+    return sum(each.nbytes for face in faces for each in (face.shows, face.places, face.distance_by_depth))
 
 
 _NUMBERS = {

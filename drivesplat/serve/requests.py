@@ -27,8 +27,9 @@ MAX_REQUEST_SCANS = 16
 
 @dataclass(frozen=True)
 class WorldKey:
-    """What the world of a request depends on: requests with equal keys are rendered together. `listed` are the dynamic
-    objects as bytes of their messages."""
+    """What the world of a request depends on: requests with equal keys are rendered together. `scene_id` is the id by
+    which a scene is offered, whichever of its ids a request has; `listed` are the dynamic objects as bytes of their
+    messages."""
 
     scene_id: str
     times: FrameTimes
@@ -78,8 +79,9 @@ class RequestReader:
     def __init__(self) -> None:
         self._objects: dict[WorldKey, ListedObjects] = {}
 
-    def image(self, message: Any) -> ImageRequest:
-        """Raises ServiceError for a request that no scene can answer."""
+    def image(self, message: Any, scene_id: str) -> ImageRequest:
+        """A request for an image of a scene, by the id by which it is offered. Raises ServiceError for a request that
+        no scene can answer."""
         spec = message.camera_intrinsics
         times = FrameTimes.checked(
             message.frame_start_us, message.frame_end_us, spec.shutter_type == wire.ShutterType.GLOBAL
@@ -87,14 +89,14 @@ class RequestReader:
         length_us = message.frame_end_us - message.frame_start_us
         camera = camera_of(spec, message.resolution_w, message.resolution_h, length_us)
         steady = steady_poses([message.sensor_pose], ["sensor_pose"], times)
-        world, objects = self._world(message, times)
+        world, objects = self._world(message, scene_id, times)
         mask = (message.ego_mask_id.camera_logical_id or spec.logical_id) if message.insert_ego_mask else None
         return ImageRequest(
             world, objects, camera, steady.poses[0], steady.velocities[0], _encoding(message), mask
         )  # fmt: skip
 
-    def scan(self, message: Any) -> ScanRequest:
-        """Raises ServiceError for a request that no scene can answer."""
+    def scan(self, message: Any, scene_id: str) -> ScanRequest:
+        """A request for a scan of a scene, as `image`."""
         times = FrameTimes.checked(message.frame_start_us, message.frame_end_us, at_start=False)
         lidar = None
         if message.HasField("lidar_config"):
@@ -106,12 +108,12 @@ class RequestReader:
         steady = steady_poses([pair], ["sensor_pose"], times)
         reverse = wire.PosePair(start_pose=pair.end_pose, end_pose=pair.start_pose)
         end = steady_poses([reverse], ["sensor_pose"], at_start).poses[0]
-        world, objects = self._world(message, times)
+        world, objects = self._world(message, scene_id, times)
         return ScanRequest(world, objects, lidar, steady.poses[0], steady.velocities[0], end)
 
-    def _world(self, message: Any, times: FrameTimes) -> tuple[WorldKey, ListedObjects]:
+    def _world(self, message: Any, scene_id: str, times: FrameTimes) -> tuple[WorldKey, ListedObjects]:
         listed = tuple(own.SerializeToString(deterministic=True) for own in message.dynamic_objects)
-        key = WorldKey(message.scene_id, times, listed)
+        key = WorldKey(scene_id, times, listed)
         if key not in self._objects:
             self._objects[key] = ListedObjects.of(message.dynamic_objects, times)
         return key, self._objects[key]

@@ -156,9 +156,9 @@ class LoadedDrives:
 
     @property
     def names(self) -> list[str]:
-        """The scene ids of the drives in memory; any thread may ask."""
+        """An id of each of the drives in memory, that of its archive where it has one; any thread may ask."""
         loaded = list(self._loaded)  # in one step: another thread may load a drive meanwhile
-        return scene_ids({name: self.offered[name] for name in loaded})
+        return [self.offered[name].archive_id or name for name in loaded]
 
     def __len__(self) -> int:
         """The number of drives in memory."""

@@ -3,8 +3,10 @@
 import importlib
 import logging
 import socket
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,8 +28,12 @@ log = logging.getLogger(__name__)
 
 ADDRESS = "127.0.0.1:50051"
 """Where a server listens by default: on this machine alone."""
-THREADS = 32
-"""Calls that are answered at a time; most of them wait for the device."""
+MAX_CALLS = 64
+"""Calls that may need a scene at a time; all but one of them wait for the device."""
+SPARE_THREADS = 8
+"""Threads for calls that do not wait: those of `PROMPT`, of the health service, and those that are refused."""
+PROMPT = ("get_version", "get_available_scenes", "get_loaded_scenes", "get_available_ego_masks")
+"""The rpcs that need no scene."""
 GRACE_S = 300.0
 """Seconds in which calls may end after a server was told to stop, the deadline of AlpaSim's runtime."""
 
@@ -48,6 +54,7 @@ class SensorServer:
         *,
         device: str = "any",
         max_loaded: int = 2,
+        max_calls: int = MAX_CALLS,
         unlisted: Unlisted = "removed",
         jpeg: JpegEncoder = "threads",
         metrics_port: int | None = None,
@@ -60,6 +67,8 @@ class SensorServer:
             address: Host and port; port 0 is any free port.
             device: 'any' (the GPU where there is one), 'cuda' or 'cpu'.
             max_loaded: Number of scenes that may be in memory at a time.
+            max_calls: Number of calls that may be in progress at a time, of those that need a scene. Further ones are
+                refused at once (RESOURCE_EXHAUSTED).
             unlisted: What a request without dynamic objects shows of those that it could list: 'removed' or 'recorded'.
             jpeg: Where JPEGs are encoded: 'threads' or 'device'.
             metrics_port: Port of this machine's loopback at which figures are served for Prometheus; None: not at all.
@@ -73,13 +82,16 @@ class SensorServer:
         host, port = _split(address)
         if max_loaded < 1:
             raise RequestError(f"--max-loaded is {max_loaded}; at least one scene must be loaded")
+        if max_calls < 1:
+            raise RequestError(f"--max-calls is {max_calls}; at least one call must be answered")
         sources = find_sources([Path(path) for path in paths])
         self.device = choose_device(DeviceSettings.model_validate(device), min_free_gb=0.0)
         options = ServiceOptions(_version(), self.device.type, max_loaded, unlisted, jpeg)
         _require_free(host, port)
         self.scenes = scene_ids(sources)
         self.service = SensorService(sources, options)
-        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="drivesplat-serve")
+        self._max_calls, self._places = max_calls, threading.Semaphore(max_calls)
+        self._pool = ThreadPoolExecutor(max_calls + SPARE_THREADS, thread_name_prefix="drivesplat-serve")
         self._server = self._grpc.server(
             self._pool,
             options=[
@@ -140,7 +152,8 @@ class SensorServer:
         """Answers a call. Every error has a status and one sentence."""
         began, code = perf_counter(), "OK"
         try:
-            return self._answer(name, request, context.is_active)
+            with self._place(name):
+                return self._answer(name, request, context.is_active)
         except Exception as error:
             failure = _as_failure(error, name)
             code = failure.code
@@ -148,6 +161,24 @@ class SensorServer:
             raise  # which `abort` does
         finally:
             self.service.figures.called(name, code, perf_counter() - began)
+
+    @contextmanager
+    def _place(self, name: str) -> Iterator[None]:
+        """A block that answers a call, while others wait: the threads of the pool always suffice for the rpcs of
+        `PROMPT`. Raises ServiceError (RESOURCE_EXHAUSTED) where too many calls are in progress."""
+        if name in PROMPT:
+            yield
+            return
+        if not self._places.acquire(blocking=False):
+            raise ServiceError(
+                "RESOURCE_EXHAUSTED",
+                f"{name}: {self._max_calls} calls are in progress, and no more may be: wait for their replies, or "
+                "start the service with a larger --max-calls",
+            )
+        try:
+            yield
+        finally:
+            self._places.release()
 
     def _answer(self, name: str, request: bytes, active: Callable[[], bool]) -> bytes:
         kind, _ = METHODS[name]

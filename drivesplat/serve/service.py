@@ -89,7 +89,8 @@ class SensorService:
         return wire.AvailableScenesReturn(scene_ids=scene_ids(self._sources))
 
     def get_loaded_scenes(self, request: Any, active: IsActive) -> Any:
-        """The scenes in memory, each of which serves any number of clients."""
+        """The scenes in memory, each of which serves any number of clients: once, by the id of its scene for AlpaSim
+        where it has one."""
         entries = [
             wire.LoadedSceneEntry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
             for name in self._drives.names
@@ -156,7 +157,7 @@ class SensorService:
 
     def render_lidar(self, request: Any, active: IsActive) -> Any:
         """One scan. Points are in the frame of the sensor at the end of the spin."""
-        return self._scan(RequestReader().scan(request), active)
+        return self._scan(RequestReader().scan(request, self._drives.name_of(request.scene_id)), active)
 
     def render_aggregated(self, request: Any, active: IsActive) -> Any:
         """Images and scans; all of them, or the first error."""
@@ -166,7 +167,7 @@ class SensorService:
                 "RESOURCE_EXHAUSTED",
                 f"the request asks for {len(request.lidar_requests)} scans; it may ask for {MAX_REQUEST_SCANS}",
             )
-        scans = [reader.scan(own) for own in request.lidar_requests]
+        scans = [reader.scan(own, self._drives.name_of(own.scene_id)) for own in request.lidar_requests]
         images = [_or_raise(image) for image in self._images(request.rgb_requests, active)]
         return wire.AggregatedRenderReturn(
             rgb_returns=[wire.RGBRenderReturn(image_bytes=image) for image in images],
@@ -195,8 +196,7 @@ class SensorService:
 
     def _read(self, reader: RequestReader, message: Any) -> ImageRequest:
         """A request for an image of a scene that is served."""
-        self._drives.name_of(message.scene_id)
-        return reader.image(message)
+        return reader.image(message, self._drives.name_of(message.scene_id))
 
     def _rendered(self, requests: Sequence[ImageRequest]) -> list[Picture]:
         """The images of requests of one world, rendered by the thread that uses the device."""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import grpc
@@ -74,6 +75,37 @@ def test_health_and_figures(results, sound):
         assert float(re.search(r"^drivesplat_model_seconds_total (\S+)", page, re.MULTILINE)[1]) > 0.0
 
 
+def test_health_version_and_figures_answer_while_calls_wait_and_further_ones_are_refused(results, sound):
+    with served(results / "0002", max_calls=3, metrics_port=0) as (running, client), ExitStack() as others:
+        expected = client.render_rgb(sound).image_bytes
+        with running.service._lock:  # the device is in use
+            waiting = [client.render_rgb.future(sound) for _ in range(3)]
+            wait_until(lambda: "drivesplat_waiting_requests 3.0" in _page(running))
+            for call, request in (
+                (client.render_rgb, sound), (client.batch_render_rgb, sensorsim_pb2.BatchRGBRenderRequest()),
+                (client.get_available_cameras, sensorsim_pb2.AvailableCamerasRequest(scene_id="0002")),
+            ):  # fmt: skip
+                with pytest.raises(grpc.RpcError, match=r"3 calls are in progress.*--max-calls") as raised:
+                    call(request, timeout=PATIENCE_S)
+                assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+            clients = [SensorClient(running.address) for _ in range(4)]
+            for own in clients:
+                others.callback(own.channel.close)
+            refused = [own.render_rgb.future(sound) for own in clients for _ in range(10)]
+            health = health_pb2_grpc.HealthStub(client.channel)
+            check = health.Check(health_pb2.HealthCheckRequest(), timeout=PATIENCE_S)
+            assert check.status == health_pb2.HealthCheckResponse.SERVING
+            assert client.get_version(EMPTY, timeout=PATIENCE_S).version_id
+            assert [*client.get_available_scenes(EMPTY, timeout=PATIENCE_S).scene_ids] == ["0002"]
+            assert len(client.get_loaded_scenes(EMPTY, timeout=PATIENCE_S).scenes) == 1
+            assert not client.get_available_ego_masks(EMPTY, timeout=PATIENCE_S).ego_mask_metadata
+            for call in refused:
+                assert call.exception(PATIENCE_S).code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+            assert not any(call.done() for call in waiting)
+        assert [call.result(PATIENCE_S).image_bytes for call in waiting] == 3 * [expected]
+        assert client.render_rgb(sound).image_bytes == expected, "places are free again"
+
+
 def _page(running) -> str:
     with urllib.request.urlopen(running.metrics_address) as answer:
         return answer.read().decode()
@@ -105,7 +137,7 @@ def test_what_cannot_be_served_is_one_sentence(results, tmp_path, monkeypatch):
             ({"address": address}, address), ({"address": "nowhere"}, "--address"),
             ({"address": "h:99999"}, "--address"),
             ({"address": "host.invalid:1"}, r"host\.invalid"), ({"address": "a..b:1"}, r"a\.\.b"),
-            ({"max_loaded": 0}, "--max-loaded"),
+            ({"max_loaded": 0}, "--max-loaded"), ({"max_calls": 0}, "--max-calls"),
             ({"metrics_port": taken.getsockname()[1]}, "--metrics-port"),
             ({"tls": (tmp_path / "none.pem", tmp_path / "none.pem")}, r"none\.pem"),
             ({"tls": (Path(__file__), Path(__file__))}, "a certificate and its key"),

@@ -221,10 +221,10 @@ def test_every_format_has_the_same_image(client, results, frame, path):
 
 def test_the_exposure_is_that_of_the_recorded_camera(frame, path):
     request = wire.RGBRenderRequest.FromString(image_request(SCENE, frame, path).SerializeToString())
-    read = RequestReader().image(request)
+    read = RequestReader().image(request, SCENE)
     assert read.placed(1.0).view(torch.device("cpu")).camera == CAMERA
     request.camera_intrinsics.logical_id = ""
-    assert RequestReader().image(request).camera.exposure_of is None
+    assert RequestReader().image(request, SCENE).camera.exposure_of is None
 
 
 def test_ego_masks_are_offered_and_drawn_in_black(client, frame, path):

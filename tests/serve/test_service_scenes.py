@@ -58,12 +58,17 @@ def test_a_scene_for_alpasim_is_served_by_its_id_without_the_folder_of_results(r
     with served(results / "0002") as (_, client):
         expected = client.render_rgb(image_request("0002", *seen)).image_bytes
     for path in (archive, archive.parent):
-        with served(path) as (running, client):
+        with served(path, max_loaded=1) as (running, client):
             assert [*client.get_available_scenes(EMPTY).scene_ids] == ["0002", own]
             assert client.render_rgb(image_request(own, *seen)).image_bytes == expected
-            assert [entry.scene_id for entry in client.get_loaded_scenes(EMPTY).scenes] == ["0002", own]
+            batch = sensorsim_pb2.BatchRGBRenderRequest()
+            for name in ("0002", own, "0002/street"):
+                batch.items.add(request=image_request(name, *seen))
+            images = [item.result.image_bytes for item in client.batch_render_rgb(batch).items]
+            assert images == 3 * [expected], "one scene by three ids, where one scene may be loaded"
+            assert [entry.scene_id for entry in client.get_loaded_scenes(EMPTY).scenes] == [own]
             loaded = running.service.figures.registry.get_sample_value("drivesplat_loaded_scenes")
-            assert loaded == 1.0, "one scene by two names"
+            assert loaded == 1.0
 
 
 def test_a_folder_of_results_knows_the_id_of_the_scene_that_it_exported(results, archive, tmp_path):
