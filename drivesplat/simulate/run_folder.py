@@ -107,7 +107,7 @@ class _Recorder:
         seen_from = now.drive.camera_to_world(name, now.time) if now.follows else pose @ mount
         frame = Frame(
             name, time, str(file), camera.width, camera.height, camera.lens.intrinsics, seen_from, pose, True,
-            len(self.times) - 1, f"{name}/{time}",
+            len(self.times) - 1, f"{name}/{time}", readout_middle_s=float(camera.readout_s[2]),
         )  # fmt: skip
         self._frames.append(frame)
 

@@ -22,6 +22,7 @@ from drivesplat.readers.drive.layout import camera_names, find_root
 from drivesplat.readers.drive.reader import chosen_recordings, read
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.sweeps import read_returns, sweep_fault
+from drivesplat.scene.recorded_shutters import shutters
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.extract import SceneSource
 
@@ -69,6 +70,34 @@ def test_a_written_scene_is_read_back_to_the_last_bit(recorded, folder):
         mine, theirs = read_returns(one), read_returns(other)
         for field in ("points", "intensity", "rings"):
             np.testing.assert_array_equal(getattr(mine, field), getattr(theirs, field))
+
+
+def test_a_rolling_shutter_is_read_back_with_the_middle_of_its_readout(recorded, tmp_path):
+    name = recorded.cameras[0].name
+    cameras = tuple(
+        dataclasses.replace(camera, readout_s=0.03, readout_direction="down") if camera.name == name else camera
+        for camera in recorded.cameras
+    )
+    frames = tuple(dataclasses.replace(frame, readout_middle_s=0.001 * i) for i, frame in enumerate(recorded.frames))
+    scene = dataclasses.replace(recorded, cameras=cameras, frames=frames)
+    write_drive(scene, tmp_path / "0001")
+    again = extract_scene(source(), tmp_path)
+    middles = {frame.token: frame.readout_middle_s for frame in again.frames if frame.camera == name}
+    assert len(middles) > 2
+    written = {(frame.camera, frame.timestamp): frame.readout_middle_s for frame in frames}
+    for frame in again.frames:
+        expected = written[frame.camera, frame.timestamp] if frame.camera == name else 0.0
+        assert frame.readout_middle_s == expected
+    found, expected = (shutters(one) for one in (again, scene))
+    for one, other in zip(found, expected, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            np.testing.assert_array_equal(one.readout_s, other.readout_s)
+    record = json.loads((tmp_path / "0001/drive.json").read_text())
+    record["frames"][0]["readout_middle_s"] = 3.0
+    (tmp_path / "0001/drive.json").write_text(json.dumps(record))
+    with pytest.raises(DatasetError, match=r"frames\[0\]\.readout_middle_s is 3\.0"):
+        extract_scene(source(), tmp_path)
 
 
 def test_a_track_that_is_absent_at_one_key_frame_stays_absent(recorded, tmp_path):

@@ -126,6 +126,9 @@ class DriveFrame(DriveRecord):
     camera_velocity: tuple[float, float, float, float, float, float] | None = None
     """The camera's linear (m/s), then angular velocity (rad/s) during the readout, along its own axes. null: by the
     images before and after."""
+    readout_middle_s: float = Field(0.0, ge=-1, le=1)
+    """Time from the timestamp to the middle of the readout (seconds), negative where the timestamp is later: half of
+    the camera's readout_s if timestamps are those of the first line."""
 
 
 class DriveSweep(DriveRecord):

@@ -243,6 +243,7 @@ class _DriveReading:
                 is_key_frame=is_key_frame,
                 sample_index=index,
                 token=f"{name}/{frame.timestamp}",
+                readout_middle_s=frame.readout_middle_s,
                 camera_velocity=None if frame.camera_velocity is None else np.array(frame.camera_velocity),
             )
 

@@ -124,6 +124,7 @@ def drive_record(
                 "camera_to_world": pose_record(frame.camera_to_world),
                 "ego_to_world": pose_record(frame.ego_to_world),
                 "camera_velocity": _velocity(frame) if frame.camera in rolling else None,
+                "readout_middle_s": frame.readout_middle_s if frame.camera in rolling else 0.0,
             }
             for frame, name in written
         ],
