@@ -1,182 +1,68 @@
 """Rigs a second of the sensor service: a server in a process of its own, and a client as AlpaSim's runtime is one.
 
     python -m benchmarks.sensor_service results/demo/street --size 1920x1080 --frames 300
-    python -m benchmarks.sensor_service results/demo --size 48x27 --soak 20000
+    python -m benchmarks.sensor_service results/demo/street --size 160x90 --simulate --frames 600 --rollouts 4
+    python -m benchmarks.sensor_service results/demo/street --size 48x27 --soak 20000 --log soak.csv
+    python -m benchmarks.sensor_service results/demo/street --size 48x27 --offered 10 --frames 40
 
 A rig has three cameras, which look ahead and to both sides with the intrinsics of the scene's first camera. A call asks
 for the images of all of them at one time, with rolling shutters of 17 ms and all tracks of the scene as moving objects.
 Each rollout has one call in progress. The share inside of the model is the part of the time in which the device was in
 use.
 
+With --simulate, each rollout first asks for version, scenes, cameras and ego masks, and then goes round the recording,
+from a time of its own on: the first one with all objects, the second one with every second object, the third one
+without any, and so on. Every image must come, and every tenth frame that is asked for alone afterwards must have equal
+bytes. Meanwhile get_version is called all the time.
+
 With --soak, requests of all served scenes come in random order; equal requests must get equal bytes. Memory and open
-files of the server are those after every request was answered once, and at the end.
+files of the server are those after every request was answered once, and later; --log writes them into a table.
+
+With --offered, servers offer the first drive under two and under so many names, and load two of them at a time. Memory
+is that at the start, after frames of two scenes, and after two rounds of all scenes.
 """
 
 import hashlib
-import re
-import subprocess
 import sys
-import urllib.request
-from collections.abc import Iterator, Sequence
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from benchmarks.command import argument_parser
-from drivesplat.scene.pose_path import PosePath
-from drivesplat.scene.rigid import rigid
-from drivesplat.scene.scene import Scene, read_scene
-from drivesplat.scene.tracks import box_at
-from drivesplat.serve.messages import METHODS, SERVICE, wire
-from drivesplat.serve.poses import pose_message
-from drivesplat.serve.scenes import find_sources
+from benchmarks.sensor_client import (
+    FORMATS,
+    LISTED,
+    YAWS,
+    Listed,
+    RenderClient,
+    RigRequests,
+    RunningServer,
+    images_of,
+    running_server,
+)
+from drivesplat.scene.scene import read_scene
+from drivesplat.serve.messages import wire
+from drivesplat.serve.scenes import DriveSource, find_sources
 
-SHUTTER_US = 17_000
-YAWS = (0.0, 55.0, -55.0)
-"""Directions of the cameras in degrees to the left."""
-MESSAGE_BYTES = 64 << 20
-FORMATS = {"jpeg": wire.ImageFormat.JPEG, "png": wire.ImageFormat.PNG}
 DISTINCT = 60
 """Different requests of a soak."""
-
-
-@dataclass(frozen=True)
-class RunningServer:
-    """A server in a process of its own."""
-
-    pid: int
-    address: str
-    metrics: str
-
-    def model_seconds(self) -> float:
-        """Seconds in which the device was in use."""
-        with urllib.request.urlopen(self.metrics) as page:
-            text = page.read().decode()
-        found = re.search(r"^drivesplat_model_seconds_total (\S+)", text, re.MULTILINE)
-        assert found is not None
-        return float(found[1])
-
-    def memory_mb(self) -> float:
-        """Resident memory in MB."""
-        status = Path(f"/proc/{self.pid}/status").read_text(encoding="utf-8")
-        return int(re.findall(r"VmRSS:\s+(\d+) kB", status)[0]) / 1000.0
-
-    def open_files(self) -> int:
-        """Number of open files and sockets."""
-        return len(list(Path(f"/proc/{self.pid}/fd").iterdir()))
-
-
-@contextmanager
-def running_server(paths: Sequence[Path], device: str, options: Sequence[str] = ()) -> Iterator[RunningServer]:
-    """A server of drives, until the block ends."""
-    command = [sys.executable, "-m", "drivesplat.cli", "serve", *map(str, paths), "--address", "127.0.0.1:0"]
-    command += ["--metrics-port", "0", "--device", device, *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        said, metrics = "", ""
-        while " serves " not in said:
-            said = process.stdout.readline()
-            if not said:
-                raise SystemExit(f"the server ended with status {process.wait()}")
-            metrics = said.rpartition(" ")[2].strip() if " figures at " in said else metrics
-        yield RunningServer(process.pid, said.split()[2], metrics)
-    finally:
-        process.terminate()
-        process.communicate()
-
-
-class RenderClient:
-    """A client that calls by the names of rpcs: `client("get_version", wire.Empty())`."""
-
-    def __init__(self, address: str):
-        import grpc
-
-        options = [("grpc.max_receive_message_length", MESSAGE_BYTES), ("grpc.max_send_message_length", MESSAGE_BYTES)]
-        self._channel = grpc.insecure_channel(address, options)
-
-    def __call__(self, name: str, message: Any) -> Any:
-        """The reply of a call."""
-        call = self._channel.unary_unary(f"/{SERVICE}/{name}")
-        return METHODS[name][1].FromString(call(message.SerializeToString()))
-
-
-@dataclass(frozen=True, eq=False)
-class RigRequests:
-    """Requests for the images of a rig in a scene, by what a server tells of it and its tracks."""
-
-    scene_id: str
-    spec: Any
-    mounts: Sequence[np.ndarray]
-    stamps: np.ndarray
-    path: np.ndarray
-    scene: Scene
-
-    @classmethod
-    def of(cls, client: RenderClient, scene_id: str, scene: Scene) -> "RigRequests":
-        """Asks a server for cameras and path."""
-        cameras = client("get_available_cameras", wire.AvailableCamerasRequest(scene_id=scene_id)).available_cameras
-        trajectories = client("get_available_trajectories", wire.AvailableTrajectoriesRequest(scene_id=scene_id))
-        poses = trajectories.available_trajectories[0].trajectory.poses
-        turns = [rigid(Rotation.from_euler("z", yaw, degrees=True).as_matrix(), np.zeros(3)) for yaw in YAWS]
-        spec = wire.CameraSpec.FromString(cameras[0].intrinsics.SerializeToString())
-        spec.shutter_type = wire.ShutterType.ROLLING_TOP_TO_BOTTOM
-        mounts = [turn @ _matrix(cameras[0].rig_to_camera) for turn in turns]
-        path = np.stack([_matrix(own.pose) for own in poses])
-        return cls(scene_id, spec, mounts, np.array([own.timestamp_us for own in poses]), path, scene)
-
-    def batch(self, fraction: float, size: tuple[int, int], image_format: int) -> Any:
-        """The request at a fraction of the recording, with images of a size."""
-        first, last = int(self.stamps[0]), int(self.stamps[-1])
-        start = first + round(fraction * (last - first - SHUTTER_US))
-        ends = np.array([start, start + SHUTTER_US])
-        rigs, objects = self._rigs(ends), self._objects(start)
-        reply = wire.BatchRGBRenderRequest()
-        for number, mount in enumerate(self.mounts):
-            pair = wire.PosePair(start_pose=pose_message(rigs[0] @ mount), end_pose=pose_message(rigs[1] @ mount))
-            request = wire.RGBRenderRequest(
-                scene_id=self.scene_id, resolution_w=size[0], resolution_h=size[1], camera_intrinsics=self.spec,
-                frame_start_us=start, frame_end_us=start + SHUTTER_US, sensor_pose=pair, image_format=image_format,
-                dynamic_objects=objects,
-            )  # fmt: skip
-            reply.items.add(camera_name=str(number), request=request)
-        return reply
-
-    def _rigs(self, stamps: np.ndarray) -> np.ndarray:
-        """Poses (n, 4, 4) of the vehicle."""
-        return PosePath(self.stamps, self.path).at(stamps)
-
-    def _objects(self, start: int) -> list[Any]:
-        """All tracks that are there, half a metre to their left."""
-        found, aside = [], rigid(np.eye(3), np.array([0.0, 0.5, 0.0]))
-        for track in self.scene.tracks:
-            boxes = [box_at(track, stamp, self.scene.seconds(stamp)) for stamp in (start, start + SHUTTER_US)]
-            if None not in boxes:
-                start_pose, end_pose = (pose_message(box.object_to_world @ aside) for box in boxes if box is not None)
-                pair = wire.PosePair(start_pose=start_pose, end_pose=end_pose)
-                found.append(wire.DynamicObject(track_id=track.id, pose_pair=pair))
-        return found
-
-
-def _matrix(message: Any) -> np.ndarray:
-    vec, quat = message.vec, message.quat
-    turn = Rotation.from_quat([quat.w, quat.x, quat.y, quat.z], scalar_first=True).as_matrix()
-    return rigid(turn, np.array([vec.x, vec.y, vec.z]))
-
-
-def images_of(client: RenderClient, batch: Any) -> list[bytes]:
-    """The images of a batch. Raises SystemExit with the first error."""
-    items = client("batch_render_rgb", batch).items
-    if failed := [item.error_message for item in items if not item.success]:
-        raise SystemExit(failed[0])
-    return [item.result.image_bytes for item in items]
+WATCH_S = 5.0
+"""Seconds between two looks at a server's memory."""
+BLACK = 10
+"""The largest value of an image that AlpaSim counts as black."""
+VERSION_S = 0.1
+"""Seconds between two calls of get_version."""
+CHECK_EVERY = 10
+"""Of so many frames of rollouts one is rendered again."""
 
 
 def speed(server: RunningServer, batches: Sequence[Any], rollouts: int, warm_up: int) -> str:
@@ -207,9 +93,114 @@ def speed(server: RunningServer, batches: Sequence[Any], rollouts: int, warm_up:
     )
 
 
-def soak(server: RunningServer, batches: Sequence[Any], count: int, rollouts: int, seed: int = 0) -> str:
-    """Sends `count` single requests in random order; returns the figures. Raises SystemExit for an image that differs
-    from that of an equal request before."""
+Batches = Callable[..., Any]
+"""What makes the request of a rig at a fraction of its recording: `RigRequests.batch` of a size and a format."""
+
+
+class RolloutFrame(NamedTuple):
+    """A frame of a rollout, which has a number."""
+
+    rollout: int
+    rig: RigRequests
+    fraction: float
+    listed: Listed
+
+    def images(self, client: RenderClient, batch: Batches) -> list[bytes]:
+        """What a server shows."""
+        return images_of(client, batch(self.rig, self.fraction, listed=self.listed))
+
+
+def simulate(server: RunningServer, rigs: Sequence[RigRequests], batch: Batches, frames: int, rollouts: int) -> str:
+    """Has `rollouts` at a time, of `frames` in all; returns the figures. Raises SystemExit for an image that is
+    missing, or that differs from that of the same request alone."""
+    each, found = max(1, frames // rollouts), {}
+    asked = []
+    for n in range(rollouts):
+        rig, listed, first = rigs[n % len(rigs)], LISTED[n % len(LISTED)], n * each // rollouts
+        asked.append([RolloutFrame(n, rig, (first + i) % each / each, listed) for i in range(each)])
+
+    def roll_out(own: Sequence[RolloutFrame]) -> list[float]:
+        client, seconds = RenderClient(server.address), []
+        _prepare(client, own[0].rig.scene_id)
+        for frame in own:
+            began = perf_counter()
+            found[frame] = frame.images(client, batch)
+            seconds.append(perf_counter() - began)
+        return seconds
+
+    ask_version, began = partial(RenderClient(server.address), "get_version", wire.Empty()), perf_counter()
+    with repeated(ask_version, VERSION_S) as versions, ThreadPoolExecutor(rollouts) as threads:
+        latencies = np.concatenate([*threads.map(roll_out, asked)])
+    seconds, alone = perf_counter() - began, RenderClient(server.address)
+    checked = [frame for own in asked for frame in own[::CHECK_EVERY]]
+    wrong = sum(frame.images(alone, batch) != found[frame] for frame in checked)
+    black = sum(_is_black(image) for images in found.values() for image in images)
+    text = (
+        f"{len(latencies)} frames of {len(YAWS)} images in {rollouts} rollouts: {len(latencies) / seconds:.2f} rigs/s; "
+        f"latency {_milliseconds(latencies)}; {black} black images; {_changed(found)}; {wrong} of {len(checked)} "
+        f"frames differ when they are asked for alone; get_version {_milliseconds(np.array(versions))} in "
+        f"{len(versions)} calls"
+    )
+    if wrong:
+        raise SystemExit(text)
+    return text
+
+
+def _prepare(client: RenderClient, scene_id: str) -> None:
+    """What a runtime asks for before the first frame."""
+    client("get_version", wire.Empty())
+    if scene_id not in client("get_available_scenes", wire.Empty()).scene_ids:
+        raise SystemExit(f"{scene_id} is not served")
+    client("get_available_cameras", wire.AvailableCamerasRequest(scene_id=scene_id))
+    client("get_available_ego_masks", wire.Empty())
+
+
+def _milliseconds(seconds: np.ndarray) -> str:
+    median, most = 1e3 * np.quantile(seconds, [0.5, 0.95])
+    return f"{median:.0f} ms (median), {most:.0f} ms (95 %), {1e3 * seconds.max():.0f} ms (longest)"
+
+
+def _is_black(image: bytes) -> bool:
+    return int(cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR).max()) <= BLACK
+
+
+def _changed(found: Mapping[RolloutFrame, list[bytes]]) -> str:
+    """How many frames show something else where objects are left out."""
+    shown = {frame[1:]: images for frame, images in found.items()}
+    counts = []
+    for less in LISTED[1:]:
+        both = [place for *place, listed in shown if listed == "all" and (*place, less) in shown]
+        other = sum(shown[*place, "all"] != shown[*place, less] for place in both)
+        counts.append(f"{other} of {len(both)} frames change with {less} of the objects")
+    return ", ".join(counts)
+
+
+@contextmanager
+def repeated(call: Callable[[], Any], pause_s: float) -> Iterator[list[float]]:
+    """Calls again and again until the block ends, at least once; the seconds that each call took are added to the
+    list."""
+    ended, seconds = threading.Event(), []
+
+    def go_on() -> None:
+        while not (seconds and ended.wait(pause_s)):
+            began = perf_counter()
+            call()
+            seconds.append(perf_counter() - began)
+
+    thread = threading.Thread(target=go_on)
+    thread.start()
+    try:
+        yield seconds
+    finally:
+        ended.set()
+        thread.join()
+
+
+def soak(
+    server: RunningServer, batches: Sequence[Any], count: int, rollouts: int, log: Path | None = None, seed: int = 0
+) -> str:  # fmt: skip
+    """Sends `count` single requests in random order; returns the figures. `log` gets a table of memory and open files.
+    Raises SystemExit for an image that differs from that of an equal request before."""
     requests = [item.request for batch in batches for item in batch.items]
     clients = [RenderClient(server.address) for _ in range(rollouts)]
 
@@ -217,26 +208,67 @@ def soak(server: RunningServer, batches: Sequence[Any], count: int, rollouts: in
         return hashlib.sha256(client("render_rgb", requests[number]).image_bytes).hexdigest()
 
     known = [digest(clients[0], number) for number in range(len(requests))]
-    before, order = (
-        (server.memory_mb(), server.open_files()),
-        np.random.default_rng(seed).integers(0, len(requests), count),
-    )
+    order, samples = np.random.default_rng(seed).integers(0, len(requests), count), []
+    began = perf_counter()
+
+    def look() -> None:
+        samples.append((perf_counter() - began, server.memory_mb(), server.open_files()))
 
     def roll_out(number: int) -> int:
         return sum(digest(clients[number], i) != known[i] for i in order[number::rollouts].tolist())
 
-    began = perf_counter()
-    with ThreadPoolExecutor(rollouts) as threads:
+    look()
+    with repeated(look, WATCH_S), ThreadPoolExecutor(rollouts) as threads:
         wrong = sum(threads.map(roll_out, range(rollouts)))
-    seconds, after = perf_counter() - began, (server.memory_mb(), server.open_files())
+    look()
+    if log is not None:
+        np.savetxt(log, samples, "%.1f", ",", header="seconds,memory_mb,open_files", comments="")
+    seconds, memory, files = np.array(samples).T
     text = (
-        f"{count} requests of {len(requests)} kinds in random order, {rollouts} at a time: {count / seconds:.1f} a "
-        f"second, {wrong} wrong images; memory {before[0]:.0f} MB, then {after[0]:.0f} MB; open files {before[1]}, "
-        f"then {after[1]}"
+        f"{count} requests of {len(requests)} kinds in random order, {rollouts} at a time: "
+        f"{count / seconds[-1]:.1f} a second, {wrong} wrong images; memory {memory[0]:.0f} MB, then {memory.min():.0f} "
+        f"to {memory.max():.0f}, {memory[-1]:.0f} MB at the end; open files {files[0]:.0f}, then {files.min():.0f} to "
+        f"{files.max():.0f}"
     )
     if wrong:
         raise SystemExit(text)
     return text
+
+
+def copies(source: DriveSource, folder: Path, count: int) -> list[Path]:
+    """Methods of `count` scenes in `folder` that are all the drive of `source`: their files are links."""
+    method, found = source.folder.resolve(), []
+    for number in range(count):
+        copy = folder / f"{source.scene}_{number}" / source.method
+        copy.mkdir(parents=True)
+        for file in (*method.parent.iterdir(), *method.iterdir()):
+            if file.is_file():
+                (copy.parent / file.relative_to(method.parent)).symlink_to(file)
+        found.append(copy)
+    return found
+
+
+def memory(methods: Sequence[Path], device: str, batch: Batches, frames: int) -> str:
+    """A server offers drives and loads two of them at a time; returns its memory."""
+    sources, used = find_sources(methods), 2
+    with running_server(methods, device, ["--max-loaded", str(used)]) as server:
+        client, at_first = RenderClient(server.address), server.memory_mb()
+        rigs = list(_rigs(client, sources))
+        for i in range(frames):
+            images_of(client, batch(rigs[i % used], i / frames))
+        after = server.memory_mb()
+        for rig in (*rigs, *rigs):
+            images_of(client, batch(rig, 0.5))
+        rounds = server.memory_mb()
+    return (
+        f"{len(rigs)} scenes offered: {at_first:.0f} MB at the start, {after:.0f} MB after {frames} rigs of {used} "
+        f"scenes, {rounds:.0f} MB after two rounds of all scenes"
+    )
+
+
+def _rigs(client: RenderClient, sources: dict[str, DriveSource]) -> Iterator[RigRequests]:
+    for name, source in sources.items():
+        yield RigRequests.of(client, name, read_scene(source.folder.resolve().parent / "scene.json"))
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -254,23 +286,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--format", choices=FORMATS, default="jpeg")
     parser.add_argument("--device", choices=["any", "cuda", "cpu"], default="any")
     parser.add_argument("--jpeg", choices=["threads", "device"], default="threads", help="as of drivesplat serve")
-    parser.add_argument("--soak", type=int, metavar="N", help="send N requests in random order instead")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--simulate", action="store_true", help="roll out as a simulator does, and check the images")
+    kinds.add_argument("--soak", type=int, metavar="N", help="send N requests in random order instead")
+    kinds.add_argument("--offered", type=int, metavar="N", help="memory of servers that offer 2 and N scenes instead")
+    parser.add_argument("--log", type=Path, metavar="CSV", help="with --soak: memory and open files over time")
     parsed = parser.parse_args(arguments)
     sources = find_sources(parsed.paths)
+    batch = partial(RigRequests.batch, size=parsed.size, image_format=FORMATS[parsed.format])
+    if parsed.offered is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            methods = copies(next(iter(sources.values())), Path(folder), max(2, parsed.offered))
+            for some in (methods[:2], methods):
+                print(memory(some, parsed.device, batch, parsed.frames), flush=True)
+        return 0
     options = ["--jpeg", parsed.jpeg, "--max-loaded", str(len(sources))]
     with running_server(parsed.paths, parsed.device, options) as server:
-        client, rigs = RenderClient(server.address), []
-        for name, source in sources.items():
-            scene = read_scene(source.folder.resolve().parent / "scene.json")
-            rigs.append(RigRequests.of(client, name, scene))
-        batch = partial(RigRequests.batch, size=parsed.size, image_format=FORMATS[parsed.format])
+        rigs = list(_rigs(RenderClient(server.address), sources))
         if parsed.soak is not None:
             each = -(-DISTINCT // (len(rigs) * len(YAWS)))
             batches = [batch(rig, i / each) for rig in rigs for i in range(each)]
-            print(soak(server, batches, parsed.soak, max(2, parsed.rollouts)))
-            return 0
-        batches = [batch(rigs[i % len(rigs)], i / parsed.frames) for i in range(parsed.frames)]
-        print(speed(server, batches, parsed.rollouts, warm_up=min(5, len(batches))))
+            print(soak(server, batches, parsed.soak, max(2, parsed.rollouts), parsed.log))
+        elif parsed.simulate:
+            print(simulate(server, rigs, batch, parsed.frames, parsed.rollouts))
+        else:
+            batches = [batch(rigs[i % len(rigs)], i / parsed.frames) for i in range(parsed.frames)]
+            print(speed(server, batches, parsed.rollouts, warm_up=min(5, len(batches))))
     return 0
 
 
