@@ -53,8 +53,6 @@ from drivesplat.scene.scene import read_scene
 from drivesplat.serve.messages import wire
 from drivesplat.serve.scenes import DriveSource, find_sources
 
-DISTINCT = 60
-"""Different requests of a soak."""
 WATCH_S = 5.0
 """Seconds between two looks at a server's memory."""
 BLACK = 10
@@ -213,6 +211,8 @@ def soak(
 
     def look() -> None:
         samples.append((perf_counter() - began, server.memory_mb(), server.open_files()))
+        if log is not None:
+            np.savetxt(log, samples, "%.1f", ",", header="seconds,memory_mb,open_files", comments="")
 
     def roll_out(number: int) -> int:
         return sum(digest(clients[number], i) != known[i] for i in order[number::rollouts].tolist())
@@ -221,8 +221,6 @@ def soak(
     with repeated(look, WATCH_S), ThreadPoolExecutor(rollouts) as threads:
         wrong = sum(threads.map(roll_out, range(rollouts)))
     look()
-    if log is not None:
-        np.savetxt(log, samples, "%.1f", ",", header="seconds,memory_mb,open_files", comments="")
     seconds, memory, files = np.array(samples).T
     text = (
         f"{count} requests of {len(requests)} kinds in random order, {rollouts} at a time: "
@@ -253,10 +251,12 @@ def memory(methods: Sequence[Path], device: str, batch: Batches, frames: int) ->
     sources, used = find_sources(methods), 2
     with running_server(methods, device, ["--max-loaded", str(used)]) as server:
         client, at_first = RenderClient(server.address), server.memory_mb()
-        rigs = list(_rigs(client, sources))
+        names = [*sources]
+        rigs = [_rig(client, name, sources[name]) for name in names[:used]]
         for i in range(frames):
             images_of(client, batch(rigs[i % used], i / frames))
         after = server.memory_mb()
+        rigs += [_rig(client, name, sources[name]) for name in names[used:]]
         for rig in (*rigs, *rigs):
             images_of(client, batch(rig, 0.5))
         rounds = server.memory_mb()
@@ -266,9 +266,8 @@ def memory(methods: Sequence[Path], device: str, batch: Batches, frames: int) ->
     )
 
 
-def _rigs(client: RenderClient, sources: dict[str, DriveSource]) -> Iterator[RigRequests]:
-    for name, source in sources.items():
-        yield RigRequests.of(client, name, read_scene(source.folder.resolve().parent / "scene.json"))
+def _rig(client: RenderClient, name: str, source: DriveSource) -> RigRequests:
+    return RigRequests.of(client, name, read_scene(source.folder.resolve().parent / "scene.json"))
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -290,6 +289,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kinds.add_argument("--simulate", action="store_true", help="roll out as a simulator does, and check the images")
     kinds.add_argument("--soak", type=int, metavar="N", help="send N requests in random order instead")
     kinds.add_argument("--offered", type=int, metavar="N", help="memory of servers that offer 2 and N scenes instead")
+    parser.add_argument("--kinds", type=int, default=60, metavar="N", help="with --soak: different requests (60)")
     parser.add_argument("--log", type=Path, metavar="CSV", help="with --soak: memory and open files over time")
     parsed = parser.parse_args(arguments)
     sources = find_sources(parsed.paths)
@@ -302,9 +302,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     options = ["--jpeg", parsed.jpeg, "--max-loaded", str(len(sources))]
     with running_server(parsed.paths, parsed.device, options) as server:
-        rigs = list(_rigs(RenderClient(server.address), sources))
+        client = RenderClient(server.address)
+        rigs = [_rig(client, name, source) for name, source in sources.items()]
         if parsed.soak is not None:
-            each = -(-DISTINCT // (len(rigs) * len(YAWS)))
+            each = -(-parsed.kinds // (len(rigs) * len(YAWS)))
             batches = [batch(rig, i / each) for rig in rigs for i in range(each)]
             print(soak(server, batches, parsed.soak, max(2, parsed.rollouts), parsed.log))
         elif parsed.simulate:

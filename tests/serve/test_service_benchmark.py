@@ -12,7 +12,7 @@ from helpers.served_drives import served
 
 from benchmarks import sensor_service
 from benchmarks.sensor_client import FORMATS, RenderClient, RigRequests, RunningServer
-from benchmarks.sensor_service import DISTINCT, copies, memory, simulate, soak, speed
+from benchmarks.sensor_service import copies, memory, simulate, soak, speed
 from drivesplat.serve.faults import invalid
 from drivesplat.serve.scenes import find_sources
 from drivesplat.serve.service import SensorService
@@ -100,7 +100,7 @@ def test_memory_is_that_of_a_server_that_offers_more_than_it_loads(results, tmp_
 
 
 def test_a_wrong_image_ends_a_soak(server, batches, monkeypatch, tmp_path):
-    assert "0 wrong images" in soak(server, batches, 10, 2, tmp_path / "soak.csv") and DISTINCT > 0
+    assert "0 wrong images" in soak(server, batches, 10, 2, tmp_path / "soak.csv")
     table = np.genfromtxt(tmp_path / "soak.csv", delimiter=",", names=True)
     assert table.dtype.names == ("seconds", "memory_mb", "open_files") and len(table) >= 2
     assert (table["memory_mb"] > 50.0).all() and (table["open_files"] > 3).all()
