@@ -62,7 +62,7 @@ class KeptCameras:
     """The cameras that were used last: at most `max_count`, of at most `max_bytes`, and always the last one.
 
     A camera that makes place gives up the directions of its lens; a request that still has it computes them again when
-    it is rendered. So calls that wait hold no memory of lenses. Any thread may call `camera`.
+    it is rendered. So the lenses of calls that wait are within the limit, too. Any thread may call `camera`.
     """
 
     def __init__(self, max_bytes: int = MAX_KEPT_BYTES, max_count: int = MAX_CAMERAS):
@@ -76,8 +76,8 @@ class KeptCameras:
         return sum(size for _, size in self._cameras.values())
 
     def camera(self, key: CameraKey) -> PoseableCamera:
-        """The camera of a key. Lenses are computed one at a time, each of them once, while others are looked
-        up. Raises ServiceError for what is no camera."""
+        """The camera of a key. Lenses are computed one at a time, and a lens that several threads ask for is computed
+        once; cameras that are there do not wait. Raises ServiceError for what is no camera."""
         found = self._use(key)
         if found is None:
             found = _camera(*key)
@@ -135,7 +135,11 @@ def _lens_bytes(camera: PoseableCamera) -> int:
     with as_service_errors():
         faces = camera.faces
     if sum(face.width * face.height for face in faces) > MAX_PIXELS:
-        raise ServiceError("RESOURCE_EXHAUSTED", f"the lens is resampled from more than {MAX_PIXELS} pixels")
+        raise ServiceError(
+            "RESOURCE_EXHAUSTED",
+            f"the lens is resampled from more than {MAX_PIXELS} pixels: ask for a smaller image, or give it a smaller "
+            "max_angle",
+        )
     return sum(each.nbytes for face in faces for each in (face.shows, face.places, face.distance_by_depth))
 
 
