@@ -2,7 +2,7 @@
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl and parser.npz, masks/masks.json (and the PNGs beside it);
-# where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
+# where the settings name a segmentation network, segmented/masks.json (and the PNGs beside it); where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
 # lidar_depth.npz and scans.npz; light.json for edits that insert objects. The scene of all rules after these (plan.scene) is the refined one where there is one.
 # What depends on tracks is made for each kind of tracks that methods train with (tracks.smk): the wildcard {tracks} is
 # empty for annotated ones, else the folder 'discovered/' or 'unlabelled/'.
@@ -151,6 +151,35 @@ rule parser:
         "../workflow_scripts/parser.py"
 
 
+rule segment:
+    """
+    Makes class maps, sky masks and vehicle masks of all images by a segmentation network. Runs only where the settings
+    name one (segment.model), and downloads nothing.
+    """
+    input:
+        scene=plan.annotated_scene,
+        network=plan.network_files,
+    output:
+        maps="<results>/{scene}/segmented/masks.json",
+    log:
+        "<logs>/{scene}/segment.log",
+    benchmark:
+        "<benchmarks>/{scene}/segment.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=4)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("segment"),
+        code=plan.code("segment"),
+    script:
+        "../workflow_scripts/segment.py"
+
+
 rule masks:
     """
     Labels every pixel of every image as static, parked, moving or ignored (from the annotated boxes), and as sky.
@@ -158,6 +187,8 @@ rule masks:
     input:
         scene=plan.scene,
         own_car="<results>/{scene}/own_car.json",
+        # read as folders of the user's
+        segmented=plan.segmented,
     output:
         masks="<results>/{scene}/masks/masks.json",
     log:

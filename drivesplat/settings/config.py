@@ -34,6 +34,7 @@ from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.removed import in_this_version, refuse_removed
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.scans import ScanSettings
+from drivesplat.settings.segment import SegmentSettings
 from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.visuals import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.without_boxes import REPLACED, substitutes
@@ -41,7 +42,7 @@ from drivesplat.settings.world import CameraChannel
 
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
-    "lidar_depth", "scans", "discover", "masks", "sky", "train", "render", "ghosts", "removal", "export",
+    "lidar_depth", "scans", "discover", "masks", "segment", "sky", "train", "render", "ghosts", "removal", "export",
     "device", "replace_street",
 )  # fmt: skip
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
@@ -86,6 +87,7 @@ class Config(Settings):
     scans: ScanSettings = ScanSettings()
     discover: DiscoverSettings = DiscoverSettings()
     masks: MaskSettings = MaskSettings()
+    segment: SegmentSettings = SegmentSettings()
     sky: SkyKind = "cubemap"
     """:printed: Sky model behind the Gaussians: 'cubemap' (learned colours by direction), 'mask' (one learned colour,
     opacity penalised in sky pixels) or 'none' (black). Without a cube map, Gaussians fill the sky."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from drivesplat.errors import ConfigError, DriveSplatError
+from drivesplat.preprocess.segmentation.weights import weights_files
 from drivesplat.provenance.file_digests import record_output
 from drivesplat.readers.datasets import index, layout
 from drivesplat.readers.truth import TRUTH_FILE
@@ -13,8 +14,10 @@ from drivesplat.scene.scene import REFINED
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.names import suggestion
+from drivesplat.settings.segment import local_path
 from drivesplat.settings.tracks import OTHER_TRACKS, TRACK_FOLDERS, Tracks
 from drivesplat.settings.world import CameraChannel
+from drivesplat.workflow.segmented import SEGMENTED, replaced_masks
 from drivesplat.workflow.stages import SCAN_BASELINES, SCANS, refines_poses, training_inputs
 from drivesplat.workflow.without_cameras import has_cameras
 from drivesplat.workflow.without_tracks import methods_of
@@ -187,6 +190,22 @@ class Inputs:
         of_any = (method.tracks for method in methods_of(self.config, wildcards.scene).values())
         wanted = "discovered" in ([self.tracks(wildcards)] if alone else of_any)
         return [f"{self.config.results_dir}/{wildcards.scene}/discovered.json"] if wanted else []
+
+    def segmented(self, wildcards: Any) -> list[str]:
+        """The record of a scene's maps by a network, if its masks use them."""
+        used = replaced_masks(for_scene(self.config, wildcards.scene))
+        return [f"{self.config.results_dir}/{wildcards.scene}/{SEGMENTED}/masks.json"] if used else []
+
+    def network_files(self, wildcards: Any) -> list[str]:
+        """The files of the segmentation network of a scene, if they are the user's own. Raises ConfigError where they
+        are missing, or the settings name no network."""
+        found = for_scene(self.config, wildcards.scene).segment
+        if found.model is None:
+            raise ConfigError(
+                f"scene {wildcards.scene} has no maps by a network: segment.model is null; name one (docs/masks.md)"
+            )
+        path = local_path(found.model)
+        return [] if path is None else [str(file) for file in weights_files(path)]
 
     def triangulated(self, wildcards: Any) -> list[str]:
         """The points triangulated by pose refinement, if seeds use them."""

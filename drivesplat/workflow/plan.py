@@ -39,6 +39,7 @@ from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.recordings import Recordings
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.runs_file import RUNS, no_such_run, runs_of
+from drivesplat.workflow.segmented import SEGMENTED
 from drivesplat.workflow.stages import idle_variants
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
 from drivesplat.workflow.without_tracks import known_methods, methods_of
@@ -141,7 +142,7 @@ class Plan(JobResources):
                     f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: "
                     f"{', '.join(self.config.methods)}"
                 )
-            if len(rest) > 1 and rest[0] not in (*known_methods(self.config, scene), *OTHER_TRACKS, "masks"):
+            if len(rest) > 1 and rest[0] not in (*known_methods(self.config, scene), *OTHER_TRACKS, "masks", SEGMENTED):
                 more = f"; for the ablation: {ablation.job.name_pattern}" if self.config.ablated else ""
                 meant, known = suggestion(rest[0], methods), ", ".join(methods)
                 raise ConfigError(f"method {rest[0]!r} is not in the config; {meant}there are: {known}{more}")

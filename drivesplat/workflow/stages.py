@@ -38,6 +38,7 @@ from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, Region
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob, TruthFilmJob
 from drivesplat.settings.scans import ScansJob
+from drivesplat.settings.segment import SegmentJob
 from drivesplat.settings.simulate import RunJob
 from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
@@ -46,6 +47,7 @@ from drivesplat.settings.world import WorldDonor, WorldJob
 from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.named_tracks import fitting_edits, shows_subject
 from drivesplat.workflow.runs_file import code_of, no_such_run, runs_of
+from drivesplat.workflow.segmented import mask_settings, segment_job
 from drivesplat.workflow.without_cameras import (
     CAMERA_STAGES,
     HOW,
@@ -64,8 +66,8 @@ METHOD_STAGES = (TRAIN, "evaluate")
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
-    WORLD, "extract", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
-    "scan_folder", "run", "run_folder",
+    WORLD, "extract", "masks", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer",
+    "drive_folder", "scan_folder", "run", "run_folder",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
@@ -352,17 +354,15 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "refine_poses": (RefinePosesJob, _lidar_rays),
     "lidar_seed": (SeedJob, _nothing),
     "parser": (ParserJob, _nothing),
-    "masks": (MaskJob, _nothing),
+    "segment": (SegmentJob, lambda at: dict(segment_job(at.config))),
+    "masks": (MaskJob, lambda at: {"masks": mask_settings(at.config, at.scene)}),
     "light": (LightJob, _nothing),
     "relabel": (Settings, _nothing),
     "regions": (RegionJob, _nothing),
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
     "lidar_depth": (
         LidarDepthJob,
-        lambda at: {
-            "ray_spacing": at.config.lidar_depth.ray_spacing,
-            **_lidar(at, "own_car_radius", "box_margin"),
-        },
+        lambda at: {"ray_spacing": at.config.lidar_depth.ray_spacing} | _lidar(at, "own_car_radius", "box_margin"),
     ),
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),

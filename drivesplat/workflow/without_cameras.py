@@ -12,14 +12,14 @@ LIDAR_SCENE_STAGES = ("extract", "parser", "scene_metrics")
 LIDAR_METHOD_STAGES = ("train", "evaluate_scans")
 """The stages behind the metrics.json of a scene without cameras, of the scene and of each of its methods."""
 CAMERA_STAGES = (
-    "own_car", "lidar_seed", "masks", "regions", "lidar_depth", "evaluate", "ablation", "tracks",
+    "own_car", "lidar_seed", "segment", "masks", "regions", "lidar_depth", "evaluate", "ablation", "tracks",
     "film", "film_parts", "truth_film", "compare", "edit", "quad", "drive_folder", "ghost_panel", "remove_actor",
     "far_gaussians", "export", "export_usd", "export_viewer", "export_colmap", "export_spz", "export_sog",
     "export_alpasim",
 )  # fmt: skip
 """Stages that need images."""
 IMAGE_RESULTS = (
-    "own_car.json", "triangulated.npz", "seed.ply", "masks", "lidar_depth.npz",
+    "own_car.json", "triangulated.npz", "seed.ply", "masks", "segmented", "lidar_depth.npz",
     "tracks.csv", "tracks.png", "compare.mp4", "compare.json", "ablation.csv", "ablation.json",
 )  # fmt: skip
 """The files and folders of a scene that these stages make."""
