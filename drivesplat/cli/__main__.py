@@ -17,7 +17,7 @@ from pathlib import Path
 
 import drivesplat
 from drivesplat import SNAKEFILE, WORKFLOW
-from drivesplat.cli import assets, imports, serve
+from drivesplat.cli import assets, imports, segment, serve
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import default_config, in_this_copy, of_the_workflow
@@ -85,6 +85,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     serve.add_parser(commands)
     assets.add_parser(commands)
     imports.add_parser(commands)
+    segment.add_parser(commands)
 
     mcap = commands.add_parser("mcap", help="write a drive folder as an MCAP file for ROS 2 (docs/mcap.md)")
     mcap.add_argument("folder", type=Path, help="with drive.json, recorded or rendered")
@@ -145,6 +146,8 @@ def run_command(parsed: argparse.Namespace) -> int:
         return assets.run_assets(parsed)
     if parsed.command == imports.COMMAND:
         return imports.run_import(parsed)
+    if parsed.command == segment.COMMAND:
+        return segment.run_segment(parsed)
     if parsed.command == "mcap":
         from drivesplat.export.drive_mcap import write_mcap
 

@@ -8,6 +8,7 @@
 - segmented/{digest of the settings}/regions/…: the labels from boxes, left out where the map contradicts
 """
 
+import logging
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -35,8 +36,16 @@ from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.segment import SegmentJob, local_path
 
+log = logging.getLogger(__name__)
+
 CACHE = ".segmented"
 """The folder below that of all results with the labels of images, by digest."""
+MIN_SKY = 0.005
+"""Minimum share of sky over all images, as of the heuristic. Below it the network may have overlooked the sky."""
+NO_SKY = (
+    "scene %s: %s sees no sky, as is usual in a tunnel; if there is some, write segment: {use: [semantic]}, which finds "
+    "the sky by the heuristic"
+)
 MOVABLE = class_numbers((*VEHICLES, *PEOPLE))
 
 
@@ -88,6 +97,8 @@ def make_maps(scene: Scene, job: SegmentJob, network: Network, folder: Path, cac
         if other.is_dir() and not other.name.startswith(".") and other.name != job.folder:
             shutil.rmtree(other, ignore_errors=True)
     sky, vehicles, unlabelled = np.mean(shares, axis=0).tolist()
+    if sky < MIN_SKY:
+        log.warning(NO_SKY, scene.name, job.model)
     return MapsRecord(
         job.model, network.digest, network.labels.name, CLASSES, len(scene.frames), reused, job.folder, sky, vehicles,
         unlabelled,

@@ -51,25 +51,31 @@ class NetworkInput:
 
 
 class Network(ABC):
-    """A network with its `labels` and what it takes as `input`. `digest` changes where its labels of an image may."""
+    """What gives every pixel of an image one of its `labels`. `digest` changes where the labels of an image may."""
+
+    def __init__(self, labels: LabelSet, digest: str, batch: int = 1):
+        self.labels, self.digest, self.batch = labels, digest, batch
+
+    @abstractmethod
+    def segment(self, images: UInt8[np.ndarray, "n h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "n v u"]:
+        """The label of every pixel of at most `batch` images of one size, at `size` (width, height)."""
+
+
+class ScoreNetwork(Network):
+    """A network that takes images as `taken` says, and scores labels on a coarser grid."""
 
     def __init__(self, labels: LabelSet, taken: NetworkInput, digest: str, device: torch.device):
-        self.labels, self.input, self.digest, self.device = labels, taken, digest, device
+        super().__init__(labels, digest, BATCH if device.type == "cuda" else 1)
+        self.taken, self.device = taken, device
 
     @abstractmethod
     def scores(self, inputs: Float[Tensor, "n 3 a b"]) -> Float[Tensor, "n c p q"]:
         """The scores of all labels in prepared images; the highest wins."""
 
     def segment(self, images: UInt8[np.ndarray, "n h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "n v u"]:
-        """The label of every pixel of images of one size, at `size` (width, height)."""
         found = []
         with torch.inference_mode():
-            for scores in self.scores(self.input.prepare(images, self.device)).float():
+            for scores in self.scores(self.taken.prepare(images, self.device)).float():
                 full = F.interpolate(scores[None], (size[1], size[0]), mode="bilinear", align_corners=False)
                 found.append(full[0].argmax(0).to(torch.uint8).cpu().numpy())
         return np.stack(found)
-
-    @property
-    def batch(self) -> int:
-        """The number of images that it segments at a time."""
-        return BATCH if self.device.type == "cuda" else 1

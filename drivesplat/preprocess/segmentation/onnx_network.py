@@ -8,12 +8,12 @@ from torch import Tensor
 
 from drivesplat.errors import ConfigError
 from drivesplat.preprocess.segmentation.label_sets import label_set
-from drivesplat.preprocess.segmentation.network import Network, NetworkInput
+from drivesplat.preprocess.segmentation.network import NetworkInput, ScoreNetwork
 from drivesplat.preprocess.segmentation.weights import missing_package, weights_digest, weights_files
 from drivesplat.settings.segment import LabelSetName
 
 
-class OnnxNetwork(Network):
+class OnnxNetwork(ScoreNetwork):
     """The network in an .onnx file: one input (n, 3, h, w) float32, RGB normalised as for ImageNet; the first output
     (n, labels, h', w') scores. A fixed size of the input is kept, a fixed number of images, too. On a GPU where
     onnxruntime has its provider."""

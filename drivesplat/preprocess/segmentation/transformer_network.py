@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.preprocess.segmentation.label_sets import label_set
-from drivesplat.preprocess.segmentation.network import IMAGENET_MEAN, IMAGENET_STD, Network, NetworkInput
+from drivesplat.preprocess.segmentation.network import IMAGENET_MEAN, IMAGENET_STD, NetworkInput, ScoreNetwork
 from drivesplat.preprocess.segmentation.weights import missing_package, weights_digest, weights_files
 from drivesplat.settings.segment import LabelSetName
 
@@ -20,7 +20,7 @@ UNNAMED = "label_"
 PREPROCESSOR = "preprocessor_config.json"
 
 
-class TransformerNetwork(Network):
+class TransformerNetwork(ScoreNetwork):
     """The network in a folder of transformers: config.json, weights, preprocessor_config.json."""
 
     def __init__(self, name: str, folder: Path, device: torch.device, labels: LabelSetName | None, height: int | None):
@@ -61,7 +61,7 @@ class TransformerNetwork(Network):
         try:
             found = self._model(pixel_values=inputs)
         except (ValueError, RuntimeError) as error:
-            if self.input.size is not None or "CUDA" in str(error):
+            if self.taken.size is not None or "CUDA" in str(error):
                 raise
             raise DriveSplatError(
                 f"segment.model: {self._name} takes no images of {inputs.shape[3]}x{inputs.shape[2]} pixels; write "

@@ -11,6 +11,8 @@ from drivesplat.settings.segment import DEFAULT_MODEL
 
 EXTRA = "pip install 'drivesplat[segment]'"
 CONFIG, SAFETENSORS, PICKLED = "config.json", ".safetensors", "pytorch_model"
+MAX_QUOTED = 200
+"""Maximum number of characters of a message of others."""
 OF_ADE20K = "ADE20K, whose images may be used for non-commercial research and education alone"
 
 
@@ -55,7 +57,7 @@ def fetch(model: str) -> Path:
     except DriveSplatError:
         raise
     except Exception as error:  # of the library and of those that it calls; they share no base class
-        why = str(error).strip().partition("\n")[0] or type(error).__name__
+        why = (str(error).strip().partition("\n")[0] or type(error).__name__)[:MAX_QUOTED]
         raise DriveSplatError(
             f"{model} cannot be fetched ({why}); check its name and the network, or copy its files from another "
             "machine and name their folder as segment.model"
