@@ -1,7 +1,7 @@
 """The command `drivesplat segment`: weights of segmentation networks.
 
 drivesplat segment fetch
-drivesplat segment fetch Intel/dpt-large-ade
+drivesplat segment fetch openmmlab/upernet-convnext-tiny
 """
 
 import argparse

@@ -23,7 +23,7 @@ class SegmentSettings(Settings):
     model: str | None = None
     """:printed: Network: 'default', a name on Hugging Face (owner/name), a folder with the files of a model, or an
     .onnx file. null = none: the sky is found by a heuristic. docs/masks.md"""
-    use: tuple[MapKind, ...] = ("sky", "semantic")
+    use: tuple[MapKind, ...] = ("sky",)
     """What its maps replace where masks.sky_folder, masks.semantic_folder or masks.regions_folder is not set: 'sky',
     'semantic' (class maps for train.semantic_weight), 'regions' (labels from boxes, left out of all metrics but `all`
     where the map contradicts)."""

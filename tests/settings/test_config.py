@@ -22,10 +22,12 @@ LOOKS = (
     "truth_film",
 )  # fmt: skip
 OF_SCENES = (
-    *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "tracks", "compare",
+    *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "segment", "tracks",
+    "compare",
 )  # fmt: skip
 STAGES = (
-    *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "train", "evaluate", *LOOKS,
+    *SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "discover", "relabel", "regions", "segment", "train",
+    "evaluate", *LOOKS,
 )  # fmt: skip
 PUBLISHED = {"source": "A paper", "url": "https://example.org", "scene": "0061", "method": "M", "psnr": 20.0}
 
@@ -352,7 +354,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_any_st
             "truth_film",
         ),
         (at("sweeps", True), "extract evaluate"),
-        (at("images.width", 320), "lidar_seed parser masks regions actors lidar_depth evaluate film"),
+        (at("images.width", 320), "lidar_seed parser segment masks regions actors lidar_depth evaluate film"),
         (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth scans evaluate film"),
         (
             at("cameras", ["CAM_FRONT", "CAM_BACK"]) | at("holdout.cameras", ["CAM_BACK"]),
@@ -367,6 +369,9 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_any_st
         (at("actors.humans", True), "actors tracks"),
         (at("datasets.nuscenes.overrides", {"actors": {"max_points": 9}}), "actors tracks"),
         (at("masks.sky_folder", "sky"), "masks"),
+        (at("segment.model", "a/b"), "segment masks"),
+        (at("segment", {"use": ["regions"]}), ""),
+        (at("segment.height", 64), "segment"),
         (at("masks.own_car_polygons", {"CAM_FRONT": [[0, 0], [1, 1], [0, 1]]}), "own_car masks"),
         (at("lidar_depth.ray_spacing", [1, 1]), "lidar_depth evaluate"),
         (at("scans.azimuth_steps", 1042), "scans"),

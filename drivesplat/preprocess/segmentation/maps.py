@@ -43,8 +43,8 @@ CACHE = ".segmented"
 MIN_SKY = 0.005
 """Minimum share of sky over all images, as of the heuristic. Below it the network may have overlooked the sky."""
 NO_SKY = (
-    "scene %s: %s sees no sky, as is usual in a tunnel; if there is some, write segment: {use: [semantic]}, which finds "
-    "the sky by the heuristic"
+    "scene %s: %s sees no sky, as is usual in a tunnel; where there is some, leave sky out of segment.use, so that the "
+    "heuristic looks for it"
 )
 MOVABLE = class_numbers((*VEHICLES, *PEOPLE))
 

@@ -52,7 +52,7 @@ class TransformerNetwork(ScoreNetwork):
         named = None if all(one.lower().startswith(UNNAMED) for one in names) else names
         super().__init__(
             label_set(name, config.num_labels, named, labels),
-            network_input(folder, height),
+            network_input(folder, height, getattr(config, "image_size", None)),
             weights_digest(files, height),
             device,
         )
@@ -61,11 +61,12 @@ class TransformerNetwork(ScoreNetwork):
         try:
             found = self._model(pixel_values=inputs)
         except (ValueError, RuntimeError) as error:
-            if self.taken.size is not None or "CUDA" in str(error):
+            if "CUDA" in str(error):
                 raise
+            pixels, other = f"{inputs.shape[3]}x{inputs.shape[2]}", "a number" if self.taken.size else "null"
             raise DriveSplatError(
-                f"segment.model: {self._name} takes no images of {inputs.shape[3]}x{inputs.shape[2]} pixels; write "
-                "segment: {height: null} for the size that it was trained with"
+                f"segment.model: {self._name} takes no images of {pixels} pixels; set segment.height to {other}, or "
+                "name another model"
             ) from error
         if not self._of_queries:
             return found.logits
@@ -74,9 +75,10 @@ class TransformerNetwork(ScoreNetwork):
         return torch.einsum("nqc,nqhw->nchw", of_labels, found.masks_queries_logits.sigmoid())
 
 
-def network_input(folder: Path, height: int | None) -> NetworkInput:
-    """What a network takes, by the file preprocessor_config.json in its folder; without the file, or without a
-    `height` and a size there, the values of ImageNet and 512 pixels."""
+def network_input(folder: Path, height: int | None, trained: int | None = None) -> NetworkInput:
+    """What a network takes: images of `height` pixels; where that is None, of the size in the preprocessor_config.json
+    of its `folder`, else `trained` pixels wide and high, else 512 pixels high. The normalisation is that of the file,
+    else ImageNet's. Raises ConfigError where the file is damaged."""
     try:
         stated = json.loads((folder / PREPROCESSOR).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -86,7 +88,7 @@ def network_input(folder: Path, height: int | None) -> NetworkInput:
     mean, std = (tuple(stated.get(key) or usual) for key, usual in NORMALISATION.items())
     if height is not None:
         return NetworkInput(mean, std, None, height)
-    size = stated.get("size") or {}
+    size = stated.get("size") or (trained if isinstance(trained, int) else {})
     sides = {"height": size, "width": size} if isinstance(size, int) else size
     if {"height", "width"} <= sides.keys():
         return NetworkInput(mean, std, (sides["width"], sides["height"]))

@@ -28,8 +28,7 @@ class KnownWeights:
 KNOWN = {
     DEFAULT_MODEL: KnownWeights("MIT", 328, OF_ADE20K),
     "openmmlab/upernet-convnext-tiny": KnownWeights("MIT", 241, OF_ADE20K),
-    "openmmlab/upernet-convnext-large": KnownWeights("MIT", 940, OF_ADE20K),
-    "Intel/dpt-large-ade": KnownWeights("Apache-2.0", 1370, OF_ADE20K),
+    "openmmlab/upernet-convnext-base": KnownWeights("MIT", 489, OF_ADE20K),
 }
 
 
