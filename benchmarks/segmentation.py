@@ -1,4 +1,4 @@
-"""What maps by a network are worth: true maps of synthetic worlds in place of a network's, against the heuristic.
+"""The effect of maps by a network: true maps of synthetic worlds in place of a network's, against the heuristic.
 
     python -m benchmarks.segmentation --out results/segmentation -- --cores 16
     python -m benchmarks.segmentation --out /tmp/tiny --worlds 1 --width 160 --iterations 200 -- --cores 2
