@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -187,6 +188,18 @@ def test_weights_that_are_not_here_are_named_with_the_command_that_fetches_them(
     )
     with pytest.raises(ConfigError, match=r"neither a folder, nor an \.onnx file, nor a name on Hugging Face"):
         open_network(job("a//b"), CPU)
+
+
+def test_fetched_weights_are_found_without_a_network(monkeypatch, upernets, tmp_path):
+    """In the layout of Hugging Face's cache."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    folder = tmp_path / f"models--{DEFAULT_MODEL.replace('/', '--')}"
+    (folder / "refs").mkdir(parents=True)
+    (folder / "refs/main").write_text("0" * 40)
+    shutil.copytree(upernets["ade20k"], folder / "snapshots" / ("0" * 40))
+    monkeypatch.setattr("socket.socket.connect", None)
+    network = open_network(job(DEFAULT_MODEL), CPU)
+    assert network.labels.name == "ade20k" and network.digest == open_network(job(upernets["ade20k"]), CPU).digest
 
 
 @pytest.mark.parametrize(("package", "model"), [("transformers", "folder"), ("onnxruntime", "net.onnx")])
