@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 CACHE = ".segmented"
 """The folder below that of all results with the labels of images, by digest."""
 MIN_SKY = 0.005
-"""Minimum share of sky over all images, as of the heuristic. Below it the network may have overlooked the sky."""
+"""Minimum share of sky over all images, that of the heuristic. Below it the network may have overlooked the sky."""
 NO_SKY = (
     "scene %s: %s sees no sky, as is usual in a tunnel; where there is some, leave sky out of segment.use, so that the "
     "heuristic looks for it"

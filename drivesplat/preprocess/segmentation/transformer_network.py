@@ -17,6 +17,8 @@ OF_QUERIES = ("mask2former", "maskformer")
 """Architectures that give masks and the labels of masks, not the labels of pixels."""
 UNNAMED = "label_"
 """How transformers calls labels without a name, in small letters."""
+OF_TRAINING = "auxiliary_head"
+"""How the names of layers begin that only a training uses."""
 PREPROCESSOR = "preprocessor_config.json"
 
 
@@ -41,10 +43,11 @@ class TransformerNetwork(ScoreNetwork):
             raise ConfigError(
                 f"segment.model: {name} cannot be opened as a network that segments images ({why})"
             ) from None
-        if loading["missing_keys"]:
+        learned = {key for key, _ in self._model.named_parameters() if not key.startswith(OF_TRAINING)}
+        if missing := sorted(learned & set(loading["missing_keys"])):
             raise ConfigError(
-                f"segment.model: {name} has no weights of its last layers ({min(loading['missing_keys'])}); it was not "
-                "trained to segment images"
+                f"segment.model: {name} has no weights of some layers ({missing[0]}), so it was not trained to segment "
+                "images; name another"
             )
         self._name, self._of_queries = name, of_queries
         self._model.eval().requires_grad_(False).to(device)
