@@ -17,6 +17,7 @@ SNAKEFILE = WORKFLOW / "Snakefile"
 _PUBLIC = {
     "open": ("drivesplat.drive.trained_drive", "open_drive"),
     "render_poses": ("drivesplat.drive.render_files", "render_poses"),
+    "LongDrive": ("drivesplat.drive.long_drive", "LongDrive"),
     "TrainedDrive": ("drivesplat.drive.trained_drive", "TrainedDrive"),
     "Camera": ("drivesplat.drive.cameras", "PoseableCamera"),
     "LiveServer": ("drivesplat.drive.live_server", "LiveServer"),

@@ -260,7 +260,7 @@ class Config(Settings):
     def dataset_of(self, scene: str) -> str:
         """The name of a scene's dataset. Raises ConfigError, with the list of scenes, for an unknown scene."""
         drive = scene if scene in self.dataset_names else drive_of(scene)
-        if drive not in self.dataset_names or (drive != scene and not self.is_cut(drive)):
+        if not self.is_scene(scene):
             raise ConfigError(
                 f"scene {scene!r} is not in the config; {suggestion(scene, self.scenes)}"
                 f"there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
@@ -268,8 +268,8 @@ class Config(Settings):
         return self.dataset_names[drive]
 
     def is_cut(self, scene: str) -> bool:
-        """Whether a configured scene is cut into blocks."""
-        return self.datasets[self.dataset_names[scene]].blocks is not None
+        """Whether this is a configured scene that is cut into blocks."""
+        return scene in self.dataset_names and self.datasets[self.dataset_names[scene]].blocks is not None
 
     def is_scene(self, name: str) -> bool:
         """Whether this is the name of a configured scene, or that of a block of one."""
@@ -277,8 +277,7 @@ class Config(Settings):
 
     def is_block(self, name: str) -> bool:
         """Whether this is the name of a block of a scene that is cut into blocks, which need not exist."""
-        drive = drive_of(name)
-        return name not in self.dataset_names and drive in self.dataset_names and self.is_cut(drive)
+        return name not in self.dataset_names and self.is_cut(drive_of(name))
 
 
 def in_current_names(values: Mapping[Any, Any]) -> tuple[dict[Any, Any], list[str]]:

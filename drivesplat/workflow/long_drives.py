@@ -1,14 +1,21 @@
 """Drives that are cut into blocks: which scenes they become, and the files that blocks and drives are made from."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.blocks import block_scene_name, drive_of
+from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.outputs import Outputs
+
+OF_DRIVES = (
+    "scene.json", "scene_refined.json", "poses.json", "triangulated.npz", "blocks.json", "metrics.json", "index.html",
+)  # fmt: skip
+"""The results of a drive that is cut into blocks; others are those of blocks."""
+FILM_FILES = (".mp4", ".cameras.json")
 
 
 class LongDrives:
@@ -57,3 +64,18 @@ class LongDrives:
         if drive not in self._read:
             self._read[drive] = json.loads(Path(self._blocks_file(drive)).read_text(encoding="utf-8"))["blocks"]
         return self._read[drive]
+
+
+def refuse_results_of_blocks(config: Config, scene: str, path: Sequence[str]) -> None:
+    """Raises ConfigError if `path` below the folder of a drive that is cut into blocks is a result that only blocks
+    have."""
+    if not config.is_cut(scene):
+        return
+    trajectories = for_scene(config, scene).render.trajectories.items()
+    films = [name for name, trajectory in trajectories if trajectory.parts == "all"]
+    own = {"eval.json", "eval_objects.json", *(f"{name}{end}" for name in films for end in FILM_FILES)}
+    if len(path) > 2 or path[-1] not in (own if len(path) == 2 else OF_DRIVES):
+        raise ConfigError(
+            f"scene {scene} is cut into blocks, and {'/'.join(path)} is a result of one block: ask for "
+            f"{config.results_dir}/{block_scene_name(scene, 0)}/{'/'.join(path)} (docs/long_drives.md)"
+        )

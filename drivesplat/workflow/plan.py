@@ -18,7 +18,7 @@ from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
-from drivesplat.settings.blocks import block_scene_name, drive_of
+from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.tracks import OTHER_TRACKS
@@ -34,6 +34,7 @@ from drivesplat.workflow.film_names import (
 from drivesplat.workflow.film_pages import FilmPages
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
+from drivesplat.workflow.long_drives import refuse_results_of_blocks
 from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.recordings import Recordings
@@ -46,18 +47,6 @@ from drivesplat.workflow.without_tracks import known_methods, methods_of
 from drivesplat.world.marker import refuse_foreign_data
 
 ABLATION_FILES = ("ablation.json", "ablation.csv")
-OF_DRIVES = (
-    "scene.json",
-    "scene_refined.json",
-    "poses.json",
-    "triangulated.npz",
-    "own_car.json",
-    "blocks.json",
-    "metrics.json",
-    "index.html",
-)
-"""The results of a drive that is cut into blocks; others are those of blocks."""
-FILM_FILES = (".mp4", ".cameras.json")
 
 
 def let_scripts_import(folder: str) -> None:
@@ -135,7 +124,7 @@ class Plan(JobResources):
             if not rest:
                 continue
             self.config.dataset_of(scene)
-            self._refuse_results_of_blocks(scene, rest)
+            refuse_results_of_blocks(self.config, scene, rest)
             methods = methods_of(self.config, scene)
             if rest[0] in ABLATION_FILES and not self.config.ablated:
                 raise ConfigError(
@@ -157,20 +146,6 @@ class Plan(JobResources):
                 )
             if len(rest) > 1 and rest[0] in known_methods(self.config, scene):
                 self._refuse_unknown_film(scene, rest[0], rest[1:])
-
-    def _refuse_results_of_blocks(self, scene: str, path: list[str]) -> None:
-        """Raises ConfigError if `path` below the folder of a drive that is cut into blocks is a result that only blocks
-        have."""
-        if self.config.is_block(scene) or not self.config.is_cut(scene):
-            return
-        trajectories = for_scene(self.config, scene).render.trajectories.items()
-        films = [name for name, trajectory in trajectories if trajectory.parts == "all"]
-        own = ("eval.json", "eval_objects.json", *(f"{name}{end}" for name in films for end in FILM_FILES))
-        if len(path) > 2 or (len(path) == 2 and path[1] not in own) or (len(path) == 1 and path[0] not in OF_DRIVES):
-            raise ConfigError(
-                f"scene {scene} is cut into blocks, and {'/'.join(path)} is a result of one block: ask for "
-                f"{self.config.results_dir}/{block_scene_name(scene, 0)}/{'/'.join(path)} (docs/long_drives.md)"
-            )
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""

@@ -136,11 +136,10 @@ def _refines(at: JobScope) -> bool:
 def stages_of_metrics(config: Config, scene: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The stages of a scene, and those of each of its methods, behind its metrics.json."""
     refinement = ("refine_poses",) if refines_poses(config, scene) else ()
-    cut = not config.is_block(scene) and config.is_cut(scene)
-    of_blocks, of_their_methods = (("block",), ("evaluate_blocks",)) if cut else ((), ())
+    block, pooled = (("block",), ("evaluate_blocks",)) if config.is_cut(scene) else ((), ())
     if not has_cameras(config, scene):
-        return (*LIDAR_SCENE_STAGES, *refinement, *of_blocks), (*LIDAR_METHOD_STAGES, *of_their_methods)
-    return (*SCENE_STAGES, *refinement, *of_blocks), (*METHOD_STAGES, *of_their_methods)
+        return (*LIDAR_SCENE_STAGES, *refinement, *block), (*LIDAR_METHOD_STAGES, *pooled)
+    return (*SCENE_STAGES, *refinement, *block), (*METHOD_STAGES, *pooled)
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
@@ -341,12 +340,21 @@ def _run(at: JobScope) -> dict[str, Any]:
     return {"run": run, "edit": edit, "code": code_of(run.policy), "crf": at.config.render.crf}
 
 
+def _shown_time(at: JobScope) -> dict[str, Any]:
+    return {"time_s": at.config.export.time_s}
+
+
 def _encoding(at: JobScope) -> dict[str, Any]:
     """How films that combine others are encoded."""
     return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
 
 
+_WITHOUT_SETTINGS = (
+    "relabel", SCAN_BASELINES, "lidar_picture", "scene_metrics", "drive_mcap", "export_colmap", "export_spz",
+    "export_sog",
+)  # fmt: skip
 _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] = {
+    **dict.fromkeys(_WITHOUT_SETTINGS, (Settings, _nothing)),
     "demo_world": (WorldJob, _world),
     "extract": (SceneSource, _scene_source),
     **dict.fromkeys(("blocks", "block", "evaluate_blocks"), (BlocksJob, lambda at: {"blocks": at.dataset.blocks})),
@@ -357,7 +365,6 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "segment": (SegmentJob, lambda at: dict(segment_job(at.config))),
     "masks": (MaskJob, lambda at: {"masks": mask_settings(at.config, at.scene)}),
     "light": (LightJob, _nothing),
-    "relabel": (Settings, _nothing),
     "regions": (RegionJob, _nothing),
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
     "lidar_depth": (
@@ -365,14 +372,11 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
         lambda at: {"ray_spacing": at.config.lidar_depth.ray_spacing} | _lidar(at, "own_car_radius", "box_margin"),
     ),
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
-    SCAN_BASELINES: (Settings, _nothing),
     "discover": (DiscoverJob, _nothing),
-    "lidar_picture": (Settings, _nothing),
     "lidar_film": (LidarFilmJob, _encoding),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
     "evaluate_scans": (EvaluateScansJob, lambda at: {"tracks": at.tracks}),
-    "scene_metrics": (Settings, _nothing),
     "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
     "tracks": (TracksJob, _nothing),
     "film": (FilmJob, _film),
@@ -380,27 +384,17 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "compare": (CompareJob, lambda at: {**_encoding(at), "end": at.config.render.end}),
     "truth_film": (TruthFilmJob, _encoding),
     "edit": (EditJob, lambda at: {**_quad(at), "frames": at.config.render.edited_frames}),
-    "quad": (EditJob, _quad),
-    "edit_truth": (EditJob, _quad),
+    **dict.fromkeys(("quad", "edit_truth"), (EditJob, _quad)),
     "drive_folder": (DriveJob, _drive_folder),
     "scan_folder": (ScanFolderJob, _scan_folder),
-    "run": (RunJob, _run),
-    "run_folder": (RunJob, _run),
-    "drive_mcap": (Settings, _nothing),
+    **dict.fromkeys(("run", "run_folder"), (RunJob, _run)),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),
-    "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree, "time_s": at.config.export.time_s}),
-    "export_usd": (
-        ExportJob,
-        lambda at: {"gaussians": at.config.export.usd_gaussians, "time_s": at.config.export.time_s},
-    ),
+    "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree, **_shown_time(at)}),
+    "export_usd": (ExportJob, lambda at: {"gaussians": at.config.export.usd_gaussians, **_shown_time(at)}),
     "export_viewer": (ViewerJob, _viewer),
-    "export_colmap": (Settings, _nothing),
     "actor_assets": (AssetsJob, lambda at: {"complete": at.config.export.complete_assets}),
     "export_alpasim": (AlpasimJob, lambda at: {"body": at.config.export.vehicle}),
-    "export_spz": (Settings, _nothing),
-    "export_sog": (Settings, _nothing),
 }
-"""The record of every stage, and a function that gives those of its fields that are not sections of the config, or are
-changed for it."""
+"""The record of every stage, and what gives its fields that are no sections of the config, or are changed for it."""

@@ -32,7 +32,7 @@ def drive(key_frames: int, cameras=("CAM_FRONT", "CAM_BACK"), between: int = 5, 
 
 
 def held_out(count: int, **settings) -> tuple[list[int], list[int]]:
-    groups = held_out_key_frames(count, HoldoutSettings(**settings))
+    groups = held_out_key_frames(drive(count), HoldoutSettings(**settings))
     assert groups.keys() == {"interpolation", "extrapolation"}
     return groups["interpolation"], groups["extrapolation"]
 

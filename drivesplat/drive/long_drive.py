@@ -1,0 +1,122 @@
+"""A long drive in Python: its blocks, of which those that are rendered are in memory."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.drive.cameras import Matrix, Vector
+from drivesplat.drive.drive_view import DriveScan
+from drivesplat.drive.lidars import PoseableLidar
+from drivesplat.drive.trained_drive import TrainedDrive, open_drive
+from drivesplat.drive.world_state import AnyCamera
+from drivesplat.errors import RequestError
+from drivesplat.scene.blocks import BLOCKS, read_blocks
+from drivesplat.scene.scene import Scene, read_scene
+from drivesplat.settings.device import DeviceSettings
+
+MAX_OPEN = 2
+"""The blocks that are in memory."""
+
+
+class LongDrive:
+    """A drive that was cut into blocks. Times are seconds since the drive's first image; poses are in the world of the
+    drive, in metres with z up.
+
+    >>> drive = drivesplat.LongDrive("results/commute/street")
+    >>> image = drive.render("CAM_FRONT", time=431.0).image
+    >>> block, seconds = drive.at(431.0)
+    >>> block.actors.loc["bf53", "speed"]
+    8.4
+    """
+
+    def __init__(self, folder: str | Path, device: str | DeviceSettings = "any"):
+        """Opens the drive with the method's result folder `folder`, results/{scene}/{method}. `device`: as for
+        `drivesplat.open`.
+
+        Raises RequestError for a scene that is not cut into blocks, ResultError for damaged files.
+        """
+        self.folder, self._device = Path(folder), device
+        results = self.folder.parent
+        if not (results / BLOCKS).is_file():
+            raise RequestError(f"{results} has no {BLOCKS}: it is no drive that is cut into blocks (drivesplat.open)")
+        self.blocks = read_blocks(results / BLOCKS)
+        self._open: dict[int, TrainedDrive] = {}
+
+    def __repr__(self) -> str:
+        return f"<LongDrive {self.folder}: {self.duration:.1f} s in {len(self.blocks.blocks)} blocks>"
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The record of the whole drive."""
+        return read_scene(self.folder.parent / "scene.json")
+
+    @cached_property
+    def duration(self) -> float:
+        """The time of the last image in seconds; of the last sweep without images."""
+        recordings = self.scene.frames or self.scene.sweeps
+        return self.scene.seconds(max(recording.timestamp for recording in recordings))
+
+    def block(self, number: int) -> TrainedDrive:
+        """A block as a drive of its own, with times from its first image and a world with an origin of its own. Raises
+        RequestError for an unknown one, and one that is not trained."""
+        if not 0 <= number < len(self.blocks.blocks):
+            raise RequestError(f"{self.folder} has no block {number}; it has {len(self.blocks.blocks)}, from 0 on")
+        if number not in self._open:
+            folder = self.folder.parents[1] / self.blocks.names[number] / self.folder.name
+            while len(self._open) >= MAX_OPEN:
+                self._open.pop(next(iter(self._open)))
+            self._open[number] = open_drive(folder, self._device)
+        self._open[number] = self._open.pop(number)
+        return self._open[number]
+
+    def at(self, time: float) -> tuple[TrainedDrive, float]:
+        """The block in which the vehicle is at a time, and that time in seconds since the block's first image. Raises
+        RequestError for a time outside of the recording."""
+        if not 0.0 <= time <= self.duration:
+            raise RequestError(f"{self.folder} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s")
+        first = min(recording.timestamp for recording in self.scene.frames or self.scene.sweeps)
+        timestamp = first + round(time * 1e6)
+        drive = self.block(self.blocks.at(timestamp))
+        return drive, float(np.clip(drive.scene.seconds(timestamp), 0.0, drive.duration))
+
+    def render(
+        self,
+        camera: AnyCamera | Sequence[AnyCamera],
+        time: float,
+        *,
+        ego_to_world: Matrix | None = None,
+        camera_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+        outputs: Sequence[str] = ("rgb",),
+    ) -> Any:
+        """What a camera sees at a time (a `DriveView`), or each of several (a list): see `TrainedDrive.render`."""
+        drive, seconds = self.at(time)
+        poses = {"ego_to_world": ego_to_world, "camera_to_world": camera_to_world}
+        own = {name: self._in_block(pose, drive) for name, pose in poses.items() if pose is not None}
+        return drive.render(camera, seconds, **own, velocity=velocity, outputs=outputs)
+
+    def scan(
+        self,
+        lidar: str | PoseableLidar,
+        time: float,
+        *,
+        ego_to_world: Matrix | None = None,
+        sensor_to_world: Matrix | None = None,
+        velocity: Vector | None = None,
+        with_instance: bool = True,
+    ) -> DriveScan:
+        """What a LiDAR measures about a time, in the world of the block: see `TrainedDrive.scan`."""
+        drive, seconds = self.at(time)
+        poses = {"ego_to_world": ego_to_world, "sensor_to_world": sensor_to_world}
+        own = {name: self._in_block(pose, drive) for name, pose in poses.items() if pose is not None}
+        return drive.scan(lidar, seconds, **own, velocity=velocity, with_instance=with_instance)
+
+    def _in_block(self, pose: Matrix, drive: TrainedDrive) -> np.ndarray:
+        """A pose of the drive's world in that of a block."""
+        moved = np.array(pose, dtype=np.float64)
+        if moved.shape == (4, 4):  # anything else is refused by the block
+            moved[:3, 3] += self.scene.origin - drive.scene.origin
+        return moved
