@@ -17,7 +17,7 @@ from pathlib import Path
 
 import drivesplat
 from drivesplat import SNAKEFILE, WORKFLOW
-from drivesplat.cli import assets, imports, segment, serve
+from drivesplat.cli import assets, check, imports, segment, serve
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import default_config, in_this_copy, of_the_workflow
@@ -92,10 +92,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     mcap.add_argument("--out", type=Path, required=True, help="the file, such as drive.mcap")
     mcap.add_argument("--scans", type=Path, help="scans.json of rendered LiDAR scans, in place of the folder's own")
 
-    text = "check a drive folder, and print the settings that it needs (docs/own_data.md)"
-    check = commands.add_parser("check", help=text)
-    check.add_argument("folder", type=Path, help="with drive.json")
-    check.add_argument("--picture", type=Path, help="where the picture is written; by default {folder}/check.png")
+    check.add_parser(commands)
 
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
@@ -123,10 +120,10 @@ def run_command(parsed: argparse.Namespace) -> int:
 
             print_summary(results_folder() / "demo" / "metrics.json")
         return status
-    if parsed.command == "check":
-        from drivesplat.readers.drive.__main__ import run_check
+    if parsed.command == check.COMMAND:
+        from drivesplat.cli.check.command import run_check
 
-        return run_check(parsed.folder, parsed.picture)
+        return run_check(parsed)
     if parsed.command == "doctor":
         from drivesplat.machine.doctor.__main__ import main as doctor
 

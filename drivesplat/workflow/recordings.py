@@ -1,27 +1,16 @@
 """What is known of recordings before a run: which of its jobs they are unfit for, and what their images take."""
 
 import json
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.readers.outline import (
-    Outline,
-    RecordedCamera,
-    frames_beyond,
-    trained_key_frames,
-    unknown_beams,
-    unknown_camera,
-    without_lidar,
-    without_scans,
-    without_training,
-)
 from drivesplat.settings.config import for_scene
 from drivesplat.workflow.job_resources import JobResources
-from drivesplat.workflow.stages import SCANS, TRAIN, WORLD
-from drivesplat.workflow.without_tracks import recorded_outline
+from drivesplat.workflow.recording_faults import faults_of, image_gb
+from drivesplat.workflow.stages import TRAIN, WORLD
 from drivesplat.world.marker import WORLD_MARKER
 
 TRAINING_MB = 16_000
@@ -43,26 +32,15 @@ class Recordings:
         for job in jobs:
             if hasattr(job.wildcards, "scene"):
                 planned[job.wildcards.scene].add(job.rule.name)
-        sentences = (next(self._faults(scene, rules), None) for scene, rules in planned.items())
+        sentences = (next(faults_of(self._config, scene, rules), None) for scene, rules in planned.items())
         found = list(filter(None, sentences))
         if found:
             more = [f"{len(found) - MAX_SCENES} more scenes have such faults"] if len(found) > MAX_SCENES else []
             raise ConfigError(". ".join([*found[:MAX_SCENES], *more]))
 
     def image_gb(self, scene: str) -> float | None:
-        """The size of a scene's training images in memory, in GB, of those at key frames as far as these are trained on
-        and, where `sweeps` is set, of the others in proportion; None while the images are unknown."""
-        is_block = self._config.is_block(scene)
-        outline, frames = None if is_block else recorded_outline(self._config, scene), self._frames(scene)
-        settings = for_scene(self._config, scene)
-        if outline is None:
-            outline, frames = _extracted(Path(self._config.results_dir, scene, "scene.json")), None
-        if outline is None or not outline.key_frames:
-            return None
-        chosen = outline.key_frames[slice(*frames)] if frames else outline.key_frames
-        trained = len(trained_key_frames(chosen, settings.holdout)) / len(outline.key_frames)
-        cameras = [camera for camera in settings.cameras if camera not in settings.holdout.cameras]
-        return trained * outline.image_bytes(cameras, settings.images, settings.sweeps) * 1e-9
+        """`recording_faults.image_gb` of a scene."""
+        return image_gb(self._config, scene)
 
     def training_mb(self, wildcards: Any) -> int:
         """The memory of a training on the host: its images, which are there on the CPU, and their masks beside what is
@@ -100,38 +78,3 @@ class Recordings:
             return all(record["settings"].pop("edits") is not None for record in (made, planned)) and made == planned
         except (AttributeError, KeyError, OSError, TypeError, ValueError):
             return False
-
-    def _faults(self, scene: str, rules: set[str]) -> Iterator[str]:
-        """What the recording of a scene lacks for the jobs of some rules, a sentence each."""
-        outline, settings = recorded_outline(self._config, scene), for_scene(self._config, scene)
-        if outline is None or self._config.is_block(scene):
-            return
-        frames = self._frames(scene)
-        beyond = frames_beyond(scene, len(outline.key_frames), frames)
-        if "extract" in rules:
-            yield from filter(None, (unknown_camera(scene, outline.cameras, settings.cameras), beyond))
-        if "lidar_seed" in rules:
-            times = outline.key_frames[slice(*frames)] if frames else outline.key_frames
-            if not settings.sweeps and not trained_key_frames(times, settings.holdout):
-                yield without_training(scene, len(times))
-            if not outline.sweeps and settings.lidar_seed.on_missing == "stop":
-                yield without_lidar(scene)
-        if SCANS in rules:
-            if not outline.sweeps:
-                yield without_scans(scene)
-            yield from (f"scene {scene}, {unknown_beams(name)}" for name in outline.without_beams)
-
-    def _frames(self, scene: str) -> tuple[int, int] | None:
-        """The range of key frames that is used of a scene: the first, and the last + 1."""
-        return self._config.datasets[self._config.dataset_of(scene)].frames.get(scene)
-
-
-def _extracted(file: Path) -> Outline | None:
-    """The outline of a scene.json; None where there is none, or none that can be read."""
-    try:
-        scene = json.loads(file.read_text(encoding="utf-8"))
-        images = Counter((frame["camera"], frame["width"], frame["height"]) for frame in scene["frames"])
-        cameras = {name: RecordedCamera(*size, count) for (name, *size), count in images.items()}
-        return Outline(cameras, scene["key_frame_timestamps"], len(scene["sweeps"]))
-    except (AttributeError, KeyError, OSError, RecursionError, TypeError, ValueError):
-        return None

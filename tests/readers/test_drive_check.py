@@ -47,7 +47,9 @@ def checked(content: Content, folder: Path, capsys, picture: Path | None = None)
         status = main(["check", str(folder), *(["--picture", str(picture)] if picture else [])])
     finally:
         (folder / "drive.json").write_text(whole, encoding="utf-8")
-    return status, capsys.readouterr().out.splitlines()
+    said, *lines = capsys.readouterr().out.splitlines()
+    assert said == f"format: drive folder, by {folder / 'drive.json'}"
+    return status, lines
 
 
 def places(drive: Content) -> list[tuple[int, list[float]]]:

@@ -64,8 +64,8 @@ def test_the_checker_names_the_columns_of_each_lidar(tmp_path, capsys):
     (tmp_path / "drive.json").write_text(json.dumps(drive))
     assert main(["check", str(tmp_path)]) == 0
     expected = (
-        "LiDAR top: one.ply has x, y, z, intensity (scalar_intensity), whose intensities are divided by 255; "
-        "not used: scalar_GpsTime"
+        "  LiDAR top: 1 sweep; the first has x, y, z, intensity (scalar_intensity), whose intensities are divided by "
+        "255; not used: scalar_GpsTime"
     )
     assert expected in capsys.readouterr().out.splitlines()
 
