@@ -24,8 +24,8 @@ DATASET = "mine"
 @dataclass(frozen=True)
 class ChosenScene:
     """The scene `name` of a recording in the folder `root`, as the settings of a dataset name them; `others` are the
-    scenes beside it, and `said` how it was found. With a config file `values` are its settings, otherwise empty, and
-    `dataset` is its dataset there."""
+    scenes beside it, and `said` how it was found. `values` are the settings of config.yaml, with `of_config` those of a
+    config file laid over them, which has the `dataset`."""
 
     reader: str
     root: Path
@@ -36,6 +36,7 @@ class ChosenScene:
     dataset: str = DATASET
     frames: tuple[int, int] | None = None
     values: dict[str, Any] = field(default_factory=dict)
+    of_config: bool = False
 
 
 def chosen_scene(place: Path, scene: str | None, version: str | None = None) -> ChosenScene:
@@ -84,8 +85,9 @@ def _of_folder(reader: str, recordings: list[Recognised], scene: str | None, ver
     if len(one.scenes) > 1:
         said += f"; {len(one.scenes)} scenes: {_named(one.scenes)}"
     others = tuple(other for other in one.scenes if other != name)
-    shipped = load(read_yaml(default_config(Path.cwd()), "config file") or {}).dataset_names
-    return ChosenScene(reader, one.root, one.version, name, others, said, shipped.get(name, DATASET))
+    values = read_yaml(default_config(Path.cwd()), "config file") or {}
+    dataset = load(values).dataset_names.get(name, DATASET)
+    return ChosenScene(reader, one.root, one.version, name, others, said, dataset, values=values)
 
 
 def _of_config(file: Path, scene: str | None) -> ChosenScene:
@@ -112,14 +114,22 @@ def _of_config(file: Path, scene: str | None) -> ChosenScene:
     if others:
         said += f"; {len(dataset.scenes)} scenes: {_named(dataset.scenes)}"
     return ChosenScene(
-        dataset.reader, root, dataset.version, scene, others, said, name, dataset.frames.get(scene), values
+        dataset.reader,
+        root,
+        dataset.version,
+        scene,
+        others,
+        said,
+        name,
+        dataset.frames.get(scene),
+        values,
+        of_config=True,
     )
 
 
 def config_of(chosen: ChosenScene, settings: dict[str, Any], *presets: str) -> Config:
-    """The config of a scene with `settings` laid over those of its config file, or else over config.yaml, and over
-    `presets`."""
-    values = chosen.values or read_yaml(default_config(Path.cwd()), "config file") or {}
+    """The config of a scene with `settings` laid over its values and over `presets`."""
+    values = chosen.values
     for preset in presets:
         values = merged(values, read_yaml(of_the_workflow(preset), "preset") or {})
     return load(merged(values, settings))

@@ -79,7 +79,7 @@ def _print_findings(chosen: ChosenScene, checked: CheckedScene) -> None:
     scene, columns = checked.whole, sweep_columns(checked.at_hand)
     outline = outline_of(scene, columns)
     needed = needed_settings(chosen, checked, outline, memory_gb())
-    settings = {} if chosen.values else needed
+    settings = {} if chosen.of_config else needed
     config = config_of(chosen, settings)
     judged = list(verdicts(chosen, settings, scene, outline))
     _section("holds", contents(checked, columns))
@@ -90,7 +90,7 @@ def _print_findings(chosen: ChosenScene, checked: CheckedScene) -> None:
     able = [one.method for one in judged if one.source in OWN and one.fault is None]
     if able:
         _section("costs", expected_costs(chosen, config, able, outline))
-    if chosen.values:
+    if chosen.of_config:
         lacking = lacking_settings(for_scene(config, chosen.name), needed)
         fit = "settings: those of the config file fit"
         print(f"settings to add:\n\n{as_yaml(lacking)}".rstrip() if lacking else fit)

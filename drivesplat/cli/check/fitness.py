@@ -39,7 +39,7 @@ class Verdict(NamedTuple):
 def verdicts(chosen: ChosenScene, settings: dict[str, Any], scene: Scene, outline: Outline) -> Iterator[Verdict]:
     """The verdicts on the methods of a config and those that presets add."""
     config, name = config_of(chosen, settings), chosen.name
-    own, given = methods_of(config, name), OWN[bool(chosen.values)]
+    own, given = methods_of(config, name), OWN[chosen.of_config]
     yield from (_verdict(config, scene, outline, name, method, given) for method in own)
     known = {*own, *config.methods}
     for preset in PRESETS:
