@@ -43,7 +43,7 @@ def recordings(tmp_path_factory) -> Path:
     drives.write_world(root / "tables", WORLD)
     scene = drives.scene_at(root / "tables", lidar_sweeps=True)
     write_drive(scene, root / "drive" / "monday")
-    recorded, _ = tiny_drive(root / "tables", WORLD)
+    recorded, _ = tiny_drive(root / "tables", WORLD, lasers=(1,))
     for name, write in (("waymo_v1", write_v1), ("waymo_v2", write_v2)):
         write(root / name, recorded)
     pytest.importorskip("ncore")
@@ -117,7 +117,7 @@ def test_every_format_is_recognised_and_its_settings_are_planned(name, recording
     assert any(line.startswith("metrics of vanilla, street: ") for line in section(lines, "costs:"))
     settings = proposed(lines)
     assert scene in load(settings).scenes
-    if name != "waymo_v1":
+    if name in ("tables", "ncore"):
         workflow.write_config(yaml.safe_dump(settings))
         planned = workflow.dry_run(f"results/{scene}/metrics.json")
         assert "extract" in planned and "evaluate" in planned
@@ -166,7 +166,7 @@ def test_what_is_lacking_is_said_and_the_settings_are_planned(lacking, recording
     assert any(line.startswith(methods) for line in lines), lines
     assert any(line.startswith(words) for line in section(lines, "lacks:")) if words else "no images" in str(lines)
     load(proposed(lines))
-    if lacking in ("LiDAR", "images"):
+    if lacking == "images":
         workflow.write_config(yaml.safe_dump(proposed(lines)))
         workflow.dry_run("results/tuesday/metrics.json")
 
