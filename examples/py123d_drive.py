@@ -6,8 +6,9 @@ the folder with py123d's logs/ and maps/ (PY123D_DATA_ROOT), LOG the name of a l
 `drivesplat check OUT`.
 
 The ego frame is py123d's rear axle, lowered to the ground by --axle-height. Points are those of each LiDAR in its own
-frame; py123d gives them in the IMU's. Whether they are motion-compensated is up to the dataset: KITTI-360's are not
-(--uncompensated). Images are written as PNG, since py123d decodes them.
+frame; py123d gives them in the IMU's. They are taken as motion-compensated to the beginning of their sweep, unless
+--uncompensated says that they are where the LiDAR saw them, each at its own time. KITTI-360's are not compensated, and
+py123d has no times of them. Images are written as PNG, since py123d decodes them.
 """
 
 import argparse
@@ -177,7 +178,12 @@ def convert(scene: Any, out: Path, axle_height: float, cameras: list[str] | None
         ends = record["ego_poses"][0]["timestamp"], record["ego_poses"][-1]["timestamp"]
         sweeps = list(sweeps_of(scene, identity, name, lidar_to_imu, ends, out))
         if sweeps:
+            timed = "time" in np.load(out / sweeps[0]["file"])
             mount = pose_record(np.linalg.inv(ego_to_imu) @ lidar_to_imu)
+            if not compensated and not timed:
+                raise ConversionError(
+                    f"returns of {name} have no times, without which they cannot be moved; leave out --uncompensated"
+                )
             record["lidars"][name] = {"sensor_to_ego": mount, "motion_compensated": compensated}
             record["sweeps"] += sweeps
     record["tracks"], times = tracks_of(scene)

@@ -185,6 +185,16 @@ def test_lenses_are_stated_unless_images_are_undistorted(log, tmp_path):
     assert record["lidars"]["lidar_top"]["motion_compensated"] is False
 
 
+def test_returns_without_times_cannot_be_moved(log, tmp_path, monkeypatch, capsys):
+    timed = log.get_lidar_at_timestamp
+    monkeypatch.setattr(
+        log, "get_lidar_at_timestamp", lambda *at: SimpleNamespace(**{**vars(timed(*at)), "timestamps": None})
+    )
+    assert converted(tmp_path / "as_they_are") == 0 and check(tmp_path / "as_they_are", None) == []
+    assert converted(tmp_path / "moved", "--uncompensated") == 1
+    assert "returns of lidar_top have no times" in capsys.readouterr().err
+
+
 def test_what_is_not_there_is_one_sentence(tmp_path, monkeypatch, capsys):
     (tmp_path / "taken").write_text("")
     assert converted(tmp_path) == 1 and "is not empty" in capsys.readouterr().err

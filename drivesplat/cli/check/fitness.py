@@ -79,9 +79,9 @@ def _notes(config: Config, scene: Scene, name: str, method: str) -> Iterator[str
         if rest:
             yield f"these blur: {class_counts(track.object_class.value for track in rest)}"
     elif settings.moving_parts:
-        yield "what moves drifts without boxes" if not scene.tracks else "what moves drifts; boxes are not used"
+        yield "moving things drift" if not scene.tracks else "moving things drift; boxes are not used"
     else:
-        yield "what moves blurs" if moving or not scene.tracks else "nothing moves, by the boxes"
+        yield "moving things blur" if moving or not scene.tracks else "nothing moves, by the boxes"
     if SCANS in training_inputs(config, name, method):
         yield f"renders LiDAR {', '.join(lidar.name for lidar in scene.lidars)}"
     elif found.train.depth_weight > 0:
