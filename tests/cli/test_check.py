@@ -179,6 +179,7 @@ def test_missing_files_of_a_dataset_are_left_out_by_the_settings(recordings, che
     lacks = section(lines, "lacks:")
     assert any(line.startswith("images: frame ") and "is missing" in line for line in lacks)
     assert any(line.startswith("sweeps: key frame 1") for line in lacks)
+    assert section(lines, "holds:")[0].startswith("6 key frames at 2 Hz, 10 images of 1 camera, 10 LiDAR sweeps")
     settings = proposed(lines)
     assert settings["extract"] == settings["lidar_seed"] == {"on_missing": "warn"}
 
@@ -195,8 +196,11 @@ def test_a_config_file_is_checked_with_its_own_methods(recordings, checked, tmp_
     assert verdicts[0].startswith("vanilla (of the config file)") and lines[-1].startswith("settings: those of the")
     config |= {"cameras": ["REAR"], "eval_camera": "REAR"}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(config))
-    said = section(checked(tmp_path / "mine.yaml"), "methods: ")
-    assert said[0] == ("vanilla (of the config file): not on this recording: the drive has no camera 'REAR'")
+    lines = checked(tmp_path / "mine.yaml", status=1)
+    assert section(lines, "methods: ")[0] == (
+        "vanilla (of the config file): not on this recording: the drive has no camera 'REAR'"
+    )
+    assert lines[-1] == "no method can be trained on scene monday"
 
 
 def test_costs_are_those_measured_here(recordings, checked, tmp_path):

@@ -33,7 +33,8 @@ EXAMINE = "drivesplat.readers.*.check"
 
 
 def run_check(asked: argparse.Namespace) -> int:
-    """Checks a recording and prints what it found. Returns the exit status, 1 where there are faults."""
+    """Checks a recording and prints what it found. Returns the exit status: 1 where there are faults, or no method can
+    be trained on it."""
     chosen = chosen_scene(asked.place, asked.scene, asked.version)
     print(chosen.said + (f"; checked: {chosen.name}, --scene names another" if chosen.others else ""))
     with tempfile.TemporaryDirectory(prefix="drivesplat-check-") as folder:
@@ -43,8 +44,7 @@ def run_check(asked: argparse.Namespace) -> int:
             return 1
         for sentence in _warnings(checked):
             print(f"warning: {sentence}")
-        _print_findings(chosen, checked)
-    return 0
+        return 0 if _print_findings(chosen, checked) else 1
 
 
 def _examined(chosen: ChosenScene, picture: Path | None, folder: Path) -> tuple[CheckedScene | None, list[str]]:
@@ -74,8 +74,8 @@ def _examined(chosen: ChosenScene, picture: Path | None, folder: Path) -> tuple[
     return checked, faults
 
 
-def _print_findings(chosen: ChosenScene, checked: CheckedScene) -> None:
-    """Prints what a recording holds and lacks, and what that means."""
+def _print_findings(chosen: ChosenScene, checked: CheckedScene) -> bool:
+    """Prints what a recording holds and lacks, and what that means. Returns whether a method can be trained on it."""
     scene, columns = checked.whole, sweep_columns(checked.at_hand)
     outline = outline_of(scene, columns)
     needed = needed_settings(chosen, checked, outline, memory_gb())
@@ -88,14 +88,17 @@ def _print_findings(chosen: ChosenScene, checked: CheckedScene) -> None:
     own = [one.method for one in judged if one.source in OWN]
     _section(f"methods: {', '.join(own)}{'' if scene.tracks else _instead_of_street(own)}", map(str, judged))
     able = [one.method for one in judged if one.source in OWN and one.fault is None]
-    if able:
-        _section("costs", expected_costs(chosen, config, able, outline))
+    if not able:
+        print(f"no method can be trained on scene {chosen.name}")
+        return False
+    _section("costs", expected_costs(chosen, config, able, outline))
     if chosen.of_config:
         lacking = lacking_settings(for_scene(config, chosen.name), needed)
         fit = "settings: those of the config file fit"
         print(f"settings to add:\n\n{as_yaml(lacking)}".rstrip() if lacking else fit)
     else:
         print(f"settings to copy:\n\n{as_yaml(needed)}", end="")
+    return True
 
 
 def _instead_of_street(methods: list[str]) -> str:

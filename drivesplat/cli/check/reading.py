@@ -22,9 +22,9 @@ SPREAD = 12
 
 @dataclass(frozen=True)
 class CheckedScene:
-    """A recording: `whole` has all records, `at_hand` those whose files can be read. `faults_of_images` and
-    `faults_of_sweeps` are about files that cannot; `opened` is the number of images and sweeps that were opened, where
-    these are a sample."""
+    """A recording: `at_hand` has the images and sweeps whose files can be read, `whole` also those that were not opened
+    where these are a sample, of `opened` images and sweeps. `faults_of_images` and `faults_of_sweeps` are about files
+    that cannot be read."""
 
     whole: Scene
     at_hand: Scene
@@ -106,7 +106,7 @@ def _with_files(scene: Scene, sample: Scene, opened: tuple[int, int] | None = No
         sweeps=tuple(one for one, fault in zip(sample.sweeps, of_sweeps, strict=True) if not fault),
     )
     if opened is None:
-        scene = dataclasses.replace(scene, frames=at_hand.frames)
+        scene = at_hand
     said = said_once(sample.frames, of_images)
     return CheckedScene(scene, at_hand, said, list(filter(None, of_sweeps)), opened)
 
