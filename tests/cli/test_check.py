@@ -178,7 +178,7 @@ def test_missing_files_of_a_dataset_are_left_out_by_the_settings(recordings, che
     lines = checked(root)
     lacks = section(lines, "lacks:")
     assert any(line.startswith("images: frame ") and "is missing" in line for line in lacks)
-    assert any(line.startswith("sweeps: key frame 1") for line in lacks)
+    assert any(line.startswith("1 sweep: key frame 1") for line in lacks)
     assert section(lines, "holds:")[0].startswith("6 key frames at 2 Hz, 10 images of 1 camera, 10 LiDAR sweeps")
     settings = proposed(lines)
     assert settings["extract"] == settings["lidar_seed"] == {"on_missing": "warn"}

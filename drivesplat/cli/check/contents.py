@@ -57,7 +57,10 @@ def lacks(checked: CheckedScene, columns: dict[str, SweepColumns]) -> Iterator[s
     if checked.faults_of_images:
         yield f"images: {_first(checked.faults_of_images)}; extract.on_missing: warn leaves such images out"
     if checked.faults_of_sweeps:
-        yield f"sweeps: {_first(checked.faults_of_sweeps)}; lidar_seed.on_missing: warn leaves such sweeps out"
+        yield (
+            f"{counted(len(checked.faults_of_sweeps), 'sweep')}: {_first(checked.faults_of_sweeps)}; "
+            "lidar_seed.on_missing: warn leaves such sweeps out"
+        )
     if not scene.sweeps:
         yield (
             "LiDAR: seed points are triangulated from images, and methods know neither depth nor ground "
@@ -156,5 +159,5 @@ def _columns(returns: LidarReturns) -> list[str]:
 
 
 def _first(faults: list[str]) -> str:
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    more = " (the first)" if len(faults) > 1 else ""
     return faults[0] + more
