@@ -62,7 +62,7 @@ def test_the_checker_names_the_columns_of_each_lidar(tmp_path, capsys):
         "sweeps": [{"lidar": "top", "timestamp": 1_000_000, "file": "one.ply", "lidar_to_world": pose}],
     }  # fmt: skip
     (tmp_path / "drive.json").write_text(json.dumps(drive))
-    assert main(["check", str(tmp_path)]) == 0
+    assert main(["check", str(tmp_path)]) == 1, "no method renders a LiDAR without rings, and there are no images"
     expected = (
         "  LiDAR top: 1 sweep; the first has x, y, z, intensity (scalar_intensity), whose intensities are divided by "
         "255; not used: scalar_GpsTime"
