@@ -85,9 +85,9 @@ def pooled(
     return record, {**header, "groups": objects}
 
 
-def _frames(blocks: Sequence[BlockEvaluation], group: str) -> dict[str, list[list[float]]]:
+def _frames(blocks: Sequence[BlockEvaluation], group: str) -> dict[str, list[Sequence[int | float]]]:
     """The errors of the images of a group by region, over all blocks."""
-    found: dict[str, list[list[float]]] = {}
+    found: dict[str, list[Sequence[int | float]]] = {}
     for block in blocks:
         for region, frames in block.objects["frames"][group].items():
             found.setdefault(region, []).extend(frames)

@@ -173,7 +173,7 @@ class RegionMetrics:
         return records
 
     @classmethod
-    def of_frames(cls, frames: Mapping[str, Iterable[Sequence[float]]], with_lpips: bool) -> "RegionMetrics":
+    def of_frames(cls, frames: Mapping[str, Iterable[Sequence[int | float]]], with_lpips: bool) -> "RegionMetrics":
         """Metrics of frames that were measured before, by region; `FrameErrors` or sequences of its fields."""
         found = cls(None, frames)
         found._with_lpips = with_lpips

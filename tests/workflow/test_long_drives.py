@@ -1,0 +1,84 @@
+"""Planning of drives that are cut into blocks: names, settings, files, and what is refused in one sentence."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+from helpers import REPOSITORY
+
+from drivesplat.errors import ConfigError
+from drivesplat.settings.blocks import drive_of
+from drivesplat.settings.config import for_scene
+from drivesplat.workflow.long_drives import LongDrives, refuse_results_of_blocks
+from drivesplat.workflow.plan import Plan
+
+BLOCKS = {"length_m": 100.0, "overlap_m": 10.0}
+CUT = {"reader": "drive", "scenes": ["way"], "blocks": BLOCKS, "overrides": {"train": {"iterations": 77}}}
+
+
+def plan(**datasets) -> Plan:
+    named = {"whole": {"scenes": ["0001"]}, "cut": CUT, **datasets}
+    return Plan({"datasets": named, "methods": {"vanilla": {}}, "results_dir": "there"}, str(REPOSITORY))
+
+
+@pytest.fixture
+def drives(tmp_path) -> LongDrives:
+    path = tmp_path / "blocks.json"
+    path.write_text(json.dumps({"blocks": [{"digest": "a"}, {"digest": "b"}]}))
+    return LongDrives(plan(), {"way": str(path)}.__getitem__)
+
+
+def at(scene: str, method: str = "vanilla") -> SimpleNamespace:
+    return SimpleNamespace(scene=scene, method=method)
+
+
+def test_a_block_has_the_settings_and_the_methods_of_its_drive():
+    made = plan()
+    assert made.config.is_block("way.003") and made.config.is_cut("way") and not made.config.is_cut("way.003")
+    assert not made.config.is_block("0001.003"), "that drive is not cut"
+    of_drive, of_block = (json.loads(made.stage_settings("train", name, "vanilla")) for name in ("way", "way.003"))
+    assert of_block == of_drive and of_block["train"]["iterations"] == 77
+    assert json.loads(made.stage_settings("block", "way.003"))["blocks"]["length_m"] == 100.0
+    assert made.annotated_scene(at("way.003")) == "there/way.003/scene.json", "its poses are those of the drive"
+    assert made.truth(at("way.003")) == []
+
+
+def test_the_drive_has_films_and_figures_and_its_blocks_all_else():
+    made = plan()
+    assert made.metrics() == ["there/0001/metrics.json", "there/way/metrics.json"]
+    of_drive = {path for path in (*made.films(), *made.exports(), *made.looks(), *made.drives()) if "/way/" in path}
+    films = for_scene(made.config, "way").render.trajectories.items()
+    assert of_drive == {f"there/way/vanilla/{name}.mp4" for name, film in films if film.parts == "all"} and of_drive
+    stages = made.metrics_stages("way")
+    assert {"block", "vanilla/evaluate_blocks", "vanilla/train"} <= stages.keys()
+    assert not {"block", "vanilla/evaluate_blocks"} & made.metrics_stages("0001").keys()
+
+
+def test_the_files_of_blocks_follow_from_the_record_of_the_drive(drives):
+    assert drives.inputs_of_block(at("way.001"))[0] == "there/way/scene_refined.json"
+    assert (drives.digest(at("way.000")), drives.digest(at("way.001"))) == ("a", "b")
+    results = drives.results("{method}/eval.json")(at("way"))
+    assert results == ["there/way.000/vanilla/eval.json", "there/way.001/vanilla/eval.json"]
+    with pytest.raises(ConfigError, match=r"scene way has no block 2; it has 2: way.000 to way.001"):
+        drives.inputs_of_block(at("way.002"))
+
+
+@pytest.mark.parametrize(
+    "path", [["masks", "masks.json"], ["vanilla", "splat.ply"], ["vanilla", "edits", "gone.mp4"], ["seed.ply"]]
+)
+def test_results_of_blocks_are_refused_for_a_drive(path):
+    with pytest.raises(ConfigError, match=f"scene way is cut into blocks.*ask for there/way.000/{'/'.join(path)}"):
+        refuse_results_of_blocks(plan().config, "way", path)
+
+
+def test_results_of_a_drive_and_those_of_other_scenes_are_not_refused():
+    config = plan().config
+    for path in (["metrics.json"], ["blocks.json"], ["vanilla", "eval.json"], ["vanilla", "original.mp4"]):
+        refuse_results_of_blocks(config, "way", path)
+    refuse_results_of_blocks(config, "0001", ["vanilla", "splat.ply"])
+    refuse_results_of_blocks(config, "way.000", ["vanilla", "splat.ply"])
+
+
+def test_a_scene_with_the_name_of_a_block_is_refused():
+    with pytest.raises(ConfigError, match=r"scene 'way\.001' has the name of a block of scene 'way'; rename it"):
+        plan(cut={**CUT, "scenes": ["way", drive_of("way") + ".001"]})
