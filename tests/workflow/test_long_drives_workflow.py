@@ -1,0 +1,68 @@
+"""A drive that is cut into blocks, run as users run it; and the same drive when it has become longer."""
+
+from pathlib import Path
+
+import pytest
+from helpers.drives import World, write_world
+from helpers.shared_runs import VANILLA
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
+
+import drivesplat
+
+pytestmark = pytest.mark.workflow
+TARGETS = ("results/0001/metrics.json", "results/0001/vanilla/original.mp4")
+
+
+def world(key_frames: int) -> World:
+    return World(speed=10.0, key_frames=key_frames)
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> WorkflowCopy:
+    made = WorkflowCopy.make(
+        tmp_path_factory.mktemp("long"),
+        world(16),
+        datasets={
+            "nuscenes": {"dataroot": "data", "scenes": ["0001"], "blocks": {"length_m": 30.0, "overlap_m": 10.0}}
+        },
+        methods=VANILLA,
+        holdout={"every_nth": 5, "offset": 2, "last_block": 1},
+        train={**TINY_TRAINING, "iterations": 20},
+    )
+    made.run(*TARGETS)
+    return made
+
+
+def trained(copy: WorkflowCopy) -> dict[str, int]:
+    """When each block was trained (ns)."""
+    files = Path(copy.folder, "results").glob("0001.*/vanilla/checkpoint.npz")
+    return {file.parents[1].name: file.stat().st_mtime_ns for file in sorted(files)}
+
+
+def test_a_drive_becomes_blocks_that_are_measured_together_and_shown_in_one_film(copy):
+    assert list(trained(copy)) == ["0001.000", "0001.001", "0001.002"]
+    record = copy.read("results/0001/metrics.json")
+    found = record["methods"]["vanilla"]
+    assert found["interpolation"]["all"]["pixels"] == 3 * 96 * 54 and found["blocks"].keys() == trained(copy).keys()
+    assert record["protocol"]["held_out_frames"] == {"interpolation": [2, 7, 12], "extrapolation": [15]}
+    cameras = copy.read("results/0001/vanilla/original.cameras.json")
+    assert cameras["frames"] == 31 and (copy.folder / TARGETS[1]).stat().st_size > 1000
+    assert copy.planned(*TARGETS) == {}, "nothing is left to be done"
+    drive = drivesplat.LongDrive(copy.folder / "results/0001/vanilla", device="cpu")
+    assert drive.render("CAM_FRONT", 0.9 * drive.duration).image.shape == (54, 96, 3)
+
+
+def test_a_longer_drive_trains_its_last_block_and_new_ones_alone(copy):
+    before = trained(copy)
+    write_world(copy.folder / "data", world(24))
+    copy.run(*TARGETS)
+    after = trained(copy)
+    assert list(after) == [f"0001.00{number}" for number in range(4)]
+    assert [name for name in before if after[name] != before[name]] == ["0001.002"]
+    assert copy.read("results/0001/metrics.json")["protocol"]["held_out_frames"]["extrapolation"] == [23]
+
+
+def test_results_of_one_block_are_refused_for_the_drive_in_a_sentence(copy):
+    result = copy.run("results/0001/vanilla/splat.ply")
+    assert "ask for results/0001.000/vanilla/splat.ply (docs/long_drives.md)" in result.stdout
+    assert result.returncode
