@@ -127,3 +127,31 @@ rule film_blocks:
         code=plan.code("film_blocks"),
     script:
         "../workflow_scripts/film_blocks.py"
+
+
+rule export_blocks:
+    """
+    Exports the static Gaussians of a drive as one PLY for each block, in which no place stands twice, with an index.
+    """
+    input:
+        scene=plan.annotated_scene,
+        blocks="<results>/{scene}/blocks.json",
+        checkpoints=long_drives.results("{method}/checkpoint.npz"),
+    output:
+        index="<results>/{scene}/{method}/splats/splats.json",
+    log:
+        "<logs>/{scene}/{method}/export_blocks.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/export_blocks.tsv"
+    wildcard_constraints:
+        scene=plan.cut,
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("export"),
+        code=plan.code("export_blocks"),
+    script:
+        "../workflow_scripts/export_blocks.py"

@@ -20,7 +20,7 @@ from drivesplat.io.storage import read_record, unreadable, write_json
 log = logging.getLogger(__name__)
 
 FOLDER = ".digests"
-WITH_MEMBERS = ("masks.json", "parts.json", "truth.json", "drive.json", "scans.json")
+WITH_MEMBERS = ("masks.json", "parts.json", "truth.json", "drive.json", "scans.json", "splats.json")
 """Outputs whose rule also writes undeclared files into their folder."""
 DIGEST_BYTES = 16
 ALTERED = "its content is not what the rule wrote"

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from scipy.spatial import cKDTree
 
 from drivesplat.io.json_record import read_typed_json, write_typed_json
 from drivesplat.io.storage import Provenance, no_provenance
@@ -52,6 +53,11 @@ class Blocks:
         firsts = [(int(first), number) for number, block in enumerate(self.blocks) for first in block.core[:, 0]]
         before = [pair for pair in firsts if pair[0] <= timestamp]
         return max(before)[1] if before else min(firsts)[1]
+
+    def nearest(self, places: Float64[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
+        """The number of the block whose path is nearest to each of some places in the drive's world (metres)."""
+        owners = np.repeat(np.arange(len(self.blocks)), [len(block.path) for block in self.blocks])
+        return owners[cKDTree(np.concatenate([block.path for block in self.blocks])).query(places)[1]]
 
 
 def within(timestamps: Int64[np.ndarray, " n"], intervals: Int64[np.ndarray, "i 2"]) -> Bool[np.ndarray, " n"]:

@@ -9,7 +9,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.settings.blocks import block_scene_name, drive_of
 from drivesplat.settings.config import Config, for_scene
-from drivesplat.workflow.outputs import Outputs
+from drivesplat.workflow.outputs import SPLATS, Outputs
 
 OF_DRIVES = (
     "scene.json", "scene_refined.json", "poses.json", "triangulated.npz", "blocks.json", "metrics.json", "index.html",
@@ -74,7 +74,8 @@ def refuse_results_of_blocks(config: Config, scene: str, path: Sequence[str]) ->
     trajectories = for_scene(config, scene).render.trajectories.items()
     films = [name for name, trajectory in trajectories if trajectory.parts == "all"]
     own = {"eval.json", "eval_objects.json", *(f"{name}{end}" for name in films for end in FILM_FILES)}
-    if len(path) > 2 or path[-1] not in (own if len(path) == 2 else OF_DRIVES):
+    known = path[-1] in (own if len(path) == 2 else OF_DRIVES) if len(path) < 3 else path[1:] == SPLATS.split("/")
+    if not known:
         raise ConfigError(
             f"scene {scene} is cut into blocks, and {'/'.join(path)} is a result of one block: ask for "
             f"{config.results_dir}/{block_scene_name(scene, 0)}/{'/'.join(path)} (docs/long_drives.md)"

@@ -32,6 +32,8 @@ from drivesplat.workflow.without_cameras import has_cameras, scene_methods
 from drivesplat.workflow.without_tracks import methods_of
 
 SCRIPTS = "workflow_scripts"
+SPLATS = "splats/splats.json"
+"""The index of the PLYs of a drive that is cut into blocks."""
 NOTHING = "(?!)"
 """A wildcard constraint that nothing matches."""
 LOOKS = ("ghost_panel.png", "removal.png")
@@ -241,7 +243,10 @@ class Outputs(Inputs):
 
     def exports(self, _: Any = None) -> list[str]:
         """The exported files of the batch's scenes and methods, in the formats of the settings."""
-        return self.of_methods(
+        cut = self._with_cameras(scene for scene in self.config.batch_scenes if self.config.is_cut(scene))
+        pairs = ((scene, method) for scene in cut for method in scene_methods(self.config, scene))
+        of_drives = [f"{self.config.results_dir}/{scene}/{method}/{SPLATS}" for scene, method in pairs]
+        return of_drives + self.of_methods(
             lambda scene, _: [name for kind in for_scene(self.config, scene).export.formats for name in EXPORTS[kind]]
         )
 

@@ -48,7 +48,8 @@ def test_the_drive_has_films_and_figures_and_its_blocks_all_else():
     assert made.metrics() == ["there/0001/metrics.json", "there/way/metrics.json"]
     of_drive = {path for path in (*made.films(), *made.exports(), *made.looks(), *made.drives()) if "/way/" in path}
     films = for_scene(made.config, "way").render.trajectories.items()
-    assert of_drive == {f"there/way/vanilla/{name}.mp4" for name, film in films if film.parts == "all"} and of_drive
+    whole = [f"{name}.mp4" for name, film in films if film.parts == "all"]
+    assert whole and of_drive == {f"there/way/vanilla/{name}" for name in (*whole, "splats/splats.json")}
     stages = made.metrics_stages("way")
     assert {"block", "vanilla/evaluate_blocks", "vanilla/train"} <= stages.keys()
     assert not {"block", "vanilla/evaluate_blocks"} & made.metrics_stages("0001").keys()

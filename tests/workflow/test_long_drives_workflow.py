@@ -2,15 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.drives import World, write_world
 from helpers.shared_runs import VANILLA
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
+from plyfile import PlyData
 
 import drivesplat
 
 pytestmark = pytest.mark.workflow
-TARGETS = ("results/0001/metrics.json", "results/0001/vanilla/original.mp4")
+INDEX = "results/0001/vanilla/splats/splats.json"
+TARGETS = ("results/0001/metrics.json", "results/0001/vanilla/original.mp4", INDEX)
 
 
 def world(key_frames: int) -> World:
@@ -50,6 +53,17 @@ def test_a_drive_becomes_blocks_that_are_measured_together_and_shown_in_one_film
     assert copy.planned(*TARGETS) == {}, "nothing is left to be done"
     drive = drivesplat.LongDrive(copy.folder / "results/0001/vanilla", device="cpu")
     assert drive.render("CAM_FRONT", 0.9 * drive.duration).image.shape == (54, 96, 3)
+
+
+def test_every_static_gaussian_of_the_drive_is_in_the_file_of_the_nearest_block(copy):
+    index = copy.read(INDEX)
+    paths = [np.array(block["path"]) for block in copy.read("results/0001/blocks.json")["blocks"]]
+    for number, entry in enumerate(index["blocks"]):
+        vertices = PlyData.read(copy.folder / INDEX.replace("splats.json", entry["file"]))["vertex"]
+        places = np.stack([vertices["x"], vertices["y"]], axis=1) + entry["translation"][:2]
+        apart = [np.linalg.norm(places[:, None] - path, axis=2).min(axis=1) for path in paths]
+        assert entry["gaussians"] == len(places) > 50 and (np.argmin(apart, axis=0) == number).mean() > 0.99
+        assert vertices["x"].min() == pytest.approx(entry["lower"][0]) and entry["scene"] == f"0001.00{number}"
 
 
 def test_a_longer_drive_trains_its_last_block_and_new_ones_alone(copy):
