@@ -20,6 +20,8 @@ from drivesplat.settings.images import HoldoutSettings
 
 STEP = 1.0
 """Metres between the places of a path: smaller movements of a vehicle that stands count for nothing."""
+MAX_AT_PLACE = 10
+"""Key frames that a block keeps of a place at which the vehicle stands or crawls, beside those that are held out."""
 MAX_SPEED, SLACK = 70.0, 5.0
 """A vehicle that moves by more than MAX_SPEED (m/s) and SLACK (m) between recordings has jumped."""
 
@@ -46,26 +48,29 @@ def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
         core = np.array([[starts[a], starts[b] if b < len(starts) else last + 1] for a, b in own])
         used = _extended(own, times, places, anchors, job.blocks.overlap_m, core)
         blocks.append(Block(core, used, places[anchors[owners == number]]))
-    whole = Blocks(scene.name, tuple(blocks))
-    return replace(whole, blocks=tuple(replace(own, digest=_digest(scene, own, job)) for own in whole.blocks))
+    thinned = _without_crowds(scene, job.holdout)
+    return Blocks(scene.name, tuple(replace(own, digest=_digest(thinned, own, job.holdout)) for own in blocks))
 
 
 def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSettings) -> Scene:
     """The scene of a block: its recordings, with key frames counted from 0 and the world's origin on its path. Held-out
-    key frames are those of the whole drive; those of blocks beside it are excluded.
+    key frames are those of the whole drive; those of blocks beside it are excluded. Of a place at which the vehicle
+    stands or crawls some key frames are kept.
 
     Raises DatasetError where the block has no key frame.
     """
-    block = blocks.blocks[number]
-    kept = np.flatnonzero(within(scene.key_frame_timestamps, block.used))
+    block, stamps = blocks.blocks[number], scene.key_frame_timestamps
+    thinned = _without_crowds(scene, holdout)
+    kept = _kept(thinned, block)
     if len(kept) == 0:
         raise DatasetError(f"scene {blocks.names[number]}: the block has no key frame; make blocks longer (length_m)")
-    own = np.flatnonzero(within(scene.key_frame_timestamps, block.core))
+    own = np.flatnonzero(within(stamps, block.core))
     held_out: dict[str, list[int]] = {"excluded": []}
-    for group, indices in holdout.held_out(len(scene.key_frame_timestamps)).items():
+    for group, indices in holdout.held_out(len(stamps)).items():
         held_out[group] = np.searchsorted(kept, np.intersect1d(indices, own)).tolist()
         others = np.setdiff1d(np.intersect1d(indices, kept), own)
         held_out["excluded"] += np.searchsorted(kept, others).tolist()
+    scene = thinned
     frames = tuple(_renumbered(frame, kept) for frame in _used(scene.frames, block))
     sweeps = tuple(_renumbered(sweep, kept) for sweep in _used(scene.sweeps, block))
     cameras, lidars = {frame.camera for frame in frames}, {sweep.lidar for sweep in sweeps}
@@ -73,8 +78,8 @@ def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSetti
         replace(
             scene,
             name=blocks.names[number],
-            description=f"block {number} of {len(blocks.blocks)} of {scene.name}",
-            key_frame_timestamps=scene.key_frame_timestamps[kept],
+            description=f"block {number} of {scene.name}",
+            key_frame_timestamps=stamps[kept],
             frames=frames,
             sweeps=sweeps,
             tracks=tuple(_tracks(scene, block, kept)),
@@ -85,6 +90,53 @@ def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSetti
         ),
         block.origin,
     )
+
+
+def _without_crowds(scene: Scene, holdout: HoldoutSettings) -> Scene:
+    """The scene without most of the recordings where the vehicle stands or crawls: at a place with more than
+    MAX_AT_PLACE key frames so many of them stay, evenly in time, and those that are held out; nothing between them."""
+    times, places = _ego_places(scene)
+    starts, stamps = times[_anchors(times, places)], scene.key_frame_timestamps
+    at = np.searchsorted(starts, stamps, side="right")
+    held_out = {i for group in holdout.held_out(len(stamps)).values() for i in group}
+    dropped: set[int] = set()
+    crowded: set[int] = set()
+    for place, count in zip(*np.unique(at, return_counts=True), strict=True):
+        if count > MAX_AT_PLACE:
+            indices = np.flatnonzero(at == place)
+            kept = indices[np.linspace(0, count - 1, MAX_AT_PLACE).round().astype(int)]
+            dropped |= {*indices.tolist()} - {*kept.tolist()} - held_out
+            crowded.add(int(place))
+
+    def stays(recording: Frame | Sweep) -> bool:
+        if recording.is_key_frame:
+            return recording.sample_index not in dropped
+        return int(np.searchsorted(starts, recording.timestamp, side="right")) not in crowded
+
+    return replace(
+        scene,
+        frames=tuple(frame for frame in scene.frames if stays(frame)),
+        sweeps=tuple(sweep for sweep in scene.sweeps if stays(sweep)),
+        tracks=tuple(_at_key_frames(track, ~np.isin(track.sample_indices, [*dropped])) for track in scene.tracks),
+    )
+
+
+def _at_key_frames(track: Track, chosen: np.ndarray) -> Track:
+    """A track with some of its annotations, by mask."""
+    return replace(
+        track,
+        timestamps=track.timestamps[chosen],
+        sample_indices=track.sample_indices[chosen],
+        object_to_world=track.object_to_world[chosen],
+        visibility=track.visibility[chosen],
+    )
+
+
+def _kept(scene: Scene, block: Block) -> Int64[np.ndarray, " k"]:
+    """The key frames of a block, of a scene without those that are dropped."""
+    recorded = {recording.sample_index for recording in (*scene.frames, *scene.sweeps) if recording.is_key_frame}
+    found = np.flatnonzero(within(scene.key_frame_timestamps, block.used))
+    return found[np.isin(found, [*recorded])]
 
 
 def _ego_places(scene: Scene) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 2"]]:
@@ -205,13 +257,8 @@ def _tracks(scene: Scene, block: Block, kept: np.ndarray) -> Iterator[Track]:
     for track in scene.tracks:
         own = within(track.timestamps, block.used) & np.isin(track.sample_indices, kept)
         if own.any():
-            yield replace(
-                track,
-                timestamps=track.timestamps[own],
-                sample_indices=np.searchsorted(kept, track.sample_indices[own]),
-                object_to_world=track.object_to_world[own],
-                visibility=track.visibility[own],
-            )
+            found = _at_key_frames(track, own)
+            yield replace(found, sample_indices=np.searchsorted(kept, found.sample_indices))
 
 
 def _moved(scene: Scene, origin: np.ndarray) -> Scene:
@@ -234,13 +281,13 @@ def _moved(scene: Scene, origin: np.ndarray) -> Scene:
     )
 
 
-def _digest(scene: Scene, block: Block, job: BlocksJob) -> str:
+def _digest(scene: Scene, block: Block, holdout: HoldoutSettings) -> str:
     """That of all that a block's scene depends on: of the recordings, the tracks and the held-out key frames."""
-    held_out = job.holdout.held_out(len(scene.key_frame_timestamps))
+    held_out = holdout.held_out(len(scene.key_frame_timestamps))
     stamps = {group: scene.key_frame_timestamps[indices] for group, indices in held_out.items()}
     own = {group: times[within(times, block.used)].tolist() for group, times in stamps.items()}
     digest = hashlib.blake2b(canonical_json(own).encode(), digest_size=16)
-    kept = np.flatnonzero(within(scene.key_frame_timestamps, block.used))
+    kept = _kept(scene, block)
     for record in (*_used(scene.frames, block), *_used(scene.sweeps, block), *_tracks(scene, block, kept)):
         digest.update(json.dumps(field_values(record), default=_plain).encode())
     return digest.hexdigest()

@@ -7,7 +7,7 @@ import pytest
 from helpers.scan_drives import at, track_of
 
 from drivesplat.errors import DatasetError
-from drivesplat.preprocess.blocks import block_scene, cut_into_blocks
+from drivesplat.preprocess.blocks import MAX_AT_PLACE, block_scene, cut_into_blocks
 from drivesplat.scene.blocks import Blocks, read_blocks, within, write_blocks
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.splits import frame_groups
@@ -74,7 +74,20 @@ def test_every_recording_is_in_one_core_and_overlaps_reach_as_far_as_the_setting
 def test_a_vehicle_that_stands_for_minutes_makes_no_block():
     standing = np.repeat([[60.0, 0.0]], 3000, axis=0) + np.random.default_rng(0).normal(0.0, 0.05, (3000, 2))
     scene = drive_along(np.concatenate([straight(60), standing, straight(120, start=60.0)]))
-    assert len(cut(scene).blocks) == 1
+    blocks = cut(scene)
+    assert len(blocks.blocks) == 1
+    own = block_scene(scene, blocks, 0, HOLDOUT)
+    groups = frame_groups(own, HOLDOUT)
+    standing = [
+        i for i, frame in enumerate(own.frames) if 59.5 < frame.ego_to_world[0, 3] + own.origin[0] - 100.0 < 60.5
+    ]
+    trained = [i for i in standing if groups[i] == "train"]
+    assert 5 <= len(trained) <= MAX_AT_PLACE + 10, "of 3000"
+    measured = lambda one, found: sum(g in ("interpolation", "extrapolation") for g in found)  # noqa: E731
+    assert measured(own, groups) == measured(scene, frame_groups(scene, HOLDOUT)) > 70
+    for frame in own.frames:
+        if frame.is_key_frame:
+            assert own.key_frame_timestamps[frame.sample_index] == frame.timestamp
 
 
 def square(laps: float) -> np.ndarray:
