@@ -16,7 +16,7 @@ from drivesplat.editing.sensor_path import EgoPoses, recorded_ego
 from drivesplat.errors import RequestError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import SensorPoses
-from drivesplat.scene.blocks import BLOCKS
+from drivesplat.scene.blocks import is_block
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan import ScanRays
@@ -25,7 +25,6 @@ from drivesplat.scene.scene import REFINED, Frame, Scene, Track, read_scene
 from drivesplat.scene.shutter import readout_of
 from drivesplat.scene.tracks import box_at, ever_moves
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
-from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.tracks import FOUND, TRACK_FOLDERS, Tracks
 from drivesplat.trajectories.camera_path import recorded_frames, recorded_timestamps, smooth_path
 from drivesplat.trajectories.lateral_offset import PosesAt
@@ -58,13 +57,8 @@ class RecordedDrive:
         were `refined` or not. Raises ResultError for missing files and those of another version."""
         results = folder.parent
         own: Tracks = "discovered" if any(track.startswith(FOUND) for track in tracks) else "annotated"
-        is_block = (results.parent / drive_of(results.name) / BLOCKS).is_file() and drive_of(
-            results.name
-        ) != results.name
-        of_scene = (
-            REFINED if refined and own == "annotated" and not is_block else Path(TRACK_FOLDERS[own], "scene.json")
-        )
-        record = results / of_scene
+        with_refined = refined and own == "annotated" and not is_block(results)
+        record = results / (REFINED if with_refined else Path(TRACK_FOLDERS[own], "scene.json"))
         scene = read_scene(record)
         # Images and rays are the same with any tracks.
         of_tracks = [results / TRACK_FOLDERS[of] for of in (own, "none")]
