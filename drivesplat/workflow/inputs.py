@@ -185,7 +185,10 @@ class Inputs:
         return self._of(next(iter(methods_of(self.config, wildcards.scene).values())).tracks, wildcards, "parser.npz")
 
     def discovered(self, wildcards: Any) -> list[str]:
-        """The discovered tracks of a scene, if those of the job are discovered or, without any, those of a method."""
+        """The discovered tracks of a scene, if those of the job are discovered or, without any, those of a method. None
+        for a drive that is cut into blocks: they have their own."""
+        if self.config.is_cut(wildcards.scene):
+            return []
         alone = hasattr(wildcards, "tracks")
         of_any = (method.tracks for method in methods_of(self.config, wildcards.scene).values())
         wanted = "discovered" in ([self.tracks(wildcards)] if alone else of_any)
@@ -248,8 +251,9 @@ class Inputs:
         return SCANS in training_inputs(self.config, scene, method)
 
     def scan_baselines(self, wildcards: Any) -> list[str]:
-        """The baselines of a scene's LiDAR scans, if any method renders them."""
-        rendered = any(
+        """The baselines of a scene's LiDAR scans, if any method renders them. None for a drive that is cut into blocks:
+        they have their own."""
+        rendered = not self.config.is_cut(wildcards.scene) and any(
             self.renders_lidar(wildcards.scene, method) for method in methods_of(self.config, wildcards.scene)
         )
         return [f"{self.config.results_dir}/{wildcards.scene}/{SCAN_BASELINES}.json"] if rendered else []

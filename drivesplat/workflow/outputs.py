@@ -327,7 +327,7 @@ class Outputs(Inputs):
         """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
         own = scene_methods(self.config, scene)
         methods = self.evaluation_stages(scene, own)
-        rendered = any(self.renders_lidar(scene, method) for method in own)
+        rendered = not self.config.is_cut(scene) and any(self.renders_lidar(scene, method) for method in own)
         combined = (*([SCAN_BASELINES] if rendered else []), SIDE_BY_SIDE)
         return {**methods, **{stage: self._stage(stage, scene) for stage in combined}}
 

@@ -83,3 +83,13 @@ def test_results_of_a_drive_and_those_of_other_scenes_are_not_refused():
 def test_a_scene_with_the_name_of_a_block_is_refused():
     with pytest.raises(ConfigError, match=r"scene 'way\.001' has the name of a block of scene 'way'; rename it"):
         plan(cut={**CUT, "scenes": ["way", drive_of("way") + ".001"]})
+
+
+def test_nothing_of_a_drive_is_made_from_all_of_its_scans():
+    scans = {"overrides": {"train": {"scans": {"per_image": 0.25}}}}
+    names = {"vanilla": {}, "found": {"parts": ["background", "actors"], "tracks": "discovered", **scans}}
+    made = Plan({"datasets": {"cut": CUT}, "methods": names, "results_dir": "there"}, str(REPOSITORY))
+    assert made.scan_baselines(at("way")) == made.discovered(at("way", "found")) == []
+    assert made.scan_baselines(at("way.000")) == ["there/way.000/scan_baselines.json"]
+    assert made.discovered(at("way.000", "found")) == ["there/way.000/discovered.json"]
+    assert not {"scan_baselines"} & made.metrics_stages("way").keys()
