@@ -38,9 +38,11 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
 from drivesplat.rendering.fixed_model import FixedModel
+from drivesplat.scene.blocks import BLOCKS
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.blocks import block_scene_name
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.camera_path import recorded_frames
@@ -74,6 +76,9 @@ def open_drive(folder: str | Path, device: str | DeviceSettings = "any") -> "Tra
     """
     folder = Path(folder)
     folder = unpack_drive(folder) if folder.is_file() or folder.suffix == ".usdz" else folder
+    if (folder.parent / BLOCKS).is_file():
+        one = block_scene_name(folder.parent.name, 0)
+        raise RequestError(f"{folder.parent} is cut into blocks: use drivesplat.LongDrive, or open one, such as {one}")
     file = model_file(folder)
     checkpoint = read_checkpoint(file) if file.parent == folder else read_snapshot(file.parent)
     tracks = [track.id for part in checkpoint.parts for track in part.tracks]

@@ -86,6 +86,8 @@ def test_two_blocks_are_in_memory_at_most(results, monkeypatch):
 def test_what_is_no_long_drive_and_unknown_times_and_blocks_are_refused(results, drive):
     with pytest.raises(RequestError, match=r"way.000 has no blocks.json: it is no drive that is cut into blocks"):
         drivesplat.LongDrive(results / "way.000/street")
+    with pytest.raises(RequestError, match=r"way is cut into blocks: use drivesplat.LongDrive, or open one"):
+        drivesplat.open(results / "way/street")
     with pytest.raises(RequestError, match=r"was recorded from 0 to .* s, not at -1 s"):
         drive.render("CAM_FRONT", -1.0)
     with pytest.raises(RequestError, match=r"has no block 2; it has 2, from 0 on"):
