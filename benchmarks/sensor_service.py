@@ -49,12 +49,15 @@ from benchmarks.sensor_client import (
     images_of,
     running_server,
 )
+from drivesplat.io.storage import write_csv
 from drivesplat.scene.scene import read_scene
 from drivesplat.serve.messages import wire
 from drivesplat.serve.scenes import DriveSource, find_sources
 
 WATCH_S = 5.0
 """Seconds between two looks at a server's memory."""
+LOGGED = ("seconds", "memory_mb", "open_files")
+"""The columns of a log of a server's memory."""
 BLACK = 10
 """The largest value of an image that AlpaSim counts as black."""
 VERSION_S = 0.1
@@ -212,7 +215,7 @@ def soak(
     def look() -> None:
         samples.append((perf_counter() - began, server.memory_mb(), server.open_files()))
         if log is not None:
-            np.savetxt(log, samples, "%.1f", ",", header="seconds,memory_mb,open_files", comments="")
+            write_csv(log, LOGGED, [dict(zip(LOGGED, sample, strict=True)) for sample in samples])
 
     def roll_out(number: int) -> int:
         return sum(digest(clients[number], i) != known[i] for i in order[number::rollouts].tolist())

@@ -295,10 +295,10 @@ def test_road_and_markings_are_static_pixels_by_the_true_class_images(known):
         masks = [static & np.isin(classes, numbers) for static in static_masks(known, 2.0)]
         assert aside[region]["pixels"] == pytest.approx(np.sum(masks), rel=2e-3)
         assert aside[region]["psnr"] == pytest.approx(by_hand(GREY, images, masks), abs=0.02)
-    groups, _ = measure_groups(flat_model(), known.recording, "CAM_FRONT", None, CPU, {}, classified)
-    unclassified, _ = measure_groups(flat_model(), known.recording, "CAM_FRONT", None, CPU, {})
-    for group, figures in groups.items():
-        assert figures.keys() - unclassified[group].keys() == {"road", "markings"}
+    groups = measure_groups(flat_model(), known.recording, "CAM_FRONT", None, CPU, {}, classified)
+    unclassified = measure_groups(flat_model(), known.recording, "CAM_FRONT", None, CPU, {})
+    for group, (figures, *_) in groups.items():
+        assert figures.keys() - unclassified[group].metrics.keys() == {"road", "markings"}
         held_out = measured_images(known.recording.record, "CAM_FRONT")[group]
         static = [known.recording.labels(index) == LABELS["static"] for index in held_out]
         assert figures["road"]["pixels"] == sum(int((own & (classes != 7)).sum()) for own in static)

@@ -26,6 +26,7 @@ from drivesplat.model.splat_ply import read_splat_ply
 from drivesplat.preprocess.poses.triangulated import read_triangulated
 from drivesplat.provenance.file_digests import checked_digest, record_output
 from drivesplat.readers.truth import read_truth
+from drivesplat.scene.blocks import read_blocks
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.light import read_light
 from drivesplat.scene.masks import read_masks_record
@@ -49,6 +50,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "scene.json": (read_scene, "extract"),
     "scene_refined.json": (read_scene, "refine_poses"),
     "own_car.json": (read_ego_mask, "own_car"),
+    "blocks.json": (read_blocks, "blocks"),
     "masks.json": (lambda path: read_masks_record(path.parent), "masks"),
     "discovered.json": (read_discovered, "discover"),
     "discovered/scene.json": (read_scene, "relabel"),
@@ -158,7 +160,9 @@ def test_a_resume_state_of_any_kind_executes_nothing(tmp_path, kind):
 def test_no_script_reads_results_but_by_a_reader_that_is_tested():
     """The first four, and the inserts, are made of others. tests/readers has damaged drive folders."""
     names = "evaluation_data inputs evaluation_inputs scan_evaluation_inputs json scene ego_mask masks_record ply "
-    names += "truth training_record actors lidar_depth scans triangulated summary checkpoint evaluations baselines "
+    names += (
+        "truth training_record actors lidar_depth scans triangulated summary checkpoint evaluations baselines blocks "
+    )
     tested = {f"read_{name}" for name in (names + "backbone far discovered inserts record drive").split()}
     used = {
         name.name

@@ -8,7 +8,6 @@ import yaml
 from helpers import REPOSITORY
 
 from drivesplat.readers.waymo.names import COMPONENTS
-from drivesplat.scene.splits import held_out_key_frames
 from drivesplat.settings.config import for_scene, merged
 from drivesplat.workflow.config_files import check_config_files
 from drivesplat.workflow.plan import Plan
@@ -66,7 +65,7 @@ def test_a_preset_measures_as_its_header_and_document_say(name):
 )
 def test_held_out_are_the_frames_of_the_document(name, frames, held_out):
     holdout = plan(name).config.holdout
-    assert held_out_key_frames(frames, holdout) == {"interpolation": held_out, "extrapolation": []}
+    assert holdout.held_out(frames) == {"interpolation": held_out, "extrapolation": []}
 
 
 @pytest.mark.parametrize("name", WAYMO)
