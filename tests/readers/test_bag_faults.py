@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -207,6 +208,20 @@ def test_damaged_and_repeated_messages_are_counted(tmp_path, capsys):
     assert "note: front: 1 image left out with the timestamp of another one" in said
     assert "note: top: 1 sweep of 10 left out as damaged; the first one has no points" in said
     assert check(tmp_path / "out", None) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "content"),
+    [
+        ("tf2_msgs/msg/TFMessage", SimpleNamespace(transforms=[SimpleNamespace(child_frame_id="base_link")])),
+        ("nav_msgs/msg/Odometry", SimpleNamespace(header=None)),
+        ("sensor_msgs/msg/Image", SimpleNamespace(height=1, width=1)),
+    ],
+)
+def test_a_bag_that_defines_its_messages_without_fields_has_damaged_ones(kind, content):
+    message = BagMessage("/some", 0, kind, b"", SimpleNamespace(deserialize=lambda data, kind: content))
+    with pytest.raises(DatasetError, match=r"a message on /some is damaged \(AttributeError: .* has no attribute"):
+        message.content()
 
 
 def test_transforms_that_are_none_are_counted(tmp_path, capsys):

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,18 @@ from drivesplat.readers.record_names import shown
 
 MISSING = "ROS bags need the package rosbags: pip install 'drivesplat[ros]'"
 SUFFIXES = (".bag", ".mcap", ".db3")
+_STAMPED = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
+_PLACE = tuple(f"{of}.{axis}" for of, axes in (("position", "xyz"), ("orientation", "xyzw")) for axis in axes)
+_MOVED = tuple(f"{of}.{axis}" for of, axes in (("translation", "xyz"), ("rotation", "xyzw")) for axis in axes)
+_FIELDS = {
+    "Image": attrgetter(*_STAMPED, "height", "width", "encoding", "step", "data"),
+    "CompressedImage": attrgetter(*_STAMPED, "format", "data"),
+    "CameraInfo": attrgetter(*_STAMPED, "height", "width", "distortion_model"),
+    "PointCloud2": attrgetter(*_STAMPED, "height", "width", "fields", "is_bigendian", "point_step", "row_step", "data"),
+    "Odometry": attrgetter(*_STAMPED, "child_frame_id", *(f"pose.pose.{name}" for name in _PLACE)),
+}
+"""What reads the fields of messages that are used. A bag defines its messages itself, and may lack some."""
+_TRANSFORM = attrgetter(*_STAMPED, "child_frame_id", *(f"transform.{name}" for name in _MOVED))
 METADATA = "metadata.yaml"
 """The file that makes a folder a bag of ROS 2."""
 UNFINISHED = (
@@ -45,9 +58,15 @@ class BagMessage:
     _reader: Any
 
     def content(self) -> Any:
-        """The message. Raises DatasetError where its bytes do not fit its type."""
+        """The message. Raises DatasetError where its bytes do not fit its type, or the type lacks fields."""
         try:
-            return self._reader.deserialize(self._data, self._kind)
+            found = self._reader.deserialize(self._data, self._kind)
+            name = self._kind.rpartition("/")[2]
+            if name in _FIELDS:
+                _FIELDS[name](found)
+            for one in getattr(found, "transforms", ()):
+                _TRANSFORM(one)
+            return found
         except Exception as error:  # of rosbags, struct and NumPy
             raise DatasetError(f"a message on {self.topic} is damaged ({_reason(error)})") from error
 
