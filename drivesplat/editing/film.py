@@ -14,7 +14,6 @@ from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.placed_model import placed_models
 from drivesplat.editing.shown_objects import ShownObjects
-from drivesplat.editing.unseen_sides import UNSEEN, unseen_sides
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -29,6 +28,7 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import RECORDED_IN_WORDS, EditJob, TrajectorySettings
 from drivesplat.trajectories.camera_path import film_path
 from drivesplat.trajectories.edited_actors import EditedActor
+from drivesplat.trajectories.seen_sides import TimedCameras
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +36,12 @@ DECIMALS = 6
 """Decimals of a pose in labels: micrometres, and 1e-4 degrees. More would double the size of the file."""
 SHOWN_EVERY_S = 0.5
 """Seconds between the frames in which labels look for the objects that the background shows."""
+UNSEEN = "sides that no camera saw"
+"""The note in the film, for frames of `unseen_sides`."""
+MAX_TURN = np.radians(40.0)
+"""An object seen from farther round than this from all directions in training shows a side that is not there."""
+MIN_SHARE_SHOWN = 0.05
+"""Height of an object as a share of the frame's height from which a frame counts."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +120,23 @@ class EditedShots:
     def notes(self) -> list[str]:
         """The note in the caption of each edited frame."""
         return [UNSEEN if unseen else "" for unseen in unseen_sides(self.recorded, self.actors, self.after)]
+
+
+def unseen_sides(recorded: Sequence[EditedActor], edited: Sequence[EditedActor], shot: Shot) -> np.ndarray:
+    """The frames (n,) bool of a shot that show one of the `edited` actors from a side that no training image shows;
+    `recorded` are the actors before the edit, and assets that it inserts have `seen`. Objects that hide each other are
+    not accounted for."""
+    trained, count = TimedCameras.of_training(shot.scene, shot.format.holdout), len(shot.cameras)
+    repeated = np.tile(shot.K, (count, 1, 1)), np.tile(shot.size, (count, 1))
+    filmed = TimedCameras(np.array(shot.seconds), shot.cameras.camera_to_world, *repeated)
+    known = {actor.id: trained.azimuths(actor) for actor in recorded}
+    found = np.zeros(count, dtype=bool)
+    for actor in edited:
+        azimuths = filmed.azimuths(actor, MIN_SHARE_SHOWN)
+        seen = known[actor.source] if actor.seen is None else actor.seen
+        turns = np.abs(np.angle(np.exp(1j * (azimuths[:, None] - seen[~np.isnan(seen)]))))
+        found |= ~np.isnan(azimuths) & (turns.min(axis=1, initial=np.pi) > MAX_TURN)
+    return found
 
 
 def edited_shots(

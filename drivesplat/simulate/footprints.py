@@ -12,9 +12,6 @@ from jaxtyping import Bool, Float64
 
 from drivesplat.simulate.driven_run import OtherObject, VehicleShape
 
-AXES = 5
-"""Separating axes of two boxes: along and across each of both, and the vertical."""
-
 
 @dataclass(frozen=True, eq=False)
 class OrientedBoxes:
@@ -101,13 +98,14 @@ def time_to_contact(
 
 
 def _along_axes(a: OrientedBoxes, b: OrientedBoxes, vector: np.ndarray) -> np.ndarray:
-    """The components (..., AXES) of vectors (..., 3) on the separating axes."""
+    """The components (..., 5) of vectors (..., 3) on the separating axes of two boxes: along and across each of both,
+    and the vertical."""
     horizontal = [(vector[..., :2] * axis).sum(axis=-1) for axis in (a.forward, a.left, b.forward, b.left)]
     return np.stack([*horizontal, vector[..., 2]], axis=-1)
 
 
 def _reach(a: OrientedBoxes, b: OrientedBoxes) -> np.ndarray:
-    """The distances (..., AXES) of centres on each axis within which the projections of two boxes overlap."""
+    """The distances (..., 5) of centres on each axis within which the projections of two boxes overlap."""
     cos = np.abs((a.forward * b.forward).sum(axis=-1))
     sin = np.abs((a.left * b.forward).sum(axis=-1))
     (a_length, a_width, a_height), (b_length, b_width, b_height) = (np.moveaxis(box.half, -1, 0) for box in (a, b))

@@ -32,7 +32,7 @@ SIMILAR = math.radians(20.0)
 """Angle in radians, at a Gaussian or an object, between a camera and a training camera that saw it, up to which the two
 see it from a similar direction."""
 OTHER_SIDE = math.radians(40.0)
-"""Angle from which a side is shown that no training image saw; that of `drivesplat.editing.unseen_sides`."""
+"""Angle from which a side is shown that no training image saw; that of `drivesplat.editing.film.unseen_sides`."""
 MAX_MAGNIFICATION = 2.0
 """Pixels per metre, as a multiple of those in a training image, up to which two images are of a similar scale. An image
 from farther away always is."""

@@ -5,7 +5,7 @@ import pytest
 
 from drivesplat.lidar.objects.boxes import Discovered
 from drivesplat.lidar.objects.clusters import Chain, Cluster
-from drivesplat.lidar.objects.registration import least_misfit, misfit, misfit_along
+from drivesplat.lidar.objects.discover import least_misfit, misfit, misfit_along
 from drivesplat.lidar.objects.smoothing import smooth_path
 from drivesplat.scene.object_class import ObjectClass
 

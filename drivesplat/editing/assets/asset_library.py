@@ -4,22 +4,25 @@
 made of the folders: a folder that is removed is gone from them at the next `write_index`.
 """
 
+import base64
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from PIL import Image, UnidentifiedImageError
 
+from drivesplat.editing.assets import library_page
 from drivesplat.editing.assets.asset import TURNTABLE, Asset, write_asset
 from drivesplat.editing.assets.formats.foreign import json_of
 from drivesplat.editing.assets.library_entry import THUMBNAIL, LibraryEntry, read_entry
-from drivesplat.editing.assets.library_html import library_html
 from drivesplat.editing.assets.turntable import write_turntable
 from drivesplat.errors import RequestError, ResultError
 from drivesplat.io.file_lock import waiting_for_lock
+from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import atomic_write, write_json
 from drivesplat.settings.asset_references import PLY, RECORD
 
@@ -27,8 +30,6 @@ INDEX, PAGE, LOCK = "library.json", "index.html", ".lock"
 LIBRARY_SCHEMA = 1
 THUMBNAIL_SIZE, THUMBNAIL_FRAME = (200, 150), 3
 """Pixels, and the picture of the turntable that a thumbnail is: from the front, to the left."""
-
-
 FILES = (PLY, RECORD, TURNTABLE, THUMBNAIL)
 """Of an asset in a library; the record is the last that is written."""
 
@@ -102,7 +103,7 @@ class AssetLibrary:
     def _write(self, entries: list[LibraryEntry]) -> None:
         write_json(self.folder / INDEX, {"schema": LIBRARY_SCHEMA, "assets": [own.record() for own in entries]})
         with atomic_write(self.folder / PAGE) as file:
-            file.write(library_html(self.folder, entries).encode())
+            file.write(_page(self.folder, entries).encode())
 
     def _put(self, name: str, source: Mapping[str, Any], write: Callable[[Path], None]) -> bool:
         self.check()
@@ -120,6 +121,18 @@ class AssetLibrary:
             write(folder)
             _write_thumbnail(folder)
         return known
+
+
+def _page(folder: Path, entries: Sequence[LibraryEntry]) -> str:
+    """The text of index.html of the library in a folder, with a small picture of each asset inside. It needs no
+    network; turntables are read from the folders beside it, where they are."""
+    pictures = {
+        own.id: "data:image/webp;base64," + base64.b64encode((folder / own.thumbnail).read_bytes()).decode()
+        for own in entries
+        if own.thumbnail
+    }
+    counts = sorted(Counter(own.object_class.value for own in entries).items())
+    return filled_page(library_page, folder=folder.resolve().name, entries=entries, pictures=pictures, counts=counts)
 
 
 def _write_thumbnail(folder: Path) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import combinations, pairwise
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from drivesplat.lidar.ground import GroundMap
@@ -13,7 +13,6 @@ from drivesplat.lidar.objects.chains import chains_of
 from drivesplat.lidar.objects.clusters import Chain, Cluster, clusters_of
 from drivesplat.lidar.objects.ends import Ends
 from drivesplat.lidar.objects.merging import after_gaps, of_parts, united
-from drivesplat.lidar.objects.registration import least_misfit, misfit_along
 from drivesplat.lidar.objects.seen_empty import seen_empty
 from drivesplat.lidar.objects.separation import separated
 from drivesplat.lidar.objects.standing import StandingMap
@@ -57,6 +56,10 @@ MISFIT_LINK, MISFIT = 0.3, 0.15
 and for half of them, beside half of that distance and what UNKNOWN_ACCELERATION (metres per second squared), which
 smooth paths miss, adds from scan to scan."""
 UNKNOWN_ACCELERATION = 2.0
+MAX_POINTS = 100
+"""Returns of a cluster that are looked at, evenly chosen."""
+FREE = 3.0
+"""Factor on the distance of surfaces that were moved until they fit: chance makes it small."""
 MAX_ACCELERATION = 5.0
 """Metres per second squared, for half of the time, of an object: brisk braking, or a turn taken at speed."""
 MAX_SEPARATIONS = 8
@@ -178,6 +181,30 @@ def is_object(chain: Chain) -> bool:
         and len(seconds) >= MIN_FILL * scans
         and np.median([len(cluster.points) for cluster in chain.clusters]) >= MIN_TYPICAL
     )
+
+
+def misfit(a: Cluster, b: Cluster, shift: Float[np.ndarray, "2"]) -> float:
+    """The median distance in metres of the returns of the smaller cluster from those of the larger one, after the
+    horizontal `shift` of the first."""
+    moved, still = a.points + np.array([*shift, 0.0]), b.points
+    few, many = (moved, still) if len(moved) <= len(still) else (still, moved)
+    chosen = few[:: -(-len(few) // MAX_POINTS)]
+    return float(np.median(cKDTree(many).query(chosen)[0]))
+
+
+def least_misfit(a: Cluster, b: Cluster) -> float:
+    """The least `misfit` (metres) where the low corners, the high corners or the middles of both meet: parts of an
+    object may be hidden."""
+    corners = [(c.points[:, :2].min(axis=0), c.points[:, :2].max(axis=0), c.place) for c in (a, b)]
+    return min(misfit(a, b, to - start) for start, to in zip(*corners, strict=True))
+
+
+def misfit_along(chain: Chain, item: Discovered) -> float:
+    """The median `misfit` (metres) of consecutive clusters of a chain, moved as its box moves; or FREE times that where
+    they fit best, since patches of the even side of a long vehicle slide along it."""
+    places = item.path.places(chain.seconds)
+    pairs = zip(chain.clusters[:-1], chain.clusters[1:], np.diff(places, axis=0), strict=True)
+    return float(np.median([min(misfit(a, b, shift), FREE * least_misfit(a, b)) for a, b, shift in pairs]))
 
 
 class Surroundings:
