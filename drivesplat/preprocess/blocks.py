@@ -36,7 +36,7 @@ def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
     Raises DatasetError for a drive without poses.
     """
     times, places = _ego_places(scene)
-    anchors = _anchors(times, places)
+    anchors = _anchors(places)
     owners = _owners(places[anchors], _jumps(times, places)[anchors], job.blocks)
     runs = [0, *(np.flatnonzero(np.diff(owners)) + 1).tolist(), len(owners)]
     first, last = _span(scene)
@@ -96,7 +96,7 @@ def _without_crowds(scene: Scene, holdout: HoldoutSettings) -> Scene:
     """The scene without most of the recordings where the vehicle stands or crawls: at a place with more than
     MAX_AT_PLACE key frames so many of them stay, evenly in time, and those that are held out; nothing between them."""
     times, places = _ego_places(scene)
-    starts, stamps = times[_anchors(times, places)], scene.key_frame_timestamps
+    starts, stamps = times[_anchors(places)], scene.key_frame_timestamps
     at = np.searchsorted(starts, stamps, side="right")
     held_out = {i for group in holdout.held_out(len(stamps)).values() for i in group}
     dropped: set[int] = set()
@@ -158,7 +158,7 @@ def _jumps(times: np.ndarray, places: np.ndarray) -> Int[np.ndarray, " n"]:
     return np.append(0, np.cumsum(moved > SLACK + MAX_SPEED * passed))
 
 
-def _anchors(times: np.ndarray, places: np.ndarray) -> Int[np.ndarray, " a"]:
+def _anchors(places: np.ndarray) -> Int[np.ndarray, " a"]:
     """The first place, and each that lies STEP or more from the one before it."""
     found = [0]
     for i, place in enumerate(places):

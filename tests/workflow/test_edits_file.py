@@ -193,8 +193,9 @@ def demo_actors() -> list[EditedActor]:
 
 @pytest.mark.slow
 def test_the_demos_edits_name_what_is_there_and_use_every_step(demo_actors):
+    """But insertion, which needs the asset of another scene: presets/edits/cyclist.yaml."""
     edits = read_edits(DEMO)
-    assert {step.kind for edit in edits.values() for step in edit.steps} == set(Step.model_fields)
+    assert {step.kind for edit in edits.values() for step in edit.steps} == set(Step.model_fields) - {"insert"}
     for name, edit in edits.items():
         edited_drive = edited_actors(demo_actors, edit, name)
         moved = [actor for actor in edited_drive if actor.edited]
