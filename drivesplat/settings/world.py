@@ -1,9 +1,9 @@
 """Settings of synthetic worlds."""
 
-from collections.abc import Sequence
-from typing import Annotated, Literal, get_args
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field, model_serializer, model_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit
@@ -18,6 +18,10 @@ Gain = Annotated[float, Field(gt=0, le=8)]
 Channel = CameraChannel | Literal["LIDAR_TOP"]
 WalkwayPlace = Literal["road", "sidewalk"]
 Offset = Annotated[float, Field(ge=-6, le=6)]
+NOT_WITH_A_ROUTE = ("bystanders", "dogs", "traffic", "ego", "bend_deg", "grade")
+"""Settings of the one street."""
+MAX_STREET_KEY_FRAMES = 400
+"""Maximum number of key frames without a route."""
 
 
 class WorldLidarSettings(Settings):
@@ -48,6 +52,20 @@ class WorldTruthSettings(Settings):
     """Names of edits in the scene's edits file whose truth is written. null = all. docs/editing.md"""
 
 
+class WorldRouteSettings(Settings):
+    """A route through a grid of streets, for drives of any length. docs/world.md"""
+
+    block_m: float = Field(84.0, ge=70, le=200)
+    """Distance of neighbouring crossings in metres."""
+    speed: float = Field(12.0, ge=3, le=20)
+    """Speed of the ego vehicle on straight streets in m/s. It slows down for turns."""
+    loop_blocks: int = Field(12, ge=4, le=200, multiple_of=2)
+    """Number of blocks from a street until the route passes the same street again. Loops of 8 blocks and more have
+    turns to both sides."""
+    closure: Literal["same", "opposite"] = "same"
+    """Direction in which the route passes the street again."""
+
+
 class WorldSettings(Settings):
     """A synthetic street in nuScenes format, generated at the dataset's dataroot, with ground truth that recorded
     drives lack. docs/world.md"""
@@ -60,8 +78,8 @@ class WorldSettings(Settings):
     """Rays per pixel, evenly spread. By day each has a shadow ray."""
     cameras: tuple[CameraChannel, ...] | None = None
     """Cameras that record. null = those of the setting `cameras`."""
-    key_frames: int = Field(20, ge=2, le=400)
-    """Number of key frames."""
+    key_frames: int = Field(20, ge=2, le=100_000)
+    """Number of key frames: with a route any number, else at most 400."""
     key_frame_hz: Literal[2, 10] = 2
     """Key frames a second: 2 as nuScenes, 10 as Waymo and KITTI."""
     image_hz: Literal[10, 12, 20] = 12
@@ -97,6 +115,10 @@ class WorldSettings(Settings):
     """Angle of a bend of the road to the left."""
     grade: float = Field(0.0, ge=-0.12, le=0.12)
     """Slope of the road ahead: metres of height per metre."""
+    route: WorldRouteSettings | None = None
+    """A drive through a grid of streets, without ground truth. Numbers of vehicles, pedestrians and cyclists then
+    count for ten seconds of the drive, that of parked vehicles for a block. null = a drive along one
+    street."""
     own_car: bool = False
     """Show the rear of the ego vehicle at the lower edge of CAM_BACK's images."""
     exposures: dict[Channel, tuple[Gain, Gain, Gain]] = Field(default_factory=dict)
@@ -119,6 +141,28 @@ class WorldSettings(Settings):
         if self.image_hz % self.key_frame_hz:
             raise ValueError(f"image_hz is {self.image_hz}, no multiple of key_frame_hz ({self.key_frame_hz})")
         return self
+
+    @model_validator(mode="after")
+    def _fit_the_route(self) -> "WorldSettings":
+        if self.route is None:
+            if self.key_frames > MAX_STREET_KEY_FRAMES:
+                raise ValueError(
+                    f"key_frames is {self.key_frames}: one street has at most {MAX_STREET_KEY_FRAMES}; set route for a "
+                    "longer drive"
+                )
+            return self
+        fields = type(self).model_fields
+        unfit = [name for name in NOT_WITH_A_ROUTE if getattr(self, name) != fields[name].get_default()]
+        if unfit:
+            raise ValueError(f"a world with a route has no {', '.join(unfit)}; leave out {'it' if len(unfit) == 1 else 'them'}")
+        if self.truth != WorldTruthSettings():
+            raise ValueError("a world with a route has no ground truth; leave out truth")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_a_null_route(self, dump: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        """Worlds without a route keep the settings, and so the digests, that they had before there were routes."""
+        return {name: value for name, value in dump(self).items() if name != "route" or value is not None}
 
     def with_sensors(self, cameras: Sequence[str], sweeps: bool, lidar_sweeps: bool) -> "WorldSettings":
         """These settings with the names of sensors in place of null, for a config that uses `cameras`.

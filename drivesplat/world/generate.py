@@ -2,25 +2,22 @@
 
 import logging
 import multiprocessing
-import shutil
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from itertools import pairwise, repeat
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
-from drivesplat.errors import ConfigError, ResultError
-from drivesplat.io.storage import Provenance, atomic_write, canonical_json, sha256_text
+from drivesplat.errors import ConfigError
+from drivesplat.io.storage import Provenance, canonical_json, sha256_text
 from drivesplat.readers.truth import TruthView
-from drivesplat.scene.images import write_png
-from drivesplat.settings.world import WorldJob, WorldSettings
+from drivesplat.settings.world import WorldJob
 from drivesplat.world.marker import prepare_folder
 from drivesplat.world.optics.raycast import NO_HIT, StreetRays
-from drivesplat.world.optics.rig import RigSensor, image_height, key_frame_time, recording_sensors, trigger_times
+from drivesplat.world.optics.rig import key_frame_time
+from drivesplat.world.output.recordings import boxes, require_space, sensor_files, world_bytes, write_recording
 from drivesplat.world.output.tables import NuScenesTables
 from drivesplat.world.output.truth import (
     key_frames_of,
@@ -29,38 +26,15 @@ from drivesplat.world.output.truth import (
     write_scan,
     write_truth,
 )  # fmt: skip
-from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
-from drivesplat.world.shapes.mesh import SurfaceClass
+from drivesplat.world.recorder import Recorder, Viewpoint
+from drivesplat.world.route.dataset import write_route
 
 log = logging.getLogger(__name__)
 
-START_US = 1_767_225_600_000_000
-ANNOTATED_RANGE = 80.0
-"""Objects farther from the ego vehicle than this (metres) have no box."""
-JPEG_QUALITY = 95
-SEMANTIC, SKY = "semantic", "sky"
-"""Folders below the dataset's root."""
-UNLABELLED = 255
-JPEG_BYTES, TRUTH_BYTES, CLASS_BYTES = 0.45, 2.6, 0.06
-"""Bytes per pixel: of an image, of all images of a true view, of the class and sky maps of an image."""
-SWEEP_BYTES, SCAN_BYTES = 600_000, 250_000
-"""Bytes of a sweep of 32 beams, and of its truth."""
 CHECK_S = 0.1
 """Interval in seconds at which placed vehicles are checked."""
 CLEARANCE = 0.25
 """Height above the ground (metres) of the lowest rays through a vehicle; curbs are lower."""
-
-
-@dataclass(frozen=True)
-class SensorFile:
-    """An image or sweep to write. `path` is relative to the dataset's root; `time_us` counts from the drive's start."""
-
-    sensor: RigSensor
-    time_us: int
-    is_key_frame: bool
-    index: int
-    token: str
-    path: str
 
 
 def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int = 1) -> None:
@@ -70,6 +44,9 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
     bytes for any number of processes (`workers`). Raises ConfigError where `root` holds other files or an edit does not
     fit the street, ResultError where the disk is full or has no space for the world.
     """
+    if job.world.route is not None:
+        write_route(root, job, provenance, workers)
+        return
     recorder = Recorder(job.world, job.scene, job.edits, job.donors)
     context = multiprocessing.get_context("fork")
     if any(step.place or step.insert for edit in job.edits.values() for step in edit.steps):
@@ -82,21 +59,18 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
         f"Synthetic street, {light}, the ego vehicle {world.ego}, {world.traffic} traffic, {world.vehicles} moving "
         f"vehicles, {world.pedestrians} pedestrians"
     )
-    tables = NuScenesTables(job.scene, description, source, START_US, world)
+    tables = NuScenesTables(job.scene, description, source, world)
     for index in range(world.key_frames):
         tables.add_sample(index, key_frame_time(world, index))
-    files = []
-    for sensor in recording_sensors(world):
-        size = (world.width, image_height(world.width)) if sensor.is_camera else (0, 0)
-        for time_us, is_key, index in trigger_times(sensor, world):
-            row = tables.add_data(sensor, index, time_us, is_key, recorder.ego_to_global(time_us * 1e-6), size)
-            files.append(SensorFile(sensor, time_us, is_key, index, *row))
+    files = sensor_files(world, job.scene)
+    for file in files:
+        tables.add_data(file, recorder.ego_to_global(file.time_us * 1e-6))
     plans = planned(recorder)
     views, scans = ([plan for plan in plans if plan.sensor.is_camera == cameras] for cameras in (True, False))
     images = sum(file.sensor.is_camera for file in files)
     require_space(root, world_bytes(world, images, len(files) - images, len(views), len(scans)))
     with ProcessPoolExecutor(workers, context, _start_worker, (root, recorder)) as pool:
-        counts = pool.map(_with_recorder, repeat(_write_file), files)
+        counts = pool.map(_with_recorder, repeat(write_recording), files)
         visible = pool.map(_with_recorder, repeat(_visible_fractions), range(world.key_frames))
         frames = [
             pool.map(_with_recorder, repeat(write_frame), repeat(plan), key_frames_of(recorder, plan)) for plan in views
@@ -104,7 +78,8 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
         sweeps = [pool.map(_with_recorder, repeat(write_scan), repeat(plan), range(world.key_frames)) for plan in scans]
         lidar = {f.index: n for f, n in zip(files, counts, strict=True) if n is not None and f.is_key_frame}
         for index, fractions in enumerate(visible):
-            _annotate(tables, recorder, index, fractions, lidar[index])
+            for box in boxes(recorder, index, fractions, lidar[index]):
+                tables.add_box(box)
         true_views = []
         for plan, found in zip(views, frames, strict=True):
             view = plan.viewpoint
@@ -113,20 +88,6 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
         write_truth(root, recorder, true_views, [scan for found in sweeps for scan in found])
     tables.write(root, job.version)
     log.info("%d recordings, %d boxes in %s", len(files), len(tables.rows["sample_annotation"]), root)
-
-
-def _annotate(
-    tables: NuScenesTables, recorder: Recorder, index: int, visible: np.ndarray, lidar_points: np.ndarray
-) -> None:
-    """Adds the boxes of key frame `index`: objects in range that a camera or the LiDAR sees."""
-    seconds = key_frame_time(recorder.world, index) * 1e-6
-    ego = STREET_TO_GLOBAL @ recorder.ego_pose(seconds)
-    for item, fraction, points in zip(recorder.objects, visible.tolist(), lidar_points.tolist(), strict=True):
-        if item.category is None or not (fraction or points):
-            continue
-        box = recorder.box_to_global(item, seconds)
-        if np.linalg.norm((box - ego)[:2, 3]) <= ANNOTATED_RANGE:
-            tables.add_box(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
 
 
 def require_free_places(recorder: Recorder) -> None:
@@ -190,42 +151,5 @@ def _with_recorder(function: Callable[..., Any], *arguments: Any) -> Any:
     return function(*_worker, *arguments)
 
 
-def _write_file(root: Path, recorder: Recorder, file: SensorFile) -> np.ndarray | None:
-    """Writes an image or a sweep. Returns the number of LiDAR returns per object, None for images."""
-    with atomic_write(root / file.path) as target:
-        if not file.sensor.is_camera:
-            scan = recorder.scan(file.sensor, file.time_us)
-            target.write(recorder.returns(scan, file.sensor, file.time_us).tobytes())
-            return np.bincount(scan.object[scan.returned], minlength=len(recorder.objects))
-        picture = recorder.picture(file.sensor, file.time_us)
-        image = recorder.to_bytes(picture.radiance, file.sensor, file.time_us)
-        Image.fromarray(image).save(target, "JPEG", quality=JPEG_QUALITY)
-    if recorder.world.class_maps:
-        # the sky is unlabelled in the class map: it has no Gaussians
-        sky, name = picture.classes == SurfaceClass.SKY, f"{file.sensor.channel}/{PurePosixPath(file.path).stem}.png"
-        write_png(root / SKY / name, np.where(sky, 255, 0).astype(np.uint8))
-        write_png(root / SEMANTIC / name, np.where(sky, UNLABELLED, picture.classes).astype(np.uint8))
-    return None
-
-
 def _visible_fractions(root: Path, recorder: Recorder, index: int) -> np.ndarray:
     return recorder.visible_fractions(index)
-
-
-def world_bytes(world: WorldSettings, images: int, sweeps: int, views: int, scans: int) -> int:
-    """The approximate size in bytes of a world of so many images and sweeps, and of true views and scans, which are
-    written for each key frame."""
-    pixels, rays = world.width * image_height(world.width), world.lidar.beams / 32
-    per_image = JPEG_BYTES + (CLASS_BYTES if world.class_maps else 0.0)
-    recorded = images * pixels * per_image + sweeps * SWEEP_BYTES * rays
-    return round(recorded + world.key_frames * (views * pixels * TRUTH_BYTES + scans * SCAN_BYTES * rays))
-
-
-def require_space(root: Path, needed: int) -> None:
-    """Raises ResultError, one line, where the file system of `root` has less free space than `needed` bytes."""
-    free = shutil.disk_usage(root).free
-    if needed > free:
-        raise ResultError(
-            f"{root}: the world takes about {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; free some space, set "
-            "another datasets.<name>.dataroot, or make the world smaller (width, key_frames, cameras)"
-        )

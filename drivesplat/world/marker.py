@@ -22,6 +22,11 @@ def refuse_foreign_data(root: Path) -> None:
 def prepare_folder(root: Path, provenance: Provenance) -> None:
     """Deletes an earlier world in `root` and writes the marker. Raises ConfigError where `root` holds anything else."""
     refuse_foreign_data(root)
-    for folder in ("samples", "sweeps", "maps", "truth", "semantic", "sky"):
+    for folder in ("samples", "sweeps", "maps", "truth", "semantic", "sky", "stretches"):
         shutil.rmtree(root / folder, ignore_errors=True)
+    write_marker(root, provenance)
+
+
+def write_marker(root: Path, provenance: Provenance) -> None:
+    """Writes the marker into a world's folder."""
     write_json(root / WORLD_MARKER, {"provenance": provenance})

@@ -22,7 +22,7 @@ from drivesplat.world.optics.rig import SENSORS, RigSensor, image_height, key_fr
 from drivesplat.world.shapes.mesh import ColoredMesh
 from drivesplat.world.street.edited import Variation, edited
 from drivesplat.world.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject
-from drivesplat.world.street.street import build_street
+from drivesplat.world.street.street import Street, build_street
 from drivesplat.world.tokens import instance_token
 
 STREET_TO_GLOBAL = rigid(Rotation.from_euler("z", 0.62).as_matrix(), np.array([812.4, 1437.9, 0.0]))
@@ -84,12 +84,16 @@ class Recorder:
         scene: str = "demo",
         edits: Mapping[str, Edit] | None = None,
         donors: Mapping[str, WorldDonor] | None = None,
+        street: Street | None = None,
+        street_to_global: np.ndarray = STREET_TO_GLOBAL,
     ):
-        """`donors` are the objects that the edits insert, by the names of their assets. Raises ConfigError where a
-        world lacks one."""
+        """`donors` are the objects that the edits insert, by the names of their assets. `street` is recorded in place
+        of that of `world` if given; `street_to_global` (4, 4) is its pose. Raises ConfigError where a world lacks a
+        donor."""
         self.world, self.scene, self.edits = world, scene, dict(edits or {})
+        self.street_to_global = street_to_global
         self._inserted = {name: _donated(name, donor) for name, donor in (donors or {}).items()}
-        self.street = build_street(world)
+        self.street = build_street(world) if street is None else street
         self.objects = self.street.objects
         self._variations: dict[str | None, Variation] = {None: Variation(self.street)}
         self._casters: dict[str | None, RayCaster] = {}
@@ -226,7 +230,7 @@ class Recorder:
     def ego_to_global(self, seconds: float) -> np.ndarray:
         """The ego pose (4, 4) in the tables. `world.pose_noise` gives it the errors of nuScenes: z = 0, and smooth
         errors of roll, pitch and position."""
-        pose = STREET_TO_GLOBAL @ self.ego_pose(seconds)
+        pose = self.street_to_global @ self.ego_pose(seconds)
         if self.world.pose_noise:
             phases = self._random("poses").uniform(0, 2 * np.pi, (4, 2))
             waves = np.sin(2 * np.pi * seconds / np.array([7.0, 2.9]) + phases) @ [0.8, 0.5]

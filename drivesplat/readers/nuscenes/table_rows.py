@@ -24,6 +24,7 @@ class TableRows:
 
     def __init__(self, log_token: str, log: dict[str, str], attributes: tuple[str, ...]):
         self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
+        self._instances: dict[str, dict[str, Any]] = {}
         self._last: dict[tuple, dict[str, Any]] = {}
         self.add("log", log_token, **log)
         self.add("map", token("map"), category="semantic_prior", filename=MAP, log_tokens=[log_token])
@@ -56,10 +57,11 @@ class TableRows:
         )  # fmt: skip
         if not any(known["name"] == category for known in self.rows["category"]):
             self.add("category", token("category", category), name=category, description="")
-        known = next((known for known in self.rows["instance"] if known["token"] == instance), None) or self.add(
+        known = self._instances.get(instance) or self.add(
             "instance", instance, category_token=token("category", category), nbr_annotations=0,
             first_annotation_token=row["token"],
         )  # fmt: skip
+        self._instances[instance] = known
         known["nbr_annotations"] += 1
         known["last_annotation_token"] = row["token"]
 

@@ -5,7 +5,7 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from drivesplat.world.optics.materials import LEAVES, ROAD_, paint, surface
+from drivesplat.world.optics.materials import BARE_ASPHALT, LEAVES, ROAD_, paint, surface
 from drivesplat.world.optics.patterns import compiled, fractal, value_noise
 
 
@@ -156,8 +156,8 @@ def shade(
 def find_paint(face, weights, texture, out):
     """Fills `out` (n,) bool: whether there is paint at places of the road, given as of `shade`."""
     for i in range(len(face)):
-        x, y, _ = texture_point(texture[face[i]], weights[i])
-        out[i] = paint(x, y, 0.0) > 0.5
+        x, y, z = texture_point(texture[face[i]], weights[i])
+        out[i] = z >= BARE_ASPHALT and paint(x, y, 0.0) > 0.5
 
 
 @compiled

@@ -23,6 +23,8 @@ from drivesplat.world.optics.patterns import (
 )  # fmt: skip
 from drivesplat.world.shapes.mesh import BARK, Material
 
+BARE_ASPHALT = -10.0
+"""Where the texture of the ground is lower than this, it is road without paint."""
 PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES, METAL, SIGN = (int(m) for m in Material)
 
 
@@ -186,6 +188,9 @@ def lettering(r, g, b, along, z, footprint):
 def surface(material, r, g, b, x, y, z, nx, ny, nz, footprint):
     """Reflectance r, g, b, mirror reflectance and emission at night of a point with normal n in the object's frame."""
     if material == ROAD_:
+        if z < BARE_ASPHALT:
+            r = 0.085 * asphalt(x, y, footprint) * iron(x, y, footprint)
+            return r, r, 1.03 * r, 0.0, 0.0
         r, g, b = ground(x, y, footprint)
         return r, g, b, 0.0, 0.0
     along = y if abs(nx) > abs(ny) else x

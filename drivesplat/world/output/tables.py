@@ -9,7 +9,8 @@ from drivesplat.readers.nuscenes.table_rows import TableRows, pose_columns
 from drivesplat.readers.nuscenes.tokens import token
 from drivesplat.settings.world import WorldSettings
 from drivesplat.world.optics.lidar import scan_pattern, spin_of
-from drivesplat.world.optics.rig import RigSensor, recording_sensors
+from drivesplat.world.optics.rig import image_height, recording_sensors
+from drivesplat.world.output.recordings import START_US, KeyFrameBox, SensorFile
 from drivesplat.world.tokens import instance_token
 
 ATTRIBUTES = (
@@ -26,7 +27,7 @@ def visibility_level(fraction: float) -> str:
 class NuScenesTables(TableRows):
     """The tables of one drive. `scene` is its name without `scene-`; `source` becomes part of the log's name."""
 
-    def __init__(self, scene: str, description: str, source: str, start_us: int, world: WorldSettings):
+    def __init__(self, scene: str, description: str, source: str, world: WorldSettings):
         self.scene = scene
         log = {"logfile": f"demo-{source}", "vehicle": "demo", "date_captured": "2026-01-01", "location": "demo"}
         super().__init__(token(scene, "log"), log, ATTRIBUTES)
@@ -59,47 +60,36 @@ class NuScenesTables(TableRows):
             "scene", token(scene), log_token=token(scene, "log"), nbr_samples=0, first_sample_token="",
             last_sample_token="", name=f"scene-{scene}", description=description,
         )  # fmt: skip
-        self._start_us = start_us
+        self._size = world.width, image_height(world.width)
 
     def add_sample(self, index: int, time_us: int) -> None:
         """Adds a key frame, `time_us` after the start of the drive."""
         row = self.add_linked(
-            "sample", (), token(self.scene, "sample", index), timestamp=self._start_us + time_us,
+            "sample", (), token(self.scene, "sample", index), timestamp=START_US + time_us,
             scene_token=token(self.scene),
         )  # fmt: skip
         self._scene_row["nbr_samples"] += 1
         self._scene_row["first_sample_token"] = self._scene_row["first_sample_token"] or row["token"]
         self._scene_row["last_sample_token"] = row["token"]
 
-    def add_data(
-        self, sensor: RigSensor, index: int, time_us: int, is_key: bool, ego_to_global: np.ndarray,
-        size: tuple[int, int],
-    ) -> tuple[str, str]:  # fmt: skip
-        """Adds a recording of key frame `index`, with its ego pose (4, 4). `size`: width, height; (0, 0) for LiDAR.
-
-        Returns its token and the path of its file relative to the dataset's root.
-        """
-        timestamp = self._start_us + time_us
-        name = token(self.scene, sensor.channel, time_us)
-        suffix = "jpg" if sensor.is_camera else "pcd.bin"
-        folder = "samples" if is_key else "sweeps"
-        path = f"{folder}/{sensor.channel}/{self.scene}__{sensor.channel}__{timestamp}.{suffix}"
-        self.add("ego_pose", name, timestamp=timestamp, **pose_columns(ego_to_global))
+    def add_data(self, file: SensorFile, ego_to_global: np.ndarray) -> None:
+        """Adds a recording with its ego pose (4, 4)."""
+        channel, timestamp = file.sensor.channel, START_US + file.time_us
+        width, height = self._size if file.sensor.is_camera else (0, 0)
+        self.add("ego_pose", file.token, timestamp=timestamp, **pose_columns(ego_to_global))
         self.add_linked(
-            "sample_data", (sensor.channel,), name, sample_token=token(self.scene, "sample", index),
-            ego_pose_token=name, calibrated_sensor_token=token("calibrated", sensor.channel), timestamp=timestamp,
-            fileformat=suffix.split(".")[0], is_key_frame=is_key, width=size[0], height=size[1], filename=path,
+            "sample_data", (channel,), file.token, sample_token=token(self.scene, "sample", file.index),
+            ego_pose_token=file.token, calibrated_sensor_token=token("calibrated", channel), timestamp=timestamp,
+            fileformat="jpg" if file.sensor.is_camera else "pcd", is_key_frame=file.is_key_frame, width=width,
+            height=height, filename=file.path,
         )  # fmt: skip
-        return name, path
 
-    def add_box(
-        self, name: str, category: str, attribute: str | None, index: int, box_to_global: np.ndarray, size: np.ndarray,
-        visible: float, lidar_points: int,
-    ) -> None:  # fmt: skip
-        """Adds a box at key frame `index`: pose (4, 4) of its centre; `size` (3,): length, width, height in metres."""
+    def add_box(self, box: KeyFrameBox) -> None:
+        """Adds a box. Those of an object come in the order of time."""
         self.add_annotation(
-            (self.scene, "annotation", name, index), instance_token(self.scene, name), category, size,
-            sample_token=token(self.scene, "sample", index), visibility_token=visibility_level(visible),
-            attribute_tokens=[token(attribute)] if attribute else [], num_lidar_pts=lidar_points,
-            **pose_columns(box_to_global),
+            (self.scene, "annotation", box.name, box.index), instance_token(self.scene, box.name), box.category,
+            box.size, sample_token=token(self.scene, "sample", box.index),
+            visibility_token=visibility_level(box.visible),
+            attribute_tokens=[token(box.attribute)] if box.attribute else [], num_lidar_pts=box.lidar_points,
+            **pose_columns(box.pose),
         )  # fmt: skip

@@ -38,13 +38,19 @@ def building(low: Numbers, high: Numbers, color: Color, random: np.random.Genera
     texture = cells * (first + count * (walls.vertices - low) / (high - low))
     parts = [replace(walls, texture=texture), box(roof_low, roof_high, Material.PLAIN, METAL)]
     if random is not None:
-        front = low[1] if abs(low[1]) <= abs(high[1]) else high[1]
-        columns, floors = (max(1, round(size / cell)) for size, cell in zip((high - low)[::2], WINDOW, strict=True))
-        cell = np.array([(high[0] - low[0]) / columns, 1.0, (high[2] - low[2]) / floors])
-        details = concatenate(_front(columns, floors, cell, random))
-        turn = 0.0 if front == high[1] else np.pi
-        parts.append(details.moved((low[0] if turn == 0.0 else high[0], front, low[2]), turn))
+        parts.append(building_front(low, high, random))
     return concatenate(parts).classified(SurfaceClass.BUILDING)
+
+
+def building_front(low: Numbers, high: Numbers, random: np.random.Generator) -> ColoredMesh:
+    """What protrudes from the front of a building between two corners; see `building`."""
+    low, high = np.array(low, dtype=float), np.array(high, dtype=float)
+    front = low[1] if abs(low[1]) <= abs(high[1]) else high[1]
+    columns, floors = (max(1, round(size / cell)) for size, cell in zip((high - low)[::2], WINDOW, strict=True))
+    cell = np.array([(high[0] - low[0]) / columns, 1.0, (high[2] - low[2]) / floors])
+    details = concatenate(_front(columns, floors, cell, random)).classified(SurfaceClass.BUILDING)
+    turn = 0.0 if front == high[1] else np.pi
+    return details.moved((low[0] if turn == 0.0 else high[0], front, low[2]), turn)
 
 
 def awning(width: float, color: Color) -> ColoredMesh:

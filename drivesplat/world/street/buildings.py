@@ -31,18 +31,18 @@ def rows_of_buildings(road: ReferenceLine, random: np.random.Generator) -> list[
             near = side * (SIDEWALK + FORECOURT + random.uniform(0, 2.0))
             low, high = sorted((near, near + side * DEPTH))
             top, color = WINDOW[1] * random.integers(2, 7), WALLS[random.integers(len(WALLS))]
-            found.append(road.place(_building((-width / 2, low), (width / 2, high), top, color, random), s + width / 2))
+            found.append(road.place(standing_building((-width / 2, low), (width / 2, high), top, color, random), s + width / 2))
             if gap:
                 barrier = hedge(gap, 1.1, 0.6, random) if random.uniform() < 0.6 else fence(gap)
                 found.append(road.place(barrier, s + width + gap / 2, side * (SIDEWALK + 0.6)))
             s += width + gap
     for i, t in enumerate((-48.0, -16.0, 12.8, 41.6)):
-        across = _building((0.0, t), (15.0, t + 25.6), WINDOW[1] * (5 + 2 * i % 5), WALLS[i])
+        across = standing_building((0.0, t), (15.0, t + 25.6), WINDOW[1] * (5 + 2 * i % 5), WALLS[i])
         found += [road.place(across, ALONG[1] + 20), road.place(across, ALONG[0] - 45)]
     return found
 
 
-def _building(
+def standing_building(
     low: tuple[float, float], high: tuple[float, float], top: float, color: Color,
     random: np.random.Generator | None = None,
 ) -> ColoredMesh:  # fmt: skip

@@ -64,13 +64,7 @@ class StreetPath:
         else:
             yaw = self.heading + self.turning * np.sin(phase)
         poses = self.road.poses(self.along(seconds), t, yaw)
-        if self.suspension and self.speed:
-            pitch, roll, heave = (a * np.sin(w * seconds + p) for a, w, p in SUSPENSION)
-            poses[:, :3, :3] = (
-                poses[:, :3, :3] @ Rotation.from_euler("xy", np.stack([roll, pitch], axis=-1), degrees=True).as_matrix()
-            )
-            poses[:, 2, 3] += heave
-        return poses
+        return sprung(poses, seconds) if self.suspension and self.speed else poses
 
     def distance(self, seconds: np.ndarray) -> np.ndarray:
         return np.abs(self.along(seconds) - self.s)
@@ -83,6 +77,16 @@ class StreetPath:
         """Road coordinate s (n,) in metres."""
         surge = self.surge / self._omega * (1 - np.cos(self._omega * seconds))
         return self.s + self.speed * seconds + surge
+
+
+def sprung(poses: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Poses (n, 4, 4) of a vehicle at `seconds` (n,) with the pitch, roll and heave of its suspension; changes them in
+    place."""
+    pitch, roll, heave = (a * np.sin(w * seconds + p) for a, w, p in SUSPENSION)
+    turned = Rotation.from_euler("xy", np.stack([roll, pitch], axis=-1), degrees=True).as_matrix()
+    poses[:, :3, :3] = poses[:, :3, :3] @ turned
+    poses[:, 2, 3] += heave
+    return poses
 
 
 @dataclass(frozen=True)

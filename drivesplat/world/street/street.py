@@ -13,7 +13,7 @@ from drivesplat.world.street.buildings import rows_of_buildings
 from drivesplat.world.street.furniture import LAMPS, furniture, trees
 from drivesplat.world.street.ground import ground
 from drivesplat.world.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject, fixed
-from drivesplat.world.street.paths import StreetPath
+from drivesplat.world.street.paths import ObjectPath, StreetPath
 from drivesplat.world.street.people import people
 from drivesplat.world.street.road import STRAIGHT, ReferenceLine
 from drivesplat.world.street.traffic import ego_path, free_traffic, parked, queue
@@ -33,7 +33,7 @@ class Street:
     objects: tuple[StreetObject, ...]
     lamps: np.ndarray
     road: ReferenceLine
-    ego: StreetPath
+    ego: ObjectPath
     leading: str | None
 
 
