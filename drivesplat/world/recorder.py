@@ -204,17 +204,16 @@ class Recorder:
         """The visible fraction of each object (objects,) within the images of key frame `index`, of all six cameras
         whether they record or not: of points on its surface."""
         visible, inside, surfaces = np.zeros(len(self.objects)), np.zeros(len(self.objects)), self._surfaces
-        owners = np.repeat(list(surfaces), SURFACE_POINTS)
         for sensor in SENSORS:
             if sensor.is_camera and surfaces:
                 time = np.array([(key_frame_time(self.world, index) + sensor.delay_us) * 1e-6])
-                camera = self.camera(sensor, float(time[0]))
-                poses = [self.objects[n].piece_poses(time)[0, own.pieces] for n, own in surfaces.items()]
-                moved = [
-                    np.einsum("nij,nj->ni", pose[:, :3, :3], own.places) + pose[:, :3, 3]
-                    for pose, own in zip(poses, surfaces.values(), strict=True)
-                ]
-                points = np.concatenate(moved)
+                camera, snapshot = self.camera(sensor, float(time[0])), self.snapshot(time)
+                poses = snapshot.piece_poses()
+                present = {n: own for n, own in surfaces.items() if self.objects[n].name in poses}
+                if not present:
+                    continue
+                moved = [self._points(poses[self.objects[n].name][0], own) for n, own in present.items()]
+                points, owners = np.concatenate(moved), np.repeat(list(present), SURFACE_POINTS)
                 pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
                 limit = np.array([camera.width, camera.height]) - 0.5
                 chosen = (depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)
@@ -222,10 +221,16 @@ class Recorder:
                 toward, owner = points[chosen] - center, owners[chosen]
                 toward /= np.linalg.norm(toward, axis=1, keepdims=True)
                 rays = StreetRays(time, center[None], toward, np.zeros(len(toward), np.int32))
-                found = self.snapshot(time).cast(rays).object
+                found = snapshot.cast(rays).object
                 visible += np.bincount(owner[found == owner], minlength=len(visible))
                 inside += np.bincount(owner, minlength=len(inside))
         return visible / np.maximum(inside, 1)
+
+    @staticmethod
+    def _points(poses: np.ndarray, surface: SurfacePoints) -> np.ndarray:
+        """Points (n, 3) on a body whose pieces have these poses (pieces, 4, 4)."""
+        poses = poses[surface.pieces]
+        return np.einsum("nij,nj->ni", poses[:, :3, :3], surface.places) + poses[:, :3, 3]
 
     def ego_to_global(self, seconds: float) -> np.ndarray:
         """The ego pose (4, 4) in the tables. `world.pose_noise` gives it the errors of nuScenes: z = 0, and smooth

@@ -139,10 +139,12 @@ class RayCaster:
         # faces of one object, material, colour and direction are one surface
         owners = [number for number, item in enumerate(self.objects) for _ in item.body.pieces]
         owner = np.repeat(owners, [len(mesh.faces) for mesh in meshes])
-        rows = [owner, self.material, *(255 * self.color).round().T, *(8 * self.texture_normal).round().T]
-        columns = np.stack(rows).astype(np.int64)
-        columns -= columns.min(axis=1, keepdims=True)
-        key = np.ravel_multi_index(tuple(columns), columns.max(axis=1) + 1)
+        colors, normals = (255 * self.color).round().T, (8 * self.texture_normal).round().T
+        key = np.zeros(len(owner), np.int64)
+        for row in (owner, self.material, *colors, *normals):  # one by one, which takes less memory
+            column = row.astype(np.int64)
+            column -= column.min()
+            key = key * (column.max() + 1) + column
         self.surface = np.unique(key, return_inverse=True)[1]
 
     def at(self, seconds: np.ndarray, without: Collection[str] = ()) -> "StreetSnapshot":
@@ -154,13 +156,19 @@ class StreetSnapshot:
     """The street at m times. A ray sees it at the time of its moment."""
 
     def __init__(self, caster: RayCaster, seconds: np.ndarray, without: Collection[str]):
-        self.caster = caster
+        self.caster, self._seconds = caster, seconds
         self._moving = []
         for moving in caster._moving:
-            if moving.item.name not in without:
+            if moving.item.name not in without and moving.item.exists(seconds):
                 poses = moving.item.poses(seconds)
                 centers = moving.sphere.centers(poses)
                 self._moving.append((moving, centers, poses[:, None] @ moving.item.limb_poses(seconds)))
+
+    def piece_poses(self) -> dict[str, np.ndarray]:
+        """Piece to street (m, pieces, 4, 4) of each object that exists, by its name."""
+        found = {moving.item.name: poses for moving, _, poses in self._moving}
+        static = (item for item in self.caster.objects if not item.moves)
+        return found | {item.name: item.piece_poses(self._seconds) for item in static}
 
     def cast(self, rays: StreetRays) -> RayHits:
         """The first hit of each ray."""

@@ -34,6 +34,7 @@ from drivesplat.world.output.recordings import (
 )
 from drivesplat.world.output.tables import NuScenesTables
 from drivesplat.world.recorder import STREET_TO_GLOBAL, Recorder
+from drivesplat.world.route.scenery import build_makes
 from drivesplat.world.route.stretch import RouteDrive
 from drivesplat.world.shapes.mesh import SurfaceClass
 
@@ -55,9 +56,12 @@ def write_route(root: Path, job: WorldJob, provenance: Provenance, workers: int)
     missing = [index for index in range(drive.route.stretches) if index not in kept]
     images, sweeps = drive.count(missing)
     require_space(root, world_bytes(job.world, images, sweeps, 0, 0))
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _start_worker, (drive,)) as pool:
-        for index in pool.map(_make, missing):
-            log.info("stretch %d of %d is made", index + 1, drive.route.stretches)
+    build_makes()
+    for begin in range(0, len(missing), workers):  # new processes for each few stretches: old ones keep memory
+        some = missing[begin : begin + workers]
+        with ProcessPoolExecutor(len(some), multiprocessing.get_context("fork"), _start_worker, (drive,)) as pool:
+            for index in pool.map(_make, some):
+                log.info("stretch %d of %d is made", index + 1, drive.route.stretches)
     drive.delete_others()
     _merge(drive, sha256_text(canonical_json(provenance["stages"])))
 

@@ -32,7 +32,7 @@ ZEBRA = 15.0
 """Metres from the middle of a crossing to where the strip of road with a pedestrian crossing ends."""
 PARKED_SPACING, TREE_SPACING, LAMP_SPACING = 7.2, 17.0, 24.0
 MAKES = 24
-"""Number of different cars, and of vans, that park."""
+"""Number of different trees, of cars that park, and of vans."""
 SIGN_COLORS = ((0.6, 0.04, 0.03), (0.04, 0.1, 0.5))
 BARE = -20.0
 """z in the texture of the ground where the road has no paint."""
@@ -66,8 +66,10 @@ class House:
 
 @dataclass(frozen=True)
 class Parked:
-    """A parked vehicle: its place, the direction in which it faces in radians, its kind, and its make among MAKES."""
+    """A parked vehicle: its number on its street, its place, the direction in which it faces in radians, its kind, and
+    its make among MAKES."""
 
+    number: int
     x: float
     y: float
     heading: float
@@ -78,6 +80,22 @@ class Parked:
     def vehicle(self) -> tuple[ColoredMesh, str]:
         """Its mesh and nuScenes' category."""
         return _vehicle(self.kind, self.make)
+
+
+@cache
+def _tree(make: int) -> ColoredMesh:
+    """A tree; some overhang what is to their left."""
+    random = np.random.default_rng([5, make])
+    overhang = random.uniform(1.5, 2.5) if random.uniform() < 0.4 else 0.0
+    return plants.tree(random.uniform(5.0, 8.0), random, overhang)
+
+
+def build_makes() -> None:
+    """Builds the meshes that all streets share, once for all processes that begin later."""
+    for make in range(MAKES):
+        _tree(make)
+        for kind in ("car", "van"):
+            _vehicle(kind, make)
 
 
 @cache
@@ -130,21 +148,31 @@ class StreetScenery:
                     found.append(barrier.moved(((start + end) / 2, side * (SIDEWALK + 0.6), 0.0)))
         return found
 
+    def _tree_places(self) -> list[tuple[float, int]]:
+        """Place along the street, and side, of each tree."""
+        first = self._random(2).uniform(CLEAR + 1.0, CLEAR + 5.0, 2)
+        rows = ((np.arange(first[int(side > 0)], self.length - CLEAR, TREE_SPACING), side) for side in (-1, 1))
+        return [(float(x), side) for places, side in rows for x in places]
+
     def trees(self) -> list[ColoredMesh]:
-        """A row of trees on each sidewalk, and between them benches, planters and advertising columns."""
-        random, found = self._random(2), []
-        for side in (-1, 1):
-            for x in np.arange(CLEAR + random.uniform(1.0, 5.0), self.length - CLEAR, TREE_SPACING).tolist():
-                overhang = -side * random.uniform(1.5, 2.5) if random.uniform() < 0.4 else 0.0
-                tree = plants.tree(random.uniform(5.0, 8.0), random, overhang)
-                found.append(tree.moved((x, side * random.uniform(*TREES), 0.0)))
-                if x + TREE_SPACING / 2 < self.length - CLEAR:
-                    kind = int(random.integers(4))
-                    if kind < 2:
-                        item = scenery.advertising_column(random) if kind == 0 else plants.planter(random)
-                    else:
-                        item = scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
-                    found.append(item.moved((x + TREE_SPACING / 2, side * 8.9, 0.0)))
+        """A row of trees on each sidewalk, some of which overhang the road."""
+        random, found = self._random(6), []
+        for x, side in self._tree_places():
+            tree = _tree(int(random.integers(MAKES)))
+            found.append(tree.moved((x, side * random.uniform(*TREES), 0.0), 0.0 if side < 0 else np.pi))
+        return found
+
+    def _between_trees(self) -> list[ColoredMesh]:
+        """Benches, planters and advertising columns."""
+        random, found = self._random(7), []
+        for x, side in self._tree_places():
+            kind, between = int(random.integers(4)), x + TREE_SPACING / 2
+            if between < self.length - CLEAR:
+                if kind < 2:
+                    item = scenery.advertising_column(random) if kind == 0 else plants.planter(random)
+                else:
+                    item = scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
+                found.append(item.moved((between, side * 8.9, 0.0)))
         return found
 
     def lamps(self) -> np.ndarray:
@@ -153,9 +181,10 @@ class StreetScenery:
         return np.stack([places, FURNITURE * (-1.0) ** np.arange(len(places))], axis=-1)
 
     def furniture(self) -> list[ColoredMesh]:
-        """Street lamps, signs, and small things beside the curb."""
+        """Street lamps, signs, small things beside the curb, and what stands between the trees."""
         random, lamps = self._random(3), self.lamps()
-        found = [
+        found = self._between_trees()
+        found += [
             scenery.street_lamp(LAMP_HEIGHT, -np.sign(y) * LAMP_ARM).moved((x, y, 0.0)) for x, y in lamps.tolist()
         ]
         for side in (-1, 1):
@@ -178,7 +207,7 @@ class StreetScenery:
         for i, index in enumerate(random.permutation(len(free))[:number].tolist()):
             (x, side), kind = free[index], "van" if i % 5 == 4 else "car"
             y, make = side * (PARKING + random.uniform(-0.1, 0.1)), int(random.integers(MAKES))
-            found.append(Parked(x, float(y), 0.0 if side < 0 else np.pi, kind, make))
+            found.append(Parked(i, x, float(y), 0.0 if side < 0 else np.pi, kind, make))
         return found
 
     def ground(self) -> list[ColoredMesh]:
@@ -234,15 +263,10 @@ def crossing_ground() -> ColoredMesh:
     return concatenate(parts)
 
 
-def grass(low: tuple[float, float], high: tuple[float, float], z: float = 0.0) -> ColoredMesh:
-    """Level grass between two corners."""
+def grass(low: np.ndarray, high: np.ndarray, z: float = 0.0) -> ColoredMesh:
+    """Level grass between two corners (2,)."""
     corners = np.array([[(x, y, z) for y in (low[1], high[1])] for x in (low[0], high[0])])
     return _quads(corners, corners + (0.0, 2 * SIDEWALK - low[1], 0.0), SurfaceClass.TERRAIN)
-
-
-def placed(meshes: list[ColoredMesh], place: np.ndarray, heading: int) -> list[ColoredMesh]:
-    """Meshes in the frame of a street as meshes in a frame in which the street begins at `place` (2,)."""
-    return [mesh.moved((*place, 0.0), np.pi / 2 * heading) for mesh in meshes]
 
 
 def _sorted(a: float, b: float) -> tuple[float, float]:

@@ -4,18 +4,18 @@ What is far away is left out or simplified: details of houses, then what stands 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.world import WorldSettings
-from drivesplat.world.route import scenery
-from drivesplat.world.route.grid import FORWARD, Block
+from drivesplat.world.layout import SIDEWALK
+from drivesplat.world.route.grid import FORWARD, LEFT, Block
 from drivesplat.world.route.path import LanePath
-from drivesplat.world.route.scenery import House, Parked, StreetScenery, crossing_ground, grass, placed
+from drivesplat.world.route.scenery import Parked, StreetScenery, crossing_ground, grass
 from drivesplat.world.route.tour import ego_path
 from drivesplat.world.route.traffic import MAX_LIFE_S, PERIOD_S, Traffic
 from drivesplat.world.shapes.body import RigidBody
@@ -30,12 +30,12 @@ STRETCH_S = 10
 """Seconds of a stretch."""
 MARGIN_S = 1.0
 """Seconds before and after the recordings of a stretch at which it holds, too."""
-DETAILED, FURNISHED, HOUSES = 100.0, 60.0, 420.0
+DETAILED, FURNISHED, HOUSES = 85.0, 60.0, 420.0
 """Distances from the ego vehicle (metres) within which houses have details, streets have furniture and trees, and there
 are houses."""
-LINE_FURNISHED, LINE_HOUSES = 300.0, 800.0
-"""The same distances of furniture and houses along the street that the ego vehicle sees before it."""
-BOXED, PARKED, LIT = 90.0, 240.0, 120.0
+LINE_FURNISHED, LINE_TREES, LINE_HOUSES = 120.0, 300.0, 800.0
+"""The same distances of furniture, trees and houses along the street that the ego vehicle sees before it."""
+BOXED, PARKED, LIT = 90.0, 180.0, 120.0
 """Distances within which parked vehicles are objects of their own, are there at all, and lamps shine."""
 FACING = 0.3
 """Least cosine between the directions of the ego vehicle and of a street that it sees before it."""
@@ -43,27 +43,22 @@ HORIZON = 3000.0
 """Metres to which the ground extends."""
 BELOW = -0.05
 """Height in metres of the ground beyond the streets."""
-BURIED = -1000.0
-"""Height in metres of road users before and after they exist."""
 LAMP_LIGHT = 6.6
 """Height in metres of the light of street lamps."""
 
 
 @dataclass(frozen=True)
 class LocalPath:
-    """A path of the grid frame in a frame with its origin at `origin` (2,), from second `begin` to `end`."""
+    """A path of the grid frame in a frame with its origin at `origin` (2,)."""
 
     path: LanePath
     origin: np.ndarray
-    begin: float = -np.inf
-    end: float = np.inf
     moves: bool = True
 
     def poses(self, seconds: np.ndarray) -> np.ndarray:
-        """Object to local frame (n, 4, 4); far below the ground at other times."""
+        """Object to local frame (n, 4, 4)."""
         poses = self.path.poses(seconds)
         poses[:, :2, 3] -= self.origin
-        poses[(seconds < self.begin) | (seconds > self.end), 2, 3] += BURIED
         return poses
 
     def distance(self, seconds: np.ndarray) -> np.ndarray:
@@ -135,14 +130,34 @@ class RouteDrive:
         objects = [fixed("scenery", concatenate([*near.static()])), *near.parked()]
         for user in self.traffic.near(begin, end):
             body, category, attribute = user.body()
-            path = LocalPath(user.path, origin, user.begin, user.end)
-            objects.append(StreetObject(user.name, body, path, category, attribute))
+            path = LocalPath(user.path, origin)
+            objects.append(StreetObject(user.name, body, path, category, attribute, user.begin, user.end))
         if self.world.own_car:
             objects.append(fixed(EGO_VEHICLE, ego_rear(), ego))
         if self.world.lidar.ego_returns:
             objects.append(fixed(EGO_BODY, ego_vehicle(), ego))
         ordered = tuple(sorted(objects, key=lambda item: item.moves))
         return Stretch(Street(ordered, near.lamps(), STRAIGHT, ego, None), origin)
+
+
+@dataclass(frozen=True)
+class NearStreet:
+    """A street near the ego vehicle: the place (2,) where it `begins`, its distance from the ego vehicle in metres, and
+    whether it has trees and furniture."""
+
+    block: Block
+    begins: np.ndarray
+    distance: float
+    has_trees: bool
+    is_furnished: bool
+
+    def place(self, x: float, y: float) -> np.ndarray:
+        """The place (2,) of a point in the frame of the street."""
+        return self.begins + x * FORWARD[self.block.heading] + y * LEFT[self.block.heading]
+
+    def put(self, mesh: ColoredMesh) -> ColoredMesh:
+        """A mesh in the frame of the street."""
+        return mesh.moved((*self.begins, 0.0), np.pi / 2 * self.block.heading)
 
 
 class _Surroundings:
@@ -155,117 +170,81 @@ class _Surroundings:
         self._places, self._ahead, self._origin = places, ahead, origin
         self._streets = [*self._near_streets()]
 
-    def _near_streets(self) -> Iterator[tuple[Block, np.ndarray, float, bool]]:
-        """Each street within HOUSES, or before the ego vehicle within LINE_HOUSES: its middle (2,), its distance, and
-        whether it is furnished."""
+    def _near_streets(self) -> Iterator[NearStreet]:
+        """Each street within HOUSES, or before the ego vehicle within LINE_HOUSES."""
         length = self._length
         low = np.floor((self._places.min(axis=0) - LINE_HOUSES) / length).astype(int)
         high = np.ceil((self._places.max(axis=0) + LINE_HOUSES) / length).astype(int)
-        shift = np.round(self._origin / length).astype(int)
-        for x in range(low[0], high[0] + 1):
-            for y in range(low[1], high[1] + 1):
-                for heading in (0, 1):
-                    start = length * np.array([x, y], dtype=float)
-                    middle = start + length / 2 * FORWARD[heading]
-                    between = middle - self._places
-                    along, across = np.abs(between[:, heading]), np.abs(between[:, 1 - heading])
-                    distance = np.hypot(np.maximum(along - length / 2, 0.0), across)
-                    forward = (between * self._ahead).sum(axis=1)
-                    # on the same street line, before the ego vehicle
-                    facing = np.abs(self._ahead[:, heading]) > FACING
-                    before = distance[facing & (across < length / 4) & (forward > 0)].min(initial=np.inf)
-                    if distance.min() <= HOUSES or before <= LINE_HOUSES:
-                        furnished = distance.min() <= FURNISHED or before <= LINE_FURNISHED
-                        block = Block((x + int(shift[0]), y + int(shift[1])), heading)
-                        yield block, start, float(distance.min()), bool(furnished)
+        shift_x, shift_y = np.round(self._origin / length).astype(int).tolist()
+        for x, y, heading in product(range(low[0], high[0] + 1), range(low[1], high[1] + 1), (0, 1)):
+            begins = length * np.array([x, y], dtype=float)
+            between = begins + length / 2 * FORWARD[heading] - self._places
+            along, across = np.abs(between[:, heading]), np.abs(between[:, 1 - heading])
+            distances = np.hypot(np.maximum(along - length / 2, 0.0), across)
+            facing = np.abs(self._ahead[:, heading]) > FACING
+            before = facing & (across < length / 4) & ((between * self._ahead).sum(axis=1) > 0)
+            distance, seen = float(distances.min()), float(distances[before].min(initial=np.inf))
+            if distance <= HOUSES or seen <= LINE_HOUSES:
+                trees, furnished = (distance <= FURNISHED or seen <= reach for reach in (LINE_TREES, LINE_FURNISHED))
+                yield NearStreet(Block((x + shift_x, y + shift_y), heading), begins, distance, trees, furnished)
+
+    def _distance(self, place: np.ndarray) -> float:
+        """The least distance in metres of a place (2,) from the ego vehicle."""
+        return float(np.linalg.norm(self._places - place, axis=1).min())
 
     def _scenery(self, block: Block) -> StreetScenery:
         return StreetScenery(block, self._length, self._world.random_seed)
 
     def static(self) -> Iterator[ColoredMesh]:
         """Ground, houses, furniture and trees, and parked vehicles that are far away."""
-        length, random_seed = self._length, self._world.random_seed
-        for block, start, distance, furnished in self._streets:
-            own = (block, length, random_seed)
-            yield from placed([_shell(*own)], start, block.heading)
-            if furnished:
-                yield from placed([_furniture(*own)], start, block.heading)
-            if distance <= DETAILED:
-                for house in self._scenery(block).houses():
-                    center = placed_point(house.center, start, block.heading)
-                    if np.linalg.norm(self._places - center, axis=1).min() <= DETAILED:
-                        yield from placed([_front(house)], start, block.heading)
+        for street in self._streets:
+            block, begins, own = street.block, street.begins, self._scenery(street.block)
+            yield from map(street.put, own.ground())
+            for house in own.houses():
+                yield street.put(house.mesh())
+                if street.is_furnished and self._distance(street.place(*house.center)) <= DETAILED:
+                    yield street.put(house.front())
+            if street.has_trees:
+                yield from map(street.put, own.trees())
+            if street.is_furnished:
+                yield from map(street.put, [*own.furniture(), *own.barriers()])
             if block.heading == 0:
-                shift = 37.0 * block.crossing[0] + 91.0 * block.crossing[1]
-                yield from placed([_with_texture(crossing_ground(), shift % 4000.0)], start, 0)
-                yield grass(tuple(start + scenery.SIDEWALK), tuple(start + length - scenery.SIDEWALK))
-        yield grass((-HORIZON, -HORIZON), (HORIZON, HORIZON), BELOW)
-        for car, start, heading, near in self._all_parked():
-            if not near:
-                yield car.vehicle[0].moved((*placed_point(np.array([car.x, car.y]), start, heading), 0.0),
-                                            car.heading + np.pi / 2 * heading)  # fmt: skip
+                shift = (37.0 * block.crossing[0] + 91.0 * block.crossing[1]) % 4000.0
+                crossing = crossing_ground()
+                yield replace(crossing, texture=crossing.texture + (shift, 0.0, 0.0)).moved((*begins, 0.0))
+                yield grass(begins + SIDEWALK, begins + self._length - SIDEWALK)
+        yield grass(np.full(2, -HORIZON), np.full(2, HORIZON), BELOW)
+        for car, street, distance in self._all_parked():
+            if distance > BOXED:
+                yield street.put(car.vehicle[0].moved((car.x, car.y, 0.0), car.heading))
 
     def parked(self) -> list[StreetObject]:
         """Parked vehicles that are near."""
         found = []
-        for car, start, heading, near in self._all_parked():
-            if near:
+        for car, street, distance in self._all_parked():
+            if distance <= BOXED:
                 mesh, category = car.vehicle
-                x, y = placed_point(np.array([car.x, car.y]), start, heading).tolist()
-                turned = Rotation.from_euler("z", car.heading + np.pi / 2 * heading).as_matrix()
-                path = Standing(rigid(turned, np.array([x, y, 0.0])))
-                east, north = np.round(np.array([x, y]) + self._origin, 1)
-                name = f"parked {east:.1f} {north:.1f}"
+                turned = Rotation.from_euler("z", car.heading + np.pi / 2 * street.block.heading).as_matrix()
+                path = Standing(rigid(turned, np.array([*street.place(car.x, car.y), 0.0])))
+                east, north = street.block.crossing
+                name = f"parked {east} {north} {street.block.heading} {car.number}"
                 found.append(StreetObject(name, RigidBody(mesh), path, category, "vehicle.parked"))
         return found
 
-    def _all_parked(self) -> Iterator[tuple[Parked, np.ndarray, int, bool]]:
-        """Parked vehicles on furnished streets, the start (2,) and heading of their street, and whether they are near.
-        """
-        for block, start, _, furnished in self._streets:
-            for car in self._scenery(block).parked(self._world.parked) if furnished else ():
-                place = placed_point(np.array([car.x, car.y]), start, block.heading)
-                distance = np.linalg.norm(self._places - place, axis=1).min()
+    def _all_parked(self) -> Iterator[tuple[Parked, NearStreet, float]]:
+        """The parked vehicles within PARKED, their streets and their distances."""
+        for street in self._streets:
+            for car in self._scenery(street.block).parked(self._world.parked) if street.has_trees else ():
+                distance = self._distance(street.place(car.x, car.y))
                 if distance <= PARKED:
-                    yield car, start, block.heading, bool(distance <= BOXED)
+                    yield car, street, distance
 
     def lamps(self) -> np.ndarray:
         """The lights (m, 3) of the street lamps that are near."""
         found = [np.zeros((0, 3))]
-        for block, start, _, furnished in self._streets:
-            for x, y in self._scenery(block).lamps().tolist() if furnished else ():
-                place = placed_point(np.array([x, y - np.sign(y) * LAMP_ARM]), start, block.heading)
-                if np.linalg.norm(self._places - place, axis=1).min() <= LIT:
+        for street in self._streets:
+            for x, y in self._scenery(street.block).lamps().tolist() if street.is_furnished else ():
+                place = street.place(x, y - np.sign(y) * LAMP_ARM)
+                if self._distance(place) <= LIT:
                     found.append(np.array([[*place, LAMP_LIGHT]]))
         return np.concatenate(found)
-
-
-def placed_point(point: np.ndarray, start: np.ndarray, heading: int) -> np.ndarray:
-    """A point (2,) in the frame of a street in the frame in which the street begins at `start` (2,)."""
-    x, y = FORWARD[heading], FORWARD[heading + 1]
-    return start + point[0] * x + point[1] * y
-
-
-def _with_texture(mesh: ColoredMesh, shift: float) -> ColoredMesh:
-    return ColoredMesh(
-        mesh.vertices, mesh.texture + (shift, 0.0, 0.0), mesh.faces, mesh.material, mesh.color, mesh.surface_class
-    )
-
-
-@lru_cache(maxsize=512)
-def _shell(block: Block, length: float, random_seed: int) -> ColoredMesh:
-    """The ground of a street, and its houses without details."""
-    own = StreetScenery(block, length, random_seed)
-    return concatenate([*own.ground(), *(house.mesh() for house in own.houses())])
-
-
-@lru_cache(maxsize=16)
-def _furniture(block: Block, length: float, random_seed: int) -> ColoredMesh:
-    """What stands on the sidewalks of a street, and its hedges and fences."""
-    own = StreetScenery(block, length, random_seed)
-    return concatenate([*own.trees(), *own.furniture(), *own.barriers()])
-
-
-@lru_cache(maxsize=64)
-def _front(house: House) -> ColoredMesh:
-    return house.front()

@@ -17,13 +17,20 @@ EGO_PARTS = (EGO_VEHICLE, EGO_BODY)
 
 @dataclass(frozen=True)
 class StreetObject:
-    """An object: its body and its path. nuScenes' `category` and `attribute` are None for scenery."""
+    """An object: its body and its path. nuScenes' `category` and `attribute` are None for scenery. It exists from second
+    `begin` to `end`."""
 
     name: str
     body: Body
     path: ObjectPath
     category: str | None = None
     attribute: str | None = None
+    begin: float = -np.inf
+    end: float = np.inf
+
+    def exists(self, seconds: np.ndarray) -> bool:
+        """Whether it exists at any of `seconds` (n,)."""
+        return bool(((seconds >= self.begin) & (seconds <= self.end)).any())
 
     @property
     def moves(self) -> bool:
