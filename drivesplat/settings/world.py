@@ -154,7 +154,8 @@ class WorldSettings(Settings):
         fields = type(self).model_fields
         unfit = [name for name in NOT_WITH_A_ROUTE if getattr(self, name) != fields[name].get_default()]
         if unfit:
-            raise ValueError(f"a world with a route has no {', '.join(unfit)}; leave out {'it' if len(unfit) == 1 else 'them'}")
+            what = "it" if len(unfit) == 1 else "them"
+            raise ValueError(f"a world with a route has no {', '.join(unfit)}; leave {what} out")
         if self.truth != WorldTruthSettings():
             raise ValueError("a world with a route has no ground truth; leave out truth")
         return self

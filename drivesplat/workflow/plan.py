@@ -167,9 +167,10 @@ class Plan(JobResources):
                 )
             return
         if path in ([f"{TRUTH_FILM}.mp4"], [f"{TRUTH_FILM}.json"]):
-            if scene not in self.worlds.values():
-                raise ConfigError(f"{path[0]} needs the truth of a synthetic world, and scene {scene} is none")
+            self._require_truth(scene, path[0])
             return
+        if path[0] == EDIT_TRUTH:
+            self._require_truth(scene, "/".join(path))
         edit = Path(path[-1]).stem if len(path) == 2 and path[0] in (EDITS, QUAD, EDIT_TRUTH) else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
@@ -183,6 +184,18 @@ class Plan(JobResources):
             self._refuse_unknown_edit(scene, method, edit)
         if film not in (path[-1], *self._film_names(scene, method)):
             raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
+
+    def _require_truth(self, scene: str, target: str) -> None:
+        """Raises ConfigError if a scene of which a `target` needs the ground truth has none."""
+        dataset = self.config.dataset_of(scene)
+        world = self.config.datasets[dataset].world
+        if world is None:
+            raise ConfigError(f"{target} needs the truth of a synthetic world, and scene {scene} is none")
+        if world.route is not None:
+            raise ConfigError(
+                f"{target} needs the truth of scene {scene}, and a world with a route has none; leave out the target, "
+                f"or datasets.{dataset}.world.route"
+            )
 
     def _refuse_unknown_drive(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is not the drive.json or the scans.json of an edit or a

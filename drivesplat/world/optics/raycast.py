@@ -157,16 +157,23 @@ class StreetSnapshot:
 
     def __init__(self, caster: RayCaster, seconds: np.ndarray, without: Collection[str]):
         self.caster, self._seconds = caster, seconds
-        self._moving = []
-        for moving in caster._moving:
-            if moving.item.name not in without and moving.item.exists(seconds):
-                poses = moving.item.poses(seconds)
-                centers = moving.sphere.centers(poses)
-                self._moving.append((moving, centers, poses[:, None] @ moving.item.limb_poses(seconds)))
+        self._moving = [
+            (moving, moving.item.poses(seconds))
+            for moving in caster._moving
+            if moving.item.name not in without and moving.item.exists(seconds)
+        ]
+        self._piece_poses: dict[int, np.ndarray] = {}
+
+    def _pieces(self, index: int) -> np.ndarray:
+        """Piece to street (m, pieces, 4, 4) of a moving object; computed where it is first needed."""
+        if index not in self._piece_poses:
+            moving, poses = self._moving[index]
+            self._piece_poses[index] = poses[:, None] @ moving.item.limb_poses(self._seconds)
+        return self._piece_poses[index]
 
     def piece_poses(self) -> dict[str, np.ndarray]:
         """Piece to street (m, pieces, 4, 4) of each object that exists, by its name."""
-        found = {moving.item.name: poses for moving, _, poses in self._moving}
+        found = {moving.item.name: self._pieces(index) for index, (moving, _) in enumerate(self._moving)}
         static = (item for item in self.caster.objects if not item.moves)
         return found | {item.name: item.piece_poses(self._seconds) for item in static}
 
@@ -206,10 +213,11 @@ class StreetSnapshot:
         `origins` are those of moments (m, 3), or of rays (n, 3) where `per_ray`."""
         passing = partial(_passing, directions, moment, origins, per_ray)
         every = np.arange(len(directions))
-        for moving, centers, of_pieces in self._moving:
-            near = passing(every, centers, moving.sphere.radius**2)
+        for index, (moving, object_poses) in enumerate(self._moving):
+            near = passing(every, moving.sphere.centers(object_poses), moving.sphere.radius**2)
             if not len(near):
                 continue
+            of_pieces = self._pieces(index)
             for number, (piece, sphere) in enumerate(zip(moving.pieces, moving.spheres, strict=True)):
                 poses = of_pieces[:, number]
                 chosen = passing(near, sphere.centers(poses), sphere.radius**2)

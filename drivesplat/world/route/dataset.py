@@ -96,7 +96,9 @@ class _Drive:
             complete = made["digest"] == self.digest and made["key_frames"] == list(self.route.key_frames(index))
         except (KeyError, OSError, RecursionError, TypeError, ValueError):
             return False
-        return complete and all((self.root / path).is_file() for file in self.files(index) for path in self._paths(file))
+        return complete and all(
+            (self.root / path).is_file() for file in self.files(index) for path in self._paths(file)
+        )
 
     def _paths(self, file: SensorFile) -> list[str]:
         """The files of a recording."""
@@ -155,7 +157,9 @@ def _merge(drive: _Drive, source: str) -> None:
     tables = NuScenesTables(job.scene, description, source, world)
     for index in range(world.key_frames):
         tables.add_sample(index, key_frame_time(world, index))
-    stretches = [read_record(drive.record(index), RULE, "recordings", "boxes") for index in range(drive.route.stretches)]
+    stretches = [
+        read_record(drive.record(index), RULE, "recordings", "boxes") for index in range(drive.route.stretches)
+    ]
     poses = {row["token"]: np.array(row["ego_to_global"]) for stretch in stretches for row in stretch["recordings"]}
     for file in sensor_files(world, job.scene):
         tables.add_data(file, poses[file.token])

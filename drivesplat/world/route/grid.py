@@ -18,8 +18,8 @@ BUILT = 13.5
 """Distance in metres from the middle of a street beyond which houses stand."""
 HIDING = 4.0
 """Metres of a line of sight among houses that hide what is behind them."""
-SIGHT_STEP = 2.0
-"""Metres between the points of a line of sight that are looked at."""
+SIGHT_POINTS = 100
+"""Number of points of a line of sight that are looked at."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,8 @@ def neighbour(crossing: Crossing, heading: int) -> Crossing:
 
 
 def hidden(viewer: np.ndarray, points: np.ndarray, block_m: float) -> np.ndarray:
-    """Whether houses hide each of `points` (n, 2) from its place in `viewer` (n, 2), both in the grid frame: (n,) bool.
-    """
-    between = points - viewer
-    count = int(np.linalg.norm(between, axis=1).max(initial=0.0) / SIGHT_STEP) + 2
-    shares = np.linspace(0.0, 1.0, count)
+    """Whether houses hide each of `points` (n, 2) from its place in `viewer` (n, 2): (n,) bool. Grid frame."""
+    between, shares = points - viewer, np.linspace(0.0, 1.0, SIGHT_POINTS)
     places = (viewer[:, None] + shares[:, None] * between[:, None]) % block_m
     among_houses = (np.abs(places - block_m / 2) < block_m / 2 - BUILT).all(axis=-1)
     return among_houses.mean(axis=1) * np.linalg.norm(between, axis=1) > HIDING

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,14 +21,14 @@ SWAY_LENGTH = 90.0
 """Metres after which the sideward motion in the lane repeats."""
 
 
-def _unit_turn() -> tuple[np.ndarray, np.ndarray]:
+def _unit_turn() -> tuple[np.ndarray, float]:
     """A quarter turn to the left from (0, 0) to (1, 1) at evenly spaced shares of its length: points (n, 2), and its
     length. The curvature rises and falls steadily, from 0 to 0."""
     shares = np.linspace(0.0, 1.0, 2001)
     heading = np.pi / 2 * _turned(shares)
     steps = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     points = np.concatenate([np.zeros((1, 2)), np.cumsum((steps[1:] + steps[:-1]) / 2, axis=0)]) / (len(shares) - 1)
-    return points / points[-1, 0], 1.0 / points[-1, 0]
+    return points / points[-1, 0], float(1.0 / points[-1, 0])
 
 
 def _turned(share: np.ndarray) -> np.ndarray:
@@ -72,7 +73,9 @@ class LanePath:
             total += length
             if turn:
                 size = LEFT_TURN if turn > 0 else RIGHT_TURN
-                rows.append((total, *(middle + (offset + length) * FORWARD[heading]), heading, turn, size * TURN_LENGTH))
+                rows.append(
+                    (total, *(middle + (offset + length) * FORWARD[heading]), heading, turn, size * TURN_LENGTH)
+                )
                 total += size * TURN_LENGTH
             crossing, offset = neighbour(crossing, heading), before
         starts, x, y, headings, turns, lengths = np.array(rows).T
@@ -135,7 +138,9 @@ class LanePath:
     def distances(self, seconds: np.ndarray) -> np.ndarray:
         """Metres (n,) from the start of the path at `seconds` (n,)."""
         table, speed = self._timetable
-        since = np.asarray(seconds, dtype=float) - self.when + np.interp(self.along, STEP * np.arange(len(table)), table)
+        since = (
+            np.asarray(seconds, dtype=float) - self.when + np.interp(self.along, STEP * np.arange(len(table)), table)
+        )
         row = np.clip(np.searchsorted(table, since, side="right") - 1, 0, len(table) - 2)
         elapsed = since - table[row]
         acceleration = (speed[row + 1] ** 2 - speed[row] ** 2) / (2 * STEP)
@@ -184,7 +189,7 @@ class LanePath:
 
 def turns_of(headings: Sequence[int]) -> list[int]:
     """The turn between each two headings: +1 to the left, -1 to the right, 0 straight on."""
-    return [_turn(a, b) for a, b in zip(headings[:-1], headings[1:], strict=True)]
+    return [_turn(a, b) for a, b in pairwise(headings)]
 
 
 def _turn(heading: int, following: int) -> int:

@@ -226,7 +226,7 @@ class StreetScenery:
             low, high = _sorted(side * ROAD, side * CURB)
             profile = np.array([(low, -0.02), (low, CURB_HEIGHT), (high, CURB_HEIGHT), (high, -0.02)])
             corners = np.array([[(x, y, z) for y, z in profile] for x in (SIDEWALK, end)])
-            texture = corners + (offset, 0.0, 0.0)
+            texture = corners + np.array([offset, 0.0, 0.0])
             parts += [_quads(corners[:, i : i + 2], texture[:, i : i + 2], SurfaceClass.SIDEWALK) for i in range(3)]
         return parts
 
@@ -255,7 +255,7 @@ def crossing_ground() -> ColoredMesh:
         length = radius * (angles - angles[0])
         profile = ((flat[0], -0.02, ROAD), (flat[0], CURB_HEIGHT, ROAD), (flat[1], CURB_HEIGHT, CURB),
                    (flat[1], -0.02, CURB))  # fmt: skip
-        stone = np.stack([points + (0.0, 0.0, z) for points, z, _ in profile], axis=1)
+        stone = np.stack([points + np.array([0.0, 0.0, z]) for points, z, _ in profile], axis=1)
         texture = np.stack([np.stack([length, np.full(9, y), np.full(9, z)], axis=-1) for _, z, y in profile], axis=1)
         texture[..., 1] = np.clip(texture[..., 1], ROAD + 0.01, CURB - 0.01)
         found += [_quads(stone[:, i : i + 2], texture[:, i : i + 2], SurfaceClass.SIDEWALK) for i in range(3)]
@@ -266,7 +266,7 @@ def crossing_ground() -> ColoredMesh:
 def grass(low: np.ndarray, high: np.ndarray, z: float = 0.0) -> ColoredMesh:
     """Level grass between two corners (2,)."""
     corners = np.array([[(x, y, z) for y in (low[1], high[1])] for x in (low[0], high[0])])
-    return _quads(corners, corners + (0.0, 2 * SIDEWALK - low[1], 0.0), SurfaceClass.TERRAIN)
+    return _quads(corners, corners + np.array([0.0, 2 * SIDEWALK - low[1], 0.0]), SurfaceClass.TERRAIN)
 
 
 def _sorted(a: float, b: float) -> tuple[float, float]:
@@ -281,7 +281,7 @@ def _bare(corners: np.ndarray) -> np.ndarray:
 def _strip(along: tuple[float, float], across: tuple[float, float], kind: SurfaceClass, shift: float) -> ColoredMesh:
     """A level rectangle of ground, whose texture begins `shift` metres farther along."""
     corners = np.array([[(x, y, 0.0) for y in across] for x in along])
-    return _quads(corners, corners + (shift, 0.0, 0.0), kind)
+    return _quads(corners, corners + np.array([shift, 0.0, 0.0]), kind)
 
 
 def _quads(corners: np.ndarray, texture: np.ndarray, kind: SurfaceClass) -> ColoredMesh:

@@ -17,7 +17,7 @@ from drivesplat.world.route.grid import FORWARD, LEFT, Block
 from drivesplat.world.route.path import LanePath
 from drivesplat.world.route.scenery import Parked, StreetScenery, crossing_ground, grass
 from drivesplat.world.route.tour import ego_path
-from drivesplat.world.route.traffic import MAX_LIFE_S, PERIOD_S, Traffic
+from drivesplat.world.route.traffic import MAX_LIFE_S, PERIOD_S, RoadUsers
 from drivesplat.world.shapes.body import RigidBody
 from drivesplat.world.shapes.mesh import ColoredMesh, concatenate
 from drivesplat.world.shapes.vehicles import ego_rear, ego_vehicle
@@ -30,12 +30,12 @@ STRETCH_S = 10
 """Seconds of a stretch."""
 MARGIN_S = 1.0
 """Seconds before and after the recordings of a stretch at which it holds, too."""
-DETAILED, FURNISHED, HOUSES = 85.0, 60.0, 420.0
+DETAILED, FURNISHED, HOUSES = 75.0, 60.0, 420.0
 """Distances from the ego vehicle (metres) within which houses have details, streets have furniture and trees, and there
 are houses."""
-LINE_FURNISHED, LINE_TREES, LINE_HOUSES = 120.0, 300.0, 800.0
+LINE_FURNISHED, LINE_TREES, LINE_HOUSES = 120.0, 250.0, 800.0
 """The same distances of furniture, trees and houses along the street that the ego vehicle sees before it."""
-BOXED, PARKED, LIT = 90.0, 180.0, 120.0
+BOXED, PARKED, LIT = 90.0, 150.0, 120.0
 """Distances within which parked vehicles are objects of their own, are there at all, and lamps shine."""
 FACING = 0.3
 """Least cosine between the directions of the ego vehicle and of a street that it sees before it."""
@@ -98,7 +98,7 @@ class RouteDrive:
         self.world, self.route = world, world.route
         # road users may meet the ego vehicle after the end, and exist long after that
         self.ego = ego_path(self.route, world.random_seed, world.seconds + 2 * MAX_LIFE_S + 2 * PERIOD_S)
-        self.traffic = Traffic(world, self.ego, world.seconds + MARGIN_S)
+        self.traffic = RoadUsers(world, self.ego, world.seconds + MARGIN_S)
 
     @property
     def stretches(self) -> int:
@@ -211,7 +211,7 @@ class _Surroundings:
             if block.heading == 0:
                 shift = (37.0 * block.crossing[0] + 91.0 * block.crossing[1]) % 4000.0
                 crossing = crossing_ground()
-                yield replace(crossing, texture=crossing.texture + (shift, 0.0, 0.0)).moved((*begins, 0.0))
+                yield replace(crossing, texture=crossing.texture + np.array([shift, 0.0, 0.0])).moved((*begins, 0.0))
                 yield grass(begins + SIDEWALK, begins + self._length - SIDEWALK)
         yield grass(np.full(2, -HORIZON), np.full(2, HORIZON), BELOW)
         for car, street, distance in self._all_parked():

@@ -10,9 +10,8 @@ from drivesplat.world.route.path import LanePath
 
 APPROACH = 4
 """Number of streets straight ahead before the drive begins, for traffic that comes from there."""
-BEGIN = 16.0
-"""Metres behind a crossing at which the drive begins."""
-EGO_SWAY = 0.12
+BEGIN, EGO_SWAY = 16.0, 0.12
+"""Metres behind a crossing at which the drive begins, and metres by which the ego vehicle sways in its lane."""
 
 
 def ego_path(route: WorldRouteSettings, random_seed: int, seconds: float) -> LanePath:
@@ -25,8 +24,8 @@ def ego_path(route: WorldRouteSettings, random_seed: int, seconds: float) -> Lan
 
 
 def tour(route: WorldRouteSettings, random_seed: int) -> Iterator[int]:
-    """The headings of the streets, without end: first APPROACH to the east, then loops. After a loop its first street is
-    driven again, then one or two streets straight on to where the next begins."""
+    """The headings of the streets, without end: first APPROACH streets to the east, then loops. After a loop the route
+    passes its first street again, and goes on straight for one or two streets to where the next loop begins."""
     random, heading = np.random.default_rng([random_seed, 1]), 0
     yield from [heading] * APPROACH
     while True:

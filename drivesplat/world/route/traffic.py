@@ -22,7 +22,7 @@ PERIOD_S = 10.0
 """The settings count road users for so many seconds of the drive."""
 MAX_LIFE_S = 26.0
 """Largest number of seconds before and after the meeting that a road user may exist."""
-FAR = 150.0
+FAR = {"vehicle": 150.0, "cyclist": 110.0, "pedestrian": 110.0}
 """Metres from which a road user may appear and disappear in view."""
 CHECK_S = 0.2
 """Interval in seconds at which distances are checked."""
@@ -85,7 +85,7 @@ class _Meeting:
     offset: float
 
 
-class Traffic:
+class RoadUsers:
     """The road users of a drive of `seconds`. Those near any second of it are the same in a longer drive."""
 
     def __init__(self, world: WorldSettings, ego: LanePath, seconds: float):
@@ -134,11 +134,10 @@ class Traffic:
 
     def _meeting(self, second: float) -> _Meeting:
         """The street on which the ego vehicle is at a second; around a corner, the one into which it turns."""
-        places, angle = self._ego.places(self._ego.distances(np.array([second])))
-        index = self._ego.street_at(float(self._ego.distances(np.array([second]))[0]))
-        heading = self._ego.headings[index]
-        start = self._block * np.array(self._ego.crossing(index), dtype=float)
-        return _Meeting(second, index, float((places[0] - start) @ FORWARD[heading]))
+        along = self._ego.distances(np.array([second]))
+        index, place = self._ego.street_at(float(along[0])), self._ego.places(along)[0][0]
+        start = self._block * np.array(self._ego.crossing(index))
+        return _Meeting(second, index, float((place - start) @ FORWARD[self._ego.headings[index]]))
 
     def _vehicle(self, meeting: _Meeting, random: np.random.Generator) -> tuple[str, LanePath]:
         """A vehicle that drives ahead of the ego vehicle or comes towards it, and turns at some crossings."""
@@ -181,7 +180,12 @@ class Traffic:
         if offset > self._block:
             crossing, offset = neighbour(crossing, heading), offset - self._block
         if speed < 0.0:
-            crossing, heading, offset, left = neighbour(crossing, heading), (heading + 2) % 4, self._block - offset, -left
+            crossing, heading, offset, left = (
+                neighbour(crossing, heading),
+                (heading + 2) % 4,
+                self._block - offset,
+                -left,
+            )
         path = LanePath(crossing, (heading,), self._block, abs(speed), -left)
         return "pedestrian", path.meeting(offset, meeting.second)
 
@@ -192,7 +196,7 @@ class Traffic:
         """Whether one who walks is between the crossings of the street."""
         if user.kind != "pedestrian":
             return True
-        along = user.path.distances(np.array([second]))[0]
+        along = float(user.path.distances(np.array([second]))[0])
         return SIDEWALK_ENDS < along < self._block - SIDEWALK_ENDS
 
     def _life(self, user: RoadUser, second: float) -> tuple[float, float] | None:
@@ -203,7 +207,7 @@ class Traffic:
         for sign in (-1.0, 1.0):
             times = second + sign * steps
             ego, own = (path.poses(times)[:, :2, 3] for path in (self._ego, user.path))
-            away = np.linalg.norm(own - ego, axis=1) > FAR
+            away = np.linalg.norm(own - ego, axis=1) > FAR[user.group]
             unseen = np.flatnonzero(away | hidden(ego, own, self._block))
             if not len(unseen) or unseen[0] == 0:
                 return None
@@ -242,7 +246,7 @@ def _rectangles(poses: np.ndarray, extent: tuple[float, float]) -> np.ndarray:
 
 
 def _gap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The distance (n,) of rectangles (n, 3, 2) along the axis that separates them best; negative where they overlap."""
+    """The distance (n,) of rectangles (n, 3, 2) along the axis that separates them best; negative if they overlap."""
     between, separations = b[:, 0] - a[:, 0], []
     for half in (a[:, 1], a[:, 2], b[:, 1], b[:, 2]):
         axis = half / np.linalg.norm(half, axis=1, keepdims=True)

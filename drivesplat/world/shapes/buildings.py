@@ -1,6 +1,7 @@
 """Buildings, and what protrudes from them: doors, balconies, awnings, signs."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -53,6 +54,7 @@ def building_front(low: Numbers, high: Numbers, random: np.random.Generator) -> 
     return details.moved((low[0] if turn == 0.0 else high[0], front, low[2]), turn)
 
 
+@cache
 def awning(width: float, color: Color) -> ColoredMesh:
     """A shop's awning on a wall along x at y = 0, towards y, 2.35 to 2.95 m above the ground."""
     half = width / 2
@@ -70,6 +72,7 @@ def awning(width: float, color: Color) -> ColoredMesh:
     return concatenate([cloth, *valance, *arms]).classified(SurfaceClass.BUILDING)
 
 
+@cache
 def balcony(width: float) -> ColoredMesh:
     """A balcony on a wall along x at y = 0, towards y: a slab below z = 0 and a railing 1 m high."""
     half, depth = width / 2, 0.9
@@ -93,6 +96,7 @@ def balcony(width: float) -> ColoredMesh:
     return concatenate([slab, *rails, *bars, *sides]).classified(SurfaceClass.BUILDING)
 
 
+@cache
 def front_door(color: Color) -> ColoredMesh:
     """An entrance on a wall along x at y = 0, towards y: a frame, a door with a handle, a step, a small roof."""
     parts = [
@@ -108,6 +112,7 @@ def front_door(color: Color) -> ColoredMesh:
     return concatenate(parts).classified(SurfaceClass.BUILDING)
 
 
+@cache
 def hanging_sign(color: Color) -> ColoredMesh:
     """A shop's sign across a wall along x at y = 0, towards y, 2.7 m above the ground."""
     panel = box((-0.04, 0.15, 2.7), (0.04, 0.85, 3.2), Material.SIGN, color)

@@ -31,7 +31,9 @@ def rows_of_buildings(road: ReferenceLine, random: np.random.Generator) -> list[
             near = side * (SIDEWALK + FORECOURT + random.uniform(0, 2.0))
             low, high = sorted((near, near + side * DEPTH))
             top, color = WINDOW[1] * random.integers(2, 7), WALLS[random.integers(len(WALLS))]
-            found.append(road.place(standing_building((-width / 2, low), (width / 2, high), top, color, random), s + width / 2))
+            found.append(
+                road.place(standing_building((-width / 2, low), (width / 2, high), top, color, random), s + width / 2)
+            )
             if gap:
                 barrier = hedge(gap, 1.1, 0.6, random) if random.uniform() < 0.6 else fence(gap)
                 found.append(road.place(barrier, s + width + gap / 2, side * (SIDEWALK + 0.6)))

@@ -17,8 +17,8 @@ EGO_PARTS = (EGO_VEHICLE, EGO_BODY)
 
 @dataclass(frozen=True)
 class StreetObject:
-    """An object: its body and its path. nuScenes' `category` and `attribute` are None for scenery. It exists from second
-    `begin` to `end`."""
+    """An object: its body, its path, and the seconds from which and until which it exists. nuScenes' `category` and
+    `attribute` are None for scenery."""
 
     name: str
     body: Body
