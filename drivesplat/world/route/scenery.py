@@ -31,8 +31,8 @@ CLEAR = 16.0
 ZEBRA = 15.0
 """Metres from the middle of a crossing to where the strip of road with a pedestrian crossing ends."""
 PARKED_SPACING, TREE_SPACING, LAMP_SPACING = 7.2, 17.0, 24.0
-MAKES = 24
-"""Number of different trees, of cars that park, and of vans."""
+MAKES, VANS = 24, 6
+"""Number of different trees and cars, and of vans."""
 SIGN_COLORS = ((0.6, 0.04, 0.03), (0.04, 0.1, 0.5))
 BARE = -20.0
 """z in the texture of the ground where the road has no paint."""
@@ -79,7 +79,7 @@ class Parked:
     @property
     def vehicle(self) -> tuple[ColoredMesh, str]:
         """Its mesh and nuScenes' category."""
-        return _vehicle(self.kind, self.make)
+        return vehicle_of(self.kind, self.make)
 
 
 @cache
@@ -95,7 +95,12 @@ def build_makes() -> None:
     for make in range(MAKES):
         _tree(make)
         for kind in ("car", "van"):
-            _vehicle(kind, make)
+            vehicle_of(kind, make)
+
+
+def vehicle_of(kind: str, make: int) -> tuple[ColoredMesh, str]:
+    """A "car" or "van" of a make among MAKES, and nuScenes' category. There are fewer makes of vans."""
+    return _vehicle(kind, make % (MAKES if kind == "car" else VANS))
 
 
 @cache

@@ -12,17 +12,17 @@ import numpy as np
 from drivesplat.settings.world import WorldSettings
 from drivesplat.world.route.grid import FORWARD, hidden, neighbour
 from drivesplat.world.route.path import LanePath
+from drivesplat.world.route.scenery import MAKES, vehicle_of
 from drivesplat.world.shapes.body import Body, RigidBody
 from drivesplat.world.shapes.cyclist import Cyclist
 from drivesplat.world.shapes.people import Person
-from drivesplat.world.shapes.vehicles import vehicle
 from drivesplat.world.street.people import CYCLING_SPEED, WALKWAYS
 
 PERIOD_S = 10.0
 """The settings count road users for so many seconds of the drive."""
 MAX_LIFE_S = 26.0
 """Largest number of seconds before and after the meeting that a road user may exist."""
-FAR = {"vehicle": 150.0, "cyclist": 110.0, "pedestrian": 110.0}
+FAR = {"vehicle": 150.0, "cyclist": 90.0, "pedestrian": 90.0}
 """Metres from which a road user may appear and disappear in view."""
 CHECK_S = 0.2
 """Interval in seconds at which distances are checked."""
@@ -71,7 +71,7 @@ class RoadUser:
             return Person.drawn(random), CATEGORY, "pedestrian.moving"
         if self.kind == "cyclist":
             return Cyclist.drawn(random), "vehicle.bicycle", "cycle.with_rider"
-        mesh, category = vehicle(self.kind, random)
+        mesh, category = vehicle_of(self.kind, int(random.integers(MAKES)))
         return RigidBody(mesh), category, "vehicle.moving"
 
 
