@@ -7,7 +7,7 @@ import pytest
 
 from drivesplat.settings.world import WorldRouteSettings
 from drivesplat.world.layout import LANE, ROAD, SIDEWALK
-from drivesplat.world.route.grid import FORWARD, Block, hidden
+from drivesplat.world.route.grid import FORWARD, CityBlock, hidden
 from drivesplat.world.route.path import FASTER, SIDEWARD, SLOWER, LanePath, turns_of
 from drivesplat.world.route.tour import APPROACH, ego_path, loop_headings, tour
 from drivesplat.world.route.traffic import ego_rectangles
@@ -123,8 +123,8 @@ def test_paths_do_not_turn_round():
 
 
 def test_streets_are_the_same_from_both_ends():
-    assert Block.between((3, 4), 2) == Block.between((2, 4), 0) == Block((2, 4), 0)
-    assert Block.between((3, 4), 3) == Block.between((3, 3), 1) == Block((3, 3), 1)
+    assert CityBlock.between((3, 4), 2) == CityBlock.between((2, 4), 0) == CityBlock((2, 4), 0)
+    assert CityBlock.between((3, 4), 3) == CityBlock.between((3, 3), 1) == CityBlock((3, 3), 1)
 
 
 def test_houses_hide_what_is_around_the_corner_and_nothing_along_the_street():

@@ -12,7 +12,7 @@ from drivesplat.world.optics.imaging import geometry
 from drivesplat.world.optics.raycast import NO_HIT, StreetRays
 from drivesplat.world.recorder import Recorder
 from drivesplat.world.route import scenery, stretch
-from drivesplat.world.route.grid import Block
+from drivesplat.world.route.grid import CityBlock
 from drivesplat.world.route.scenery import StreetScenery
 from drivesplat.world.route.stretch import RouteDrive, Stretch
 from drivesplat.world.shapes.mesh import SurfaceClass
@@ -110,12 +110,12 @@ def test_houses_stand_beside_the_sidewalks_and_not_in_each_other(heading):
     for seed in range(4):
         houses = []
         for block, shift in (
-            (Block((seed, 3), heading), 0.0),
-            (Block((seed + 1 - heading, 3 + heading), heading), BLOCK),
+            (CityBlock((seed, 3), heading), 0.0),
+            (CityBlock((seed + 1 - heading, 3 + heading), heading), BLOCK),
         ):
             own = StreetScenery(block, BLOCK, seed).houses()
             houses += [np.array([house.low, house.high]) + np.array([shift, 0.0]) for house in own]
-        other = StreetScenery(Block((seed + 1 - heading, 3 + heading), 1 - heading), BLOCK, seed).houses()
+        other = StreetScenery(CityBlock((seed + 1 - heading, 3 + heading), 1 - heading), BLOCK, seed).houses()
         for house in other:  # of the street that crosses between both
             corners = np.array([house.low, house.high])
             turned = np.stack(

@@ -7,7 +7,7 @@ import pytest
 from helpers.demo_worlds import world_of
 from helpers.ground_rectangles import gaps
 
-from drivesplat.world.route.grid import Block, hidden
+from drivesplat.world.route.grid import CityBlock, hidden
 from drivesplat.world.route.path import turns_of
 from drivesplat.world.route.scenery import StreetScenery
 from drivesplat.world.route.tour import ego_path
@@ -70,7 +70,7 @@ def test_nobody_touches_a_parked_vehicle(users, ego):
     places = np.unique(np.floor(moving[:, 0] / BLOCK).astype(int), axis=0)
     for x, y in places.tolist():
         for heading in (0, 1):
-            for car in StreetScenery(Block((x, y), heading), BLOCK, WORLD.random_seed).parked(16):
+            for car in StreetScenery(CityBlock((x, y), heading), BLOCK, WORLD.random_seed).parked(16):
                 at, size = np.array([car.x, car.y]), EXTENTS[car.kind]
                 halves = np.array([[size[0] / 2, 0.0], [0.0, size[1] / 2]])
                 if heading:

@@ -23,14 +23,14 @@ SIGHT_POINTS = 100
 
 
 @dataclass(frozen=True)
-class Block:
+class CityBlock:
     """The street from a crossing to its neighbour in the east (`heading` 0) or in the north (1)."""
 
     crossing: Crossing
     heading: int
 
     @classmethod
-    def between(cls, crossing: Crossing, heading: int) -> "Block":
+    def between(cls, crossing: Crossing, heading: int) -> "CityBlock":
         """The street that leaves a crossing in any of the four headings."""
         return cls(crossing if heading < 2 else neighbour(crossing, heading), heading % 2)
 

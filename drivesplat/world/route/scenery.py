@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from drivesplat.world.layout import CROSSING, CURB, FURNITURE, PARKING, ROAD, SIDEWALK, TREES, WINDOW
-from drivesplat.world.route.grid import Block
+from drivesplat.world.route.grid import CityBlock
 from drivesplat.world.shapes import plants, scenery
 from drivesplat.world.shapes.buildings import building_front
 from drivesplat.world.shapes.mesh import ColoredMesh, Material, SurfaceClass, concatenate
@@ -111,7 +111,7 @@ def _vehicle(kind: str, make: int) -> tuple[ColoredMesh, str]:
 class StreetScenery:
     """The scenery of the street `block`, `length` metres from crossing to crossing, in a grid with `random_seed`."""
 
-    def __init__(self, block: Block, length: float, random_seed: int):
+    def __init__(self, block: CityBlock, length: float, random_seed: int):
         self.length, self._begin = length, FIRST_HOUSE if block.heading == 0 else BEHIND
         # seeds are not negative
         self._seed = [random_seed, 3, block.heading, *(2 * abs(c) + (c < 0) for c in block.crossing)]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.world import WorldSettings
 from drivesplat.world.layout import SIDEWALK
-from drivesplat.world.route.grid import FORWARD, LEFT, Block
+from drivesplat.world.route.grid import FORWARD, LEFT, CityBlock
 from drivesplat.world.route.path import LanePath
 from drivesplat.world.route.scenery import Parked, StreetScenery, crossing_ground, grass
 from drivesplat.world.route.tour import ego_path
@@ -145,7 +145,7 @@ class NearStreet:
     """A street near the ego vehicle: the place (2,) where it `begins`, its distance from the ego vehicle in metres, and
     whether it has trees and furniture."""
 
-    block: Block
+    block: CityBlock
     begins: np.ndarray
     distance: float
     has_trees: bool
@@ -186,13 +186,13 @@ class _Surroundings:
             distance, seen = float(distances.min()), float(distances[before].min(initial=np.inf))
             if distance <= HOUSES or seen <= LINE_HOUSES:
                 trees, furnished = (distance <= FURNISHED or seen <= reach for reach in (LINE_TREES, LINE_FURNISHED))
-                yield NearStreet(Block((x + shift_x, y + shift_y), heading), begins, distance, trees, furnished)
+                yield NearStreet(CityBlock((x + shift_x, y + shift_y), heading), begins, distance, trees, furnished)
 
     def _distance(self, place: np.ndarray) -> float:
         """The least distance in metres of a place (2,) from the ego vehicle."""
         return float(np.linalg.norm(self._places - place, axis=1).min())
 
-    def _scenery(self, block: Block) -> StreetScenery:
+    def _scenery(self, block: CityBlock) -> StreetScenery:
         return StreetScenery(block, self._length, self._world.random_seed)
 
     def static(self) -> Iterator[ColoredMesh]:
