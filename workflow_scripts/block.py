@@ -17,6 +17,6 @@ with job(snakemake) as current:
         sweeps=(sweep.path for sweep in scene.sweeps),
         classes=(frame.classes_path for frame in scene.frames if frame.classes_path),
     )
-    upstream = {**drive.provenance, "inputs": {}}
-    provenance = current.provenance(upstream, inputs={name: snakemake.params.recordings})
+    # not that of the drive, which may have been extracted again without a change of this block
+    provenance = current.provenance(inputs={name: snakemake.params.recordings})
     write_scene(current.output.scene, replace(scene, provenance=provenance))

@@ -16,7 +16,6 @@ from drivesplat.editing.sensor_path import EgoPoses, recorded_ego
 from drivesplat.errors import RequestError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import SensorPoses
-from drivesplat.scene.blocks import is_block
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scan import ScanRays
@@ -57,8 +56,7 @@ class RecordedDrive:
         were `refined` or not. Raises ResultError for missing files and those of another version."""
         results = folder.parent
         own: Tracks = "discovered" if any(track.startswith(FOUND) for track in tracks) else "annotated"
-        with_refined = refined and own == "annotated" and not is_block(results)
-        record = results / (REFINED if with_refined else Path(TRACK_FOLDERS[own], "scene.json"))
+        record = results / (REFINED if refined and own == "annotated" else Path(TRACK_FOLDERS[own], "scene.json"))
         scene = read_scene(record)
         # Images and rays are the same with any tracks.
         of_tracks = [results / TRACK_FOLDERS[of] for of in (own, "none")]

@@ -16,8 +16,8 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import HELD_OUT_GROUPS, held_out_key_frames, training_images
 from drivesplat.settings.images import HoldoutSettings
 
-OF_BLOCK = ("held_out_frames", "train_images", "key_frame_range", "nearest_training_s", "own_car", "lidar_missing")
-"""Of a protocol, what differs between the blocks of a drive."""
+COMPARED = ("version", "cameras", "eval_camera", "sweeps", "holdout", "poses", "regions", "extra_points")
+"""Of a protocol, what follows from settings: it is the same in all blocks of a drive."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def pooled(
     """
     first, *others = blocks.values()
     for name, other in zip(list(blocks)[1:], others, strict=True):
-        for key, value in first.record["protocol"].items():
-            if key not in OF_BLOCK and other.record["protocol"].get(key) != value:
+        for key in COMPARED:
+            if other.record["protocol"].get(key) != first.record["protocol"].get(key):
                 raise ResultError(
                     f"blocks {next(iter(blocks))} and {name} were measured differently ({key}); delete the older "
                     "eval.json and rerun"
@@ -70,8 +70,12 @@ def pooled(
     }
     if "lpips_unavailable" in first.record["result"]:
         result["lpips_unavailable"] = first.record["result"]["lpips_unavailable"]
+    measured = next((own for own in every if _frames([own], "interpolation").get("all")), first)
+    seen = [own.record["protocol"].get("visibility") for own in every]
     protocol = {
-        **first.record["protocol"],
+        **measured.record["protocol"],
+        "visibility": next((kind for kind in ("estimated", "annotated") if kind in seen), None),
+        "images_missing": scene.missing_images,
         "held_out_frames": held_out_key_frames(scene, holdout),
         "train_images": len(training_images(scene, holdout)),
         "key_frame_range": scene.key_frame_range,

@@ -11,7 +11,6 @@ from jaxtyping import Float64, Int, Int64
 from scipy.spatial import cKDTree
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.storage import canonical_json
 from drivesplat.io.typed_record import field_values
 from drivesplat.scene.blocks import Block, Blocks, within
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
@@ -22,6 +21,8 @@ STEP = 1.0
 """Metres between the places of a path: smaller movements of a vehicle that stands count for nothing."""
 MAX_AT_PLACE = 10
 """Key frames that a block keeps of a place at which the vehicle stands or crawls, beside those that are held out."""
+MIN_TRAINED = 2
+"""Key frames on the path of a block that it is trained on, at least: smaller blocks join others."""
 MAX_SPEED, SLACK = 70.0, 5.0
 """A vehicle that moves by more than MAX_SPEED (m/s) and SLACK (m) between recordings has jumped."""
 
@@ -37,10 +38,11 @@ def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
     """
     times, places = _ego_places(scene)
     anchors = _anchors(places)
+    starts = times[anchors]
     owners = _owners(places[anchors], _jumps(times, places)[anchors], job.blocks)
+    owners = _large_enough(owners, np.searchsorted(starts, _trained(scene, job.holdout), side="right") - 1)
     runs = [0, *(np.flatnonzero(np.diff(owners)) + 1).tolist(), len(owners)]
     first, last = _span(scene)
-    starts = times[anchors]
     starts[0] = first
     blocks = []
     for number in range(owners.max() + 1):
@@ -48,8 +50,10 @@ def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
         core = np.array([[starts[a], starts[b] if b < len(starts) else last + 1] for a, b in own])
         used = _extended(own, times, places, anchors, job.blocks.overlap_m, core)
         blocks.append(Block(core, used, places[anchors[owners == number]]))
-    thinned = _without_crowds(scene, job.holdout)
-    return Blocks(scene.name, tuple(replace(own, digest=_digest(thinned, own, job.holdout)) for own in blocks))
+    whole, thinned = Blocks(scene.name, tuple(blocks)), _without_crowds(scene, job.holdout)
+    digests = [_digest(_scene_of(thinned, whole, number, job.holdout)) for number in range(len(blocks))]
+    pairs = zip(blocks, digests, strict=True)
+    return replace(whole, blocks=tuple(replace(block, digest=digest) for block, digest in pairs))
 
 
 def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSettings) -> Scene:
@@ -59,9 +63,13 @@ def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSetti
 
     Raises DatasetError where the block has no key frame.
     """
+    return _scene_of(_without_crowds(scene, holdout), blocks, number, holdout)
+
+
+def _scene_of(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSettings) -> Scene:
+    """`block_scene`, of a scene `_without_crowds`."""
     block, stamps = blocks.blocks[number], scene.key_frame_timestamps
-    thinned = _without_crowds(scene, holdout)
-    kept = _kept(thinned, block)
+    kept = _kept(scene, block)
     if len(kept) == 0:
         raise DatasetError(f"scene {blocks.names[number]}: the block has no key frame; make blocks longer (length_m)")
     own = np.flatnonzero(within(stamps, block.core))
@@ -70,9 +78,8 @@ def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSetti
         held_out[group] = np.searchsorted(kept, np.intersect1d(indices, own)).tolist()
         others = np.setdiff1d(np.intersect1d(indices, kept), own)
         held_out["excluded"] += np.searchsorted(kept, others).tolist()
-    scene = thinned
-    frames = tuple(_renumbered(frame, kept) for frame in _used(scene.frames, block))
-    sweeps = tuple(_renumbered(sweep, kept) for sweep in _used(scene.sweeps, block))
+    frames = tuple(_renumbered(frame, kept) for frame in _used(scene.frames, scene, block))
+    sweeps = tuple(_renumbered(sweep, kept) for sweep in _used(scene.sweeps, scene, block))
     cameras, lidars = {frame.camera for frame in frames}, {sweep.lidar for sweep in sweeps}
     return _moved(
         replace(
@@ -86,6 +93,7 @@ def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSetti
             cameras=tuple(camera for camera in scene.cameras if camera.name in cameras),
             lidars=tuple(lidar for lidar in scene.lidars if lidar.name in lidars),
             key_frame_range=[int(kept[0]), int(kept[-1]) + 1] if len(kept) == kept[-1] - kept[0] + 1 else None,
+            missing_images=0,
             held_out=held_out,
         ),
         block.origin,
@@ -185,7 +193,28 @@ def _owners(places: np.ndarray, jumps: np.ndarray, settings: BlockSettings) -> I
         number = max(1, int(length / settings.length_m + 0.5))
         owners[a:b] = count + np.minimum((arcs[a:b] - arcs[a]) / settings.length_m, number - 1).astype(int)
         count += number
-    return owners
+    return np.unique(owners, return_inverse=True)[1]  # a gap in the path may have left out some
+
+
+def _trained(scene: Scene, holdout: HoldoutSettings) -> Int64[np.ndarray, " n"]:
+    """The timestamps of key frames that are trained on."""
+    held_out = [i for group in holdout.held_out(len(scene.key_frame_timestamps)).values() for i in group]
+    return np.delete(scene.key_frame_timestamps, held_out)
+
+
+def _large_enough(owners: Int[np.ndarray, " a"], trained: Int[np.ndarray, " n"]) -> Int[np.ndarray, " a"]:
+    """The blocks of all anchors, where those with fewer than MIN_TRAINED of the key frames that are trained on, given
+    by their anchors, join the block before or, at the start, behind them."""
+    found = owners.copy()
+    while True:
+        counts = np.bincount(found[trained.clip(0)], minlength=found.max() + 1)
+        small = np.flatnonzero(counts < MIN_TRAINED)
+        if len(small) == 0 or found.max() == 0:
+            return found
+        own = np.flatnonzero(found == small[0])
+        beside = found[own[0] - 1] if own[0] else found[np.flatnonzero(found != small[0])[0]]
+        found[own] = beside
+        found = np.unique(found, return_inverse=True)[1]
 
 
 def _driven_before(places: np.ndarray, arcs: np.ndarray, settings: BlockSettings) -> Int[np.ndarray, " a"]:
@@ -240,9 +269,12 @@ def _span(scene: Scene) -> tuple[int, int]:
     return min(every), max(every)
 
 
-def _used(recordings: tuple, block: Block) -> Iterator:
-    stamps = np.array([recording.timestamp for recording in recordings], dtype=np.int64)
-    return (recordings[i] for i in np.flatnonzero(within(stamps, block.used)))
+def _used(recordings: tuple, scene: Scene, block: Block) -> Iterator:
+    """The recordings of a block: those at key frames by the time of their key frame, others by their own."""
+    stamps = [
+        int(scene.key_frame_timestamps[one.sample_index]) if one.is_key_frame else one.timestamp for one in recordings
+    ]
+    return (recordings[i] for i in np.flatnonzero(within(np.array(stamps, dtype=np.int64), block.used)))
 
 
 def _renumbered(recording: Frame | Sweep, kept: np.ndarray) -> Frame | Sweep:
@@ -281,17 +313,11 @@ def _moved(scene: Scene, origin: np.ndarray) -> Scene:
     )
 
 
-def _digest(scene: Scene, block: Block, holdout: HoldoutSettings) -> str:
-    """That of all that a block's scene depends on: of the recordings, the tracks and the held-out key frames."""
-    held_out = holdout.held_out(len(scene.key_frame_timestamps))
-    stamps = {group: scene.key_frame_timestamps[indices] for group, indices in held_out.items()}
-    own = {group: times[within(times, block.used)].tolist() for group, times in stamps.items()}
-    digest = hashlib.blake2b(canonical_json(own).encode(), digest_size=16)
-    kept = _kept(scene, block)
-    for record in (*_used(scene.frames, block), *_used(scene.sweeps, block), *_tracks(scene, block, kept)):
-        digest.update(json.dumps(field_values(record), default=_plain).encode())
-    return digest.hexdigest()
+def _digest(scene: Scene) -> str:
+    """That of a block's scene: of all but its provenance."""
+    values = {name: value for name, value in field_values(scene).items() if name != "provenance"}
+    return hashlib.blake2b(json.dumps(values, default=_plain).encode(), digest_size=16).hexdigest()
 
 
 def _plain(value: object) -> object:
-    return value.tolist() if isinstance(value, np.ndarray) else field_values(value)
+    return value.tolist() if isinstance(value, np.ndarray | np.integer) else field_values(value)

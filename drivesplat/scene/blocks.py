@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from drivesplat.io.json_record import read_typed_json, write_typed_json
 from drivesplat.io.storage import Provenance, no_provenance
-from drivesplat.settings.blocks import block_scene_name, drive_of
+from drivesplat.settings.blocks import block_scene_name
 
 SCHEMA = 1
 RULE = "blocks"
@@ -64,12 +64,6 @@ def within(timestamps: Int64[np.ndarray, " n"], intervals: Int64[np.ndarray, "i 
     """Whether timestamps lie in any of some intervals [first, end)."""
     at = np.asarray(timestamps)[:, None]
     return ((at >= intervals[:, 0]) & (at < intervals[:, 1])).any(axis=1)
-
-
-def is_block(results: Path) -> bool:
-    """Whether a scene's folder of results is that of a block, whose poses are those of its drive."""
-    drive = drive_of(results.name)
-    return drive != results.name and (results.parent / drive / BLOCKS).is_file()
 
 
 def write_blocks(path: str | Path, blocks: Blocks) -> None:

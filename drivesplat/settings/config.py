@@ -166,8 +166,11 @@ class Config(Settings):
         for name, film in KEPT_NAMES.items():
             if name in self.render.trajectories:
                 raise ValueError(f"a trajectory cannot be called {name!r}: the name is kept for the film of {film}")
+        for scene in owners:
+            if drive_of(scene) != scene and self.is_cut(drive_of(scene)):
+                raise ValueError(f"scene {scene!r} has the name of a block of scene {drive_of(scene)!r}; rename it")
         for scene in self.subjects:
-            if scene not in owners:
+            if not self.is_scene(scene):
                 raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")
         if self.cameras and self.eval_camera not in self.cameras:
             message = f"eval_camera {self.eval_camera or 'null'} is not among cameras ({', '.join(self.cameras)})"

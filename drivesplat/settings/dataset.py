@@ -78,12 +78,11 @@ class DatasetSettings(Settings):
                 raise ValueError(f"frames names scene {scene!r}, which is not in scenes")
             if not 0 <= first < last:
                 raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
-        for scene in self.scenes if self.blocks else ():
-            if drive_of(scene) in self.scenes and drive_of(scene) != scene:
-                raise ValueError(f"scene {scene!r} has the name of a block of scene {drive_of(scene)!r}; rename it")
         for scene in self.edits:
-            if scene not in self.scenes:
+            if scene not in self.scenes and not (self.blocks and drive_of(scene) in self.scenes):
                 raise ValueError(f"edits names scene {scene!r}, which is not in scenes")
+            if self.blocks and scene in self.scenes:
+                raise ValueError(f"edits names scene {scene!r}, which is cut into blocks; name a block, {scene}.000")
         return self
 
 

@@ -15,6 +15,8 @@ OF_DRIVES = (
     "scene.json", "scene_refined.json", "poses.json", "triangulated.npz", "blocks.json", "metrics.json", "index.html",
 )  # fmt: skip
 """The results of a drive that is cut into blocks; others are those of blocks."""
+OF_DRIVES_ALONE = ("scene_refined.json", "poses.json", "triangulated.npz", "blocks.json")
+"""Those of them that blocks do not have."""
 FILM_FILES = (".mp4", ".cameras.json")
 
 
@@ -53,9 +55,9 @@ class LongDrives:
     def _block(self, scene: str) -> dict[str, Any]:
         drive, number = drive_of(scene), int(scene.rpartition(".")[2])
         blocks = self._blocks(drive)
-        if number >= len(blocks):
+        if number >= len(blocks) or scene != block_scene_name(drive, number):
             raise ConfigError(
-                f"scene {drive} has no block {number}; it has {len(blocks)}: {block_scene_name(drive, 0)} to "
+                f"scene {drive} has no block called {scene}; it has {len(blocks)}: {block_scene_name(drive, 0)} to "
                 f"{block_scene_name(drive, len(blocks) - 1)}"
             )
         return blocks[number]
@@ -66,9 +68,21 @@ class LongDrives:
         return self._read[drive]
 
 
+def require_cameras(config: Config, scene: str) -> None:
+    """Raises ConfigError for a drive without cameras that is cut into blocks: these are measured by images."""
+    if config.is_cut(scene) and not for_scene(config, scene).cameras:
+        raise ConfigError(
+            f"scene {scene} has no camera (cameras: []), and blocks are measured by images: leave out blocks"
+        )
+
+
 def refuse_results_of_blocks(config: Config, scene: str, path: Sequence[str]) -> None:
     """Raises ConfigError if `path` below the folder of a drive that is cut into blocks is a result that only blocks
     have."""
+    if config.is_block(scene) and path[0] in OF_DRIVES_ALONE:
+        raise ConfigError(
+            f"{path[0]} is a result of the whole drive: ask for {config.results_dir}/{drive_of(scene)}/{path[0]}"
+        )
     if not config.is_cut(scene):
         return
     trajectories = for_scene(config, scene).render.trajectories.items()

@@ -214,7 +214,7 @@ class Outputs(Inputs):
         names = asset_names(edit)
         for one in names:
             found = asset_of_results(one, wildcards.method)
-            if found is not None and found[0] not in self.config.scenes:
+            if found is not None and not self.config.is_scene(found[0]):
                 raise ConfigError(f"edit {name!r} inserts asset {one!r}, and the config has no scene {found[0]!r}")
             if found is not None and found[1] not in self.methods_with_actors:
                 able = ", ".join(self.methods_with_actors) or "none"

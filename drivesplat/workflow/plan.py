@@ -34,7 +34,7 @@ from drivesplat.workflow.film_names import (
 from drivesplat.workflow.film_pages import FilmPages
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
-from drivesplat.workflow.long_drives import refuse_results_of_blocks
+from drivesplat.workflow.long_drives import refuse_results_of_blocks, require_cameras
 from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.recordings import Recordings
@@ -249,6 +249,7 @@ class Plan(JobResources):
             _ = self.tables(of_scene), self.scene_tables(of_scene)
             name = self.config.dataset_of(scene)
             require_methods(self.config, scene)
+            require_cameras(self.config, drive_of(scene))
             self.refuse_unknown_cameras(name, for_scene(self.config, scene).cameras)
             # Snakemake names a points file that is absent; a job would wait for a pipe
             for path in self.points_file(of_scene):

@@ -135,11 +135,11 @@ def _refines(at: JobScope) -> bool:
 
 def stages_of_metrics(config: Config, scene: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The stages of a scene, and those of each of its methods, behind its metrics.json."""
+    if config.is_cut(scene):
+        return ("block", *SCENE_STAGES[1:]), (*METHOD_STAGES, "evaluate_blocks")
     refinement = ("refine_poses",) if refines_poses(config, scene) else ()
-    block, pooled = (("block",), ("evaluate_blocks",)) if config.is_cut(scene) else ((), ())
-    if not has_cameras(config, scene):
-        return (*LIDAR_SCENE_STAGES, *refinement, *block), (*LIDAR_METHOD_STAGES, *pooled)
-    return (*SCENE_STAGES, *refinement, *block), (*METHOD_STAGES, *pooled)
+    of_scene = SCENE_STAGES if has_cameras(config, scene) else LIDAR_SCENE_STAGES
+    return (*of_scene, *refinement), METHOD_STAGES if has_cameras(config, scene) else LIDAR_METHOD_STAGES
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import drivesplat
-from drivesplat.drive.recorded_drive import RecordedDrive
-from drivesplat.errors import RequestError, ResultError
+from drivesplat.errors import RequestError
 from drivesplat.scene.blocks import Block, Blocks, write_blocks
 from drivesplat.scene.scene import read_scene, write_scene
 
@@ -64,14 +63,6 @@ def test_poses_are_those_of_the_drive(drive):
     image = drive.render("CAM_FRONT", late, camera_to_world=of_drive).image
     assert np.array_equal(image, block.render("CAM_FRONT", seconds, camera_to_world=pose).image)
     assert not np.array_equal(image, drive.render("CAM_FRONT", late, camera_to_world=pose).image)
-
-
-def test_a_block_has_the_poses_of_its_drive_refined_or_not(results):
-    tracks = [track.id for track in read_scene(results / "way.000/scene.json").tracks]
-    recorded = RecordedDrive.of_method(results / "way.000/street", tracks, refined=True)
-    assert recorded.scene.name == "way.000", "the refined poses are in its scene.json"
-    with pytest.raises(ResultError, match=r"scene_refined.json"):
-        RecordedDrive.of_method(results / "way/street", tracks, refined=True)
 
 
 def test_two_blocks_are_in_memory_at_most(results, monkeypatch):

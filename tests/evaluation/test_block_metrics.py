@@ -40,7 +40,10 @@ def evaluation(images: int, **regions: int) -> BlockEvaluation:
         "train_seconds": 2.5, "train_iterations": 100, "peak_gpu_memory_gb": None, "device": "cpu", "random_seed": 0,
         "shown": {"group": "interpolation", "key_frame": 4}, "lpips_unavailable": "lpips.enabled is false",
     }  # fmt: skip
-    protocol = {"width": 16, "train_images": 7, "held_out_frames": {}, "key_frame_range": [0, 9], "lidar_missing": 1}
+    protocol = {
+        "sweeps": False, "width": 16, "visibility": "annotated", "train_images": 7, "held_out_frames": {},
+        "key_frame_range": [0, 9], "lidar_missing": 1,
+    }  # fmt: skip
     drive = {"interpolation": {"from_training_m": float(images), "luminance": 0.5, "flat_psnr": 10.0}}
     record = {"protocol": protocol, "drive": {**drive, "extrapolation": None}, "result": result, "provenance": {}}
     car = {"id": "car", "class": "car", "category": "car", "images": images, "pixels": 500, "mean_speed": 2.0 * images,
@@ -88,6 +91,13 @@ def test_the_protocol_is_that_of_the_drive_and_costs_are_summed():
 def test_blocks_that_were_measured_differently_are_refused():
     first, other = evaluation(1), evaluation(1)
     changed = deepcopy(other.record)
-    changed["protocol"]["width"] = 32
-    with pytest.raises(ResultError, match=r"blocks way.000 and way.001 were measured differently \(width\)"):
+    changed["protocol"]["sweeps"] = True
+    with pytest.raises(ResultError, match=r"blocks way.000 and way.001 were measured differently \(sweeps\)"):
         pooled(scene(), HOLDOUT, {"way.000": first, "way.001": BlockEvaluation(changed, other.objects)})
+
+
+def test_blocks_may_lack_tracks_and_held_out_images():
+    empty, full = evaluation(0), evaluation(2)
+    empty.record["protocol"] |= {"visibility": None, "width": 99}
+    record, _ = pooled(scene(), HOLDOUT, {"way.000": empty, "way.001": full})
+    assert (record["protocol"]["visibility"], record["protocol"]["width"]) == ("annotated", 16)

@@ -10,6 +10,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.preprocess.blocks import MAX_AT_PLACE, block_scene, cut_into_blocks
 from drivesplat.scene.blocks import Blocks, read_blocks, within, write_blocks
 from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.sensors import Camera
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.blocks import BlockSettings, BlocksJob, block_scene_name, drive_of
 from drivesplat.settings.images import HoldoutSettings
@@ -122,6 +123,50 @@ def test_a_jump_ends_a_block_and_nothing_overlaps_it():
     blocks = cut(scene)
     assert owners(blocks, scene) == [0, 1]
     assert [block.used.tolist() for block in blocks.blocks] == [block.core.tolist() for block in blocks.blocks]
+
+
+def test_a_gap_in_the_path_leaves_out_no_number():
+    """A ferry with a recording that pauses: 4.8 km in half an hour."""
+    places = np.concatenate([straight(200), straight(5200, start=5000.0)])
+    stamps = np.arange(len(places)) * STEP_US + np.where(places[:, 0] > 1000, 1_800_000_000, 0) + 1_000_000
+    scene = drive_along(places, stamps=stamps)
+    blocks = cut(scene)
+    assert owners(blocks, scene) == list(range(len(blocks.blocks))) and len(blocks.blocks) > 2
+
+
+@pytest.mark.parametrize("beyond", [153, 300], ids=["one glitch", "a jump at the end"])
+def test_stretches_without_key_frames_to_train_on_join_others(beyond):
+    places = straight(300)
+    places[max(152, beyond - 2) : beyond, 1] += 50.0
+    scene = drive_along(places)
+    blocks = cut(scene)
+    for number in range(len(blocks.blocks)):
+        own = block_scene(scene, blocks, number, HOLDOUT)
+        assert frame_groups(own, HOLDOUT).count("train") > 5
+    assert len(blocks.blocks) in (3, 4)
+
+
+def test_held_out_images_are_not_trained_on_where_key_frames_have_times_of_their_own():
+    scene = drive_along(straight(400))
+    scene = replace(scene, key_frame_timestamps=scene.key_frame_timestamps - 50_000)
+    holdout = HoldoutSettings(offset=3)
+    groups = dict(zip((frame.token for frame in scene.frames), frame_groups(scene, holdout), strict=True))
+    blocks = cut_into_blocks(scene, BlocksJob(blocks=BlockSettings(length_m=97, overlap_m=20), holdout=holdout))
+    for number in range(len(blocks.blocks)):
+        own = block_scene(scene, blocks, number, holdout)
+        for frame, group in zip(own.frames, frame_groups(own, holdout), strict=True):
+            assert group != "train" or groups[frame.token] not in ("interpolation", "extrapolation")
+
+
+def test_the_digest_changes_with_the_lens_of_a_camera_and_with_the_origin():
+    camera = Camera("front", 16, 9, np.eye(3), readout_s=0.03)
+    scene = replace(drive_along(straight(400)), cameras=(camera,))
+    before = cut(scene)
+    for changed in (
+        replace(scene, cameras=(replace(camera, readout_s=0.02),)),
+        replace(scene, origin=scene.origin + 1.0),
+    ):
+        assert all(one.digest != two.digest for one, two in zip(before.blocks, cut(changed).blocks, strict=True))
 
 
 def test_blocks_do_not_depend_on_how_the_drive_goes_on():

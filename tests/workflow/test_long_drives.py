@@ -9,7 +9,7 @@ from helpers import REPOSITORY
 from drivesplat.errors import ConfigError
 from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import for_scene
-from drivesplat.workflow.long_drives import LongDrives, refuse_results_of_blocks
+from drivesplat.workflow.long_drives import LongDrives, refuse_results_of_blocks, require_cameras
 from drivesplat.workflow.plan import Plan
 
 BLOCKS = {"length_m": 100.0, "overlap_m": 10.0}
@@ -60,8 +60,10 @@ def test_the_files_of_blocks_follow_from_the_record_of_the_drive(drives):
     assert (drives.digest(at("way.000")), drives.digest(at("way.001"))) == ("a", "b")
     results = drives.results("{method}/eval.json")(at("way"))
     assert results == ["there/way.000/vanilla/eval.json", "there/way.001/vanilla/eval.json"]
-    with pytest.raises(ConfigError, match=r"scene way has no block 2; it has 2: way.000 to way.001"):
+    with pytest.raises(ConfigError, match=r"scene way has no block called way.002; it has 2: way.000 to way.001"):
         drives.inputs_of_block(at("way.002"))
+    with pytest.raises(ConfigError, match=r"scene way has no block called way.0001; it has 2"):
+        drives.inputs_of_block(at("way.0001"))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +82,18 @@ def test_results_of_a_drive_and_those_of_other_scenes_are_not_refused():
     refuse_results_of_blocks(config, "way.000", ["vanilla", "splat.ply"])
 
 
+def test_results_of_a_drive_are_refused_for_a_block_and_blocks_without_cameras():
+    with pytest.raises(ConfigError, match=r"poses.json is a result of the whole drive: ask for there/way/poses.json"):
+        refuse_results_of_blocks(plan().config, "way.000", ["poses.json"])
+    alone = plan(cut={**CUT, "overrides": {"cameras": [], "eval_camera": None}}).config
+    with pytest.raises(ConfigError, match=r"scene way has no camera .* leave out blocks"):
+        require_cameras(alone, "way")
+    require_cameras(plan().config, "way")
+
+
 def test_a_scene_with_the_name_of_a_block_is_refused():
+    with pytest.raises(ConfigError, match=r"scene 'way\.007' has the name of a block of scene 'way'; rename it"):
+        plan(other={"scenes": ["way.007"]})
     with pytest.raises(ConfigError, match=r"scene 'way\.001' has the name of a block of scene 'way'; rename it"):
         plan(cut={**CUT, "scenes": ["way", drive_of("way") + ".001"]})
 

@@ -80,3 +80,14 @@ def test_results_of_one_block_are_refused_for_the_drive_in_a_sentence(copy):
     result = copy.run("results/0001/vanilla/splat.ply")
     assert "ask for results/0001.000/vanilla/splat.ply (docs/long_drives.md)" in result.stdout
     assert result.returncode
+
+
+def test_a_drive_that_is_extracted_by_other_code_keeps_its_blocks_and_its_figures(copy):
+    before, path = trained(copy), copy.folder / "drivesplat/readers/nuscenes/reader.py"
+    path.write_text(path.read_text() + "\n\nNOTHING_NEW = 1\n")
+    assert copy.planned(*TARGETS).get("extract") == 1
+    copy.run(*TARGETS)
+    assert trained(copy) == before and copy.planned(*TARGETS) == {}
+    assert copy.run("report").returncode == 0
+    report = copy.read("results/gap_report.json")
+    assert [row["scene"] for row in report["rows"]] == ["0001"]
