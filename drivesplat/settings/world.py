@@ -117,7 +117,7 @@ class WorldSettings(Settings):
     """Slope of the road ahead: metres of height per metre."""
     route: WorldRouteSettings | None = None
     """A drive through a grid of streets, without ground truth. Numbers of vehicles, pedestrians and cyclists then
-    count for ten seconds of the drive, that of parked vehicles for a block. null = a drive along one
+    count for ten seconds of the drive, that of parked vehicles for 130 metres of street. null = a drive along one
     street."""
     own_car: bool = False
     """Show the rear of the ego vehicle at the lower edge of CAM_BACK's images."""

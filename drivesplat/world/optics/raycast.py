@@ -20,6 +20,8 @@ from drivesplat.world.shapes.mesh import ColoredMesh
 from drivesplat.world.street.objects import StreetObject
 
 NO_HIT = -1
+FACES_AT_ONCE = 50_000
+"""Faces whose normals are computed at once, which bounds memory."""
 SAMPLED_TIMES = 60
 """Number of times at which the extent of a body is measured."""
 
@@ -132,10 +134,12 @@ class RayCaster:
         self.material = np.concatenate([mesh.material for mesh in meshes])
         self.color = np.concatenate([mesh.color for mesh in meshes])
         self.surface_class = np.concatenate([mesh.surface_class for mesh in meshes])
-        self.texture = np.concatenate([mesh.texture[mesh.faces] for mesh in meshes])
-        edges = self.texture[:, 1:] - self.texture[:, :1]
-        normals = np.cross(edges[:, 0], edges[:, 1])
-        self.texture_normal = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        self.texture = np.empty((len(self.material), 3, 3))
+        begin = 0
+        for mesh in meshes:
+            self.texture[begin : (begin := begin + len(mesh.faces))] = mesh.texture[mesh.faces]
+        blocks = range(0, len(self.texture), FACES_AT_ONCE)
+        self.texture_normal = np.concatenate([_normals(self.texture[at : at + FACES_AT_ONCE]) for at in blocks])
         # faces of one object, material, colour and direction are one surface
         owners = [number for number, item in enumerate(self.objects) for _ in item.body.pieces]
         owner = np.repeat(owners, [len(mesh.faces) for mesh in meshes])
@@ -223,6 +227,13 @@ class StreetSnapshot:
                 chosen = passing(near, sphere.centers(poses), sphere.radius**2)
                 if len(chosen):
                     yield piece, poses, chosen
+
+
+def _normals(corners: np.ndarray) -> np.ndarray:
+    """Unit normals (f, 3) of triangles with `corners` (f, 3, 3)."""
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def _bounding_sphere(mesh: ColoredMesh) -> Sphere:

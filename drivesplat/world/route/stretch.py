@@ -37,6 +37,8 @@ LINE_FURNISHED, LINE_TREES, LINE_HOUSES = 120.0, 250.0, 800.0
 """The same distances of furniture, trees and houses along the street that the ego vehicle sees before it."""
 BOXED, PARKED, LIT = 90.0, 150.0, 120.0
 """Distances within which parked vehicles are objects of their own, are there at all, and lamps shine."""
+PARKED_LENGTH = 130.0
+"""Metres of street for which the settings count parked vehicles, as on the one street of other worlds."""
 FACING = 0.3
 """Least cosine between the directions of the ego vehicle and of a street that it sees before it."""
 HORIZON = 3000.0
@@ -233,8 +235,9 @@ class _Surroundings:
 
     def _all_parked(self) -> Iterator[tuple[Parked, NearStreet, float]]:
         """The parked vehicles within PARKED, their streets and their distances."""
+        number = round(self._world.parked * self._length / PARKED_LENGTH)
         for street in self._streets:
-            for car in self._scenery(street.block).parked(self._world.parked) if street.has_trees else ():
+            for car in self._scenery(street.block).parked(number) if street.has_trees else ():
                 distance = self._distance(street.place(car.x, car.y))
                 if distance <= PARKED:
                     yield car, street, distance
