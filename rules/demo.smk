@@ -2,7 +2,7 @@
 #
 # REQUIRED INPUTS: none.
 # OUTPUTS: the tables of a nuScenes dataset at the dataset's dataroot; samples/, maps/ and truth/ beside them, and sweeps/
-# where sensors record between key frames.
+# where sensors record between key frames. With a route, stretches/ has what a longer drive keeps.
 
 for dataset in plan.worlds:
 

@@ -184,11 +184,20 @@ class _Surroundings:
             along, across = np.abs(between[:, heading]), np.abs(between[:, 1 - heading])
             distances = np.hypot(np.maximum(along - length / 2, 0.0), across)
             facing = np.abs(self._ahead[:, heading]) > FACING
-            before = facing & (across < length / 4) & ((between * self._ahead).sum(axis=1) > 0)
-            distance, seen = float(distances.min()), float(distances[before].min(initial=np.inf))
-            if distance <= HOUSES or seen <= LINE_HOUSES:
+            before = (between * self._ahead).sum(axis=1) > 0
+            distance = float(distances.min())
+            seen = float(distances[before & facing & (across < length / 4)].min(initial=np.inf))
+            # houses at the corners of the street ahead belong to the streets that cross it
+            line = min(seen, float(distances[before & self._crosses(begins, heading)].min(initial=np.inf)))
+            if distance <= HOUSES or line <= LINE_HOUSES:
                 trees, furnished = (distance <= FURNISHED or seen <= reach for reach in (LINE_TREES, LINE_FURNISHED))
                 yield NearStreet(CityBlock((x + shift_x, y + shift_y), heading), begins, distance, trees, furnished)
+
+    def _crosses(self, begins: np.ndarray, heading: int) -> np.ndarray:
+        """Whether a street begins or ends on the line along which the ego vehicle faces: (n,) bool."""
+        ends = (begins - self._places, begins + self._length * FORWARD[heading] - self._places)
+        aside = [np.abs(x * self._ahead[:, 1] - y * self._ahead[:, 0]) for x, y in (end.T for end in ends)]
+        return np.minimum(*aside) < self._length / 4
 
     def _distance(self, place: np.ndarray) -> float:
         """The least distance in metres of a place (2,) from the ego vehicle."""

@@ -1,10 +1,10 @@
 """Vehicles and people who move near the ego vehicle, each for some seconds.
 
-A road user is drawn for a second of the drive at which it is close to the ego vehicle. It exists from when houses or
-distance hide it before that second until they hide it again. One that would come too close to another is left out.
+A road user is drawn for a second of the drive, at which it meets the ego vehicle. Before and after it, houses or
+distance hide it; in between it exists. A road user that would come too close to another one is left out.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ FAR = {"vehicle": 150.0, "cyclist": 90.0, "pedestrian": 90.0}
 CHECK_S = 0.2
 """Interval in seconds at which distances are checked."""
 LIFE_STEP_S = 0.5
-"""Interval in seconds at which it is looked whether a road user is in view."""
+"""Interval in seconds at which the view of a road user is checked."""
 ATTEMPTS = 4
 """Number of places that are drawn for a road user until one fits."""
 CYCLING_AT = 3.4
@@ -118,15 +118,9 @@ class RoadUsers:
     def _drawn(self, kind: str, name: str, second: float, random: np.random.Generator) -> RoadUser | None:
         """A road user who meets the ego vehicle at about a second; None if the place that was drawn does not fit."""
         meeting = self._meeting(second)
-        draw: dict[str, Callable[[_Meeting, np.random.Generator], tuple[str, LanePath] | None]] = {
-            "vehicle": self._vehicle,
-            "cyclist": self._cyclist,
-            "pedestrian": self._pedestrian,
-        }
-        drawn = draw[kind](meeting, random)
-        if drawn is None:
-            return None
-        user = RoadUser(name, drawn[0], drawn[1], tuple(int(word) for word in random.integers(2**31, size=2)))
+        draw = {"vehicle": self._vehicle, "cyclist": self._cyclist, "pedestrian": self._pedestrian}
+        exact_kind, path = draw[kind](meeting, random)
+        user = RoadUser(name, exact_kind, path, tuple(random.integers(2**31, size=2).tolist()))
         life = self._life(user, second)
         if life is None or not all(self._is_on_its_street(user, at) for at in life):
             return None
@@ -173,20 +167,14 @@ class RoadUsers:
         """A pedestrian who walks along one side of the street, on one of the walkways of the settings."""
         walkways = [walkway for walkway in WALKWAYS if walkway.place in self._world.walkways]
         walkway = walkways[random.integers(len(walkways))]
-        ahead = walkway.ahead + random.uniform(0.0, 22.0)
-        ahead, left, speed = walkway.ahead + random.uniform(0.0, 22.0), walkway.t, walkway.speed
         heading, crossing = self._ego.headings[meeting.street], self._ego.crossing(meeting.street)
-        offset = meeting.offset + ahead
+        offset, lane = meeting.offset + walkway.ahead + random.uniform(0.0, 22.0), -walkway.t
         if offset > self._block:
             crossing, offset = neighbour(crossing, heading), offset - self._block
-        if speed < 0.0:
-            crossing, heading, offset, left = (
-                neighbour(crossing, heading),
-                (heading + 2) % 4,
-                self._block - offset,
-                -left,
-            )
-        path = LanePath(crossing, (heading,), self._block, abs(speed), -left)
+        if walkway.speed < 0.0:  # towards the ego vehicle
+            crossing, heading = neighbour(crossing, heading), (heading + 2) % 4
+            offset, lane = self._block - offset, -lane
+        path = LanePath(crossing, (heading,), self._block, abs(walkway.speed), lane)
         return "pedestrian", path.meeting(offset, meeting.second)
 
     def _turn(self, random: np.random.Generator) -> int:
@@ -200,8 +188,7 @@ class RoadUsers:
         return SIDEWALK_ENDS < along < self._block - SIDEWALK_ENDS
 
     def _life(self, user: RoadUser, second: float) -> tuple[float, float] | None:
-        """The first and the last second at which it exists; None if it is in view for too
-        long, or not at all."""
+        """The first and the last second at which it exists; None if it is in view for too long, or not at all."""
         steps = np.arange(0.0, MAX_LIFE_S, LIFE_STEP_S)
         found = []
         for sign in (-1.0, 1.0):
