@@ -1,7 +1,7 @@
 """The effect of maps by a network: true maps of synthetic worlds in place of a network's, against the heuristic.
 
     python -m benchmarks.segmentation --out results/segmentation -- --cores 16
-    python -m benchmarks.segmentation --out /tmp/tiny --worlds 1 --width 160 --iterations 200 -- --cores 2
+    python -m benchmarks.segmentation --out results/tiny --worlds 1 --width 160 --iterations 200 -- --cores 2
 
 Makes the worlds, trains `street` on each, once with the sky by the heuristic and once for each variant with maps that
 went through the stage `segment`, and writes segmentation.json and segmentation.md. Arguments after -- are Snakemake's.

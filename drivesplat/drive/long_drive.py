@@ -1,13 +1,12 @@
 """A long drive in Python: its blocks, of which those that are rendered are in memory."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivesplat.drive.cameras import Matrix, Vector
 from drivesplat.drive.drive_view import DriveScan
 from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
@@ -17,6 +16,8 @@ from drivesplat.scene.blocks import BLOCKS, read_blocks
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 
+POSES = {"ego_to_world", "camera_to_world", "sensor_to_world"}
+"""The arguments of a rendering that are poses."""
 MAX_OPEN = 2
 """The blocks that are in memory."""
 
@@ -54,6 +55,11 @@ class LongDrive:
         return read_scene(self.folder.parent / "scene.json")
 
     @cached_property
+    def _first(self) -> int:
+        """The timestamp of second 0."""
+        return min(recording.timestamp for recording in self.scene.frames or self.scene.sweeps)
+
+    @cached_property
     def duration(self) -> float:
         """The time of the last image in seconds; of the last sweep without images."""
         recordings = self.scene.frames or self.scene.sweeps
@@ -77,46 +83,28 @@ class LongDrive:
         RequestError for a time outside of the recording."""
         if not 0.0 <= time <= self.duration:
             raise RequestError(f"{self.folder} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s")
-        first = min(recording.timestamp for recording in self.scene.frames or self.scene.sweeps)
-        timestamp = first + round(time * 1e6)
+        timestamp = self._first + round(time * 1e6)
         drive = self.block(self.blocks.at(timestamp))
         return drive, float(np.clip(drive.scene.seconds(timestamp), 0.0, drive.duration))
 
-    def render(
-        self,
-        camera: AnyCamera | Sequence[AnyCamera],
-        time: float,
-        *,
-        ego_to_world: Matrix | None = None,
-        camera_to_world: Matrix | None = None,
-        velocity: Vector | None = None,
-        outputs: Sequence[str] = ("rgb",),
-    ) -> Any:
-        """What a camera sees at a time (a `DriveView`), or each of several (a list): see `TrainedDrive.render`."""
+    def render(self, camera: AnyCamera | Sequence[AnyCamera], time: float, **at: Any) -> Any:
+        """What a camera sees at a time (a `DriveView`), or each of several (a list): `TrainedDrive.render`, whose
+        further arguments it has."""
         drive, seconds = self.at(time)
-        poses = {"ego_to_world": ego_to_world, "camera_to_world": camera_to_world}
-        own = {name: self._in_block(pose, drive) for name, pose in poses.items() if pose is not None}
-        return drive.render(camera, seconds, **own, velocity=velocity, outputs=outputs)
+        return drive.render(camera, seconds, **self._in_block(at, drive))
 
-    def scan(
-        self,
-        lidar: str | PoseableLidar,
-        time: float,
-        *,
-        ego_to_world: Matrix | None = None,
-        sensor_to_world: Matrix | None = None,
-        velocity: Vector | None = None,
-        with_instance: bool = True,
-    ) -> DriveScan:
-        """What a LiDAR measures about a time, in the world of the block: see `TrainedDrive.scan`."""
+    def scan(self, lidar: str | PoseableLidar, time: float, **at: Any) -> DriveScan:
+        """What a LiDAR measures about a time, in the world of the block: `TrainedDrive.scan`, whose further arguments
+        it has."""
         drive, seconds = self.at(time)
-        poses = {"ego_to_world": ego_to_world, "sensor_to_world": sensor_to_world}
-        own = {name: self._in_block(pose, drive) for name, pose in poses.items() if pose is not None}
-        return drive.scan(lidar, seconds, **own, velocity=velocity, with_instance=with_instance)
+        return drive.scan(lidar, seconds, **self._in_block(at, drive))
 
-    def _in_block(self, pose: Matrix, drive: TrainedDrive) -> np.ndarray:
-        """A pose of the drive's world in that of a block."""
-        moved = np.array(pose, dtype=np.float64)
-        if moved.shape == (4, 4):  # anything else is refused by the block
-            moved[:3, 3] += self.scene.origin - drive.scene.origin
+    def _in_block(self, at: Mapping[str, Any], drive: TrainedDrive) -> dict[str, Any]:
+        """Arguments of a rendering, with poses of the drive's world in that of a block."""
+        moved = dict(at)
+        for name in POSES & at.keys():
+            pose = None if at[name] is None else np.array(at[name], dtype=np.float64)
+            if pose is not None and pose.shape == (4, 4):  # anything else is refused by the block
+                pose[:3, 3] += self.scene.origin - drive.scene.origin
+            moved[name] = pose
         return moved
