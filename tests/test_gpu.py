@@ -411,6 +411,17 @@ def test_a_film_whose_lists_overflow_is_captured_anew(street_film, captures):
     assert_frames(found, [*expected, *expected])
 
 
+def test_a_film_that_drops_its_only_graph_captures_another(street_film, monkeypatch, caplog):
+    """While nothing else keeps the graph, so that torch frees its memory."""
+    model, views, expected = street_film
+    monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
+    monkeypatch.setattr(capacity, "MARGIN", 1.0)
+    found = [*film_frames(model, [(view, None) for view in [*views, *views]])]
+    assert not caplog.records
+    torch.cuda.empty_cache()
+    assert_frames(found, [*expected, *expected])
+
+
 def test_an_abandoned_film_does_not_affect_the_next(street_film, captures):
     model, views, expected = street_film
     given_up = film_frames(model, [(view, None) for view in [*views, *views]])

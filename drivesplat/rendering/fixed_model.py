@@ -219,8 +219,8 @@ class FixedModel:
         """A graph of renderings of a kind; None where the GPU or its driver refuses. Graphs are replayed one after the
         other and their results copied before, so that they can share memory."""
         device = _inputs(kind.view)[0].device
-        if self._pool is None:
-            self._pool = new_pool()
+        if all(other.graph is None for other in self._kinds):
+            self._pool = new_pool()  # torch frees a pool with its last graph
         with capture_stream(device):  # a second thread may encode a film meanwhile
             work = partial(render, replace(kind.view), kind.sets)
             return capture(work, kind.needs, self._pool, device, "renderings", errors="thread_local")

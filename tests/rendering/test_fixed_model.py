@@ -24,12 +24,14 @@ SPREAD = (3e-4, 3e-4)
 
 class FakeGpu:
     """A model on a fake GPU whose one list needs as many entries as a view's time says. `captured` are the entries that
-    each graph was captured with; a `full` GPU cannot replay, one that `refuses` cannot capture."""
+    each graph was captured with, `pools` the memory pools; a `full` GPU cannot replay, one that `refuses` cannot capture.
+    """
 
     def __init__(self, monkeypatch):
         self.captured: list[list[int]] = []
+        self.pools: list[tuple[int, int]] = []
         self.full = self.refuses = False
-        for name, fake in (("graphs_supported", lambda _: True), ("new_pool", lambda: (0, 0)),
+        for name, fake in (("graphs_supported", lambda _: True), ("new_pool", lambda: (len(self.captured), 0)),
                            ("capture_stream", lambda _: nullcontext()), ("capture", self.capture)):  # fmt: skip
             monkeypatch.setattr(fixed_model, name, fake)
         monkeypatch.setattr(torch.cuda, "empty_cache", int)
@@ -43,6 +45,7 @@ class FakeGpu:
 
     def capture(self, work, needed, pool, device, what, errors):
         self.captured.append(list(needed))
+        self.pools.append(pool)
         if self.refuses:
             return None
         seconds, needs = work.args[0].seconds, torch.tensor([0])
@@ -106,6 +109,16 @@ def test_other_gaussians_of_the_same_number_are_of_the_same_kind(gpu):
 def test_images_whose_lists_overflow_are_rendered_again_and_captured_anew(gpu):
     assert gpu.made(*map(needing, (100, 100, 160, 161, 240))) == [RENDERED, REPLAYED, RENDERED, REPLAYED, REPLAYED]
     assert gpu.captured == [[100], [160]]
+
+
+def test_graphs_share_memory_while_one_of_them_lives(gpu):
+    """torch frees a pool with its last graph and refuses a capture in it afterwards."""
+    smaller = [replace(needing(entries), width=8) for entries in (100, 100)]
+    gpu.made(needing(100), needing(100), *smaller, needing(160), needing(160))
+    assert gpu.pools == [(0, 0)] * 3
+    gpu.model = FixedModel(gpu.model.model)
+    gpu.made(needing(100), needing(100), needing(160), needing(160))
+    assert gpu.pools[3:] == [(3, 0), (4, 0)]
 
 
 def test_images_that_are_made_together_are_those_made_one_by_one(gpu):
