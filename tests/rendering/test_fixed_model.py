@@ -24,7 +24,7 @@ SPREAD = (3e-4, 3e-4)
 
 class FakeGpu:
     """A model on a fake GPU whose one list needs as many entries as a view's time says. `captured` are the entries that
-    each graph was captured with, `pools` the memory pools; a `full` GPU cannot replay, one that `refuses` cannot capture.
+    each graph was captured with, `pools` their memory; a `full` GPU cannot replay, one that `refuses` cannot capture.
     """
 
     def __init__(self, monkeypatch):
