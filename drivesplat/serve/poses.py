@@ -49,6 +49,11 @@ class FrameTimes:
         """In seconds."""
         return (self.end_us - self.start_us) * 1e-6
 
+    @property
+    def shown_us(self) -> tuple[int, int]:
+        """The moment that is shown, in microseconds, and whether half a microsecond more (1) or not (0)."""
+        return divmod(2 * self.start_us if self.at_start else self.start_us + self.end_us, 2)
+
 
 @dataclass(frozen=True, eq=False)
 class SteadyPoses:
@@ -57,6 +62,10 @@ class SteadyPoses:
 
     poses: Float64[np.ndarray, "n 4 4"]
     velocities: Float64[np.ndarray, "n 6"]
+
+    def seen_from(self, origin: Float64[np.ndarray, "3"]) -> "SteadyPoses":
+        """The same in a world with its origin at a place of this one, in metres."""
+        return SteadyPoses(rigid(self.poses[:, :3, :3], self.poses[:, :3, 3] - origin), self.velocities)
 
 
 def steady_poses(pairs: Sequence[Any], names: Sequence[str], times: FrameTimes) -> SteadyPoses:

@@ -1,8 +1,8 @@
 """Requests for images and scans, checked before any model is touched."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,15 @@ class WorldKey:
     scene_id: str
     times: FrameTimes
     listed: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlace:
+    """The scene that a request is about, by the id by which it is offered, and the origin (3,) of its world in metres
+    of the world of the request: not zero for a block of a long drive."""
+
+    scene_id: str
+    origin: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +85,14 @@ class ScanRequest:
 class RequestReader:
     """Reads the messages of one call. Requests of one frame list the same objects, which are read once."""
 
-    def __init__(self) -> None:
+    def __init__(self, place: Callable[[str, FrameTimes], ScenePlace]) -> None:
+        """`place` says which scene a request with a scene id and times is about."""
+        self._place = place
         self._objects: dict[WorldKey, ListedObjects] = {}
 
-    def image(self, message: Any, scene_id: str) -> ImageRequest:
-        """A request for an image of a scene, by the id by which it is offered. Raises ServiceError for a request that
-        no scene can answer."""
+    def image(self, message: Any) -> ImageRequest:
+        """A request for an image. Raises ServiceError for a scene that is not served, and for a request that no scene
+        can answer."""
         spec = message.camera_intrinsics
         times = FrameTimes.checked(
             message.frame_start_us, message.frame_end_us, spec.shutter_type == wire.ShutterType.GLOBAL
@@ -89,14 +100,16 @@ class RequestReader:
         length_us = message.frame_end_us - message.frame_start_us
         camera = camera_of(spec, message.resolution_w, message.resolution_h, length_us)
         steady = steady_poses([message.sensor_pose], ["sensor_pose"], times)
-        world, objects = self._world(message, scene_id, times)
+        place = self._place(message.scene_id, times)
+        steady = steady.seen_from(place.origin)
+        world, objects = self._world(message, place, times)
         mask = (message.ego_mask_id.camera_logical_id or spec.logical_id) if message.insert_ego_mask else None
         return ImageRequest(
             world, objects, camera, steady.poses[0], steady.velocities[0], _encoding(message), mask
         )  # fmt: skip
 
-    def scan(self, message: Any, scene_id: str) -> ScanRequest:
-        """A request for a scan of a scene, as `image`."""
+    def scan(self, message: Any) -> ScanRequest:
+        """A request for a scan, as `image`."""
         times = FrameTimes.checked(message.frame_start_us, message.frame_end_us, at_start=False)
         lidar = None
         if message.HasField("lidar_config"):
@@ -107,15 +120,18 @@ class RequestReader:
         pair, at_start = message.sensor_pose, FrameTimes(times.start_us, times.end_us, at_start=True)
         steady = steady_poses([pair], ["sensor_pose"], times)
         reverse = wire.PosePair(start_pose=pair.end_pose, end_pose=pair.start_pose)
-        end = steady_poses([reverse], ["sensor_pose"], at_start).poses[0]
-        world, objects = self._world(message, scene_id, times)
-        return ScanRequest(world, objects, lidar, steady.poses[0], steady.velocities[0], end)
+        end = steady_poses([reverse], ["sensor_pose"], at_start)
+        place = self._place(message.scene_id, times)
+        steady, end = steady.seen_from(place.origin), end.seen_from(place.origin)
+        world, objects = self._world(message, place, times)
+        return ScanRequest(world, objects, lidar, steady.poses[0], steady.velocities[0], end.poses[0])
 
-    def _world(self, message: Any, scene_id: str, times: FrameTimes) -> tuple[WorldKey, ListedObjects]:
+    def _world(self, message: Any, place: ScenePlace, times: FrameTimes) -> tuple[WorldKey, ListedObjects]:
         listed = tuple(own.SerializeToString(deterministic=True) for own in message.dynamic_objects)
-        key = WorldKey(scene_id, times, listed)
+        key = WorldKey(place.scene_id, times, listed)
         if key not in self._objects:
-            self._objects[key] = ListedObjects.of(message.dynamic_objects, times)
+            objects = ListedObjects.of(message.dynamic_objects, times)
+            self._objects[key] = replace(objects, steady=objects.steady.seen_from(place.origin))
         return key, self._objects[key]
 
 

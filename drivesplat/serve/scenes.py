@@ -14,9 +14,13 @@ from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.editing.ego import MAX_LEAD
 from drivesplat.errors import DeviceError, RequestError
 from drivesplat.model.checkpoint import model_file
+from drivesplat.scene.blocks import BLOCKS, Blocks, read_blocks
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
+from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.serve.faults import ServiceError, as_service_errors
 from drivesplat.serve.poses import FrameTimes
+from drivesplat.serve.requests import ScenePlace
+from drivesplat.settings.blocks import drive_of
 from drivesplat.trajectories.edited_actors import EditedActor
 
 CHECKPOINT, MASK_FILE, ARCHIVE = "checkpoint.npz", "own_car.json", "scene.alpasim.usdz"
@@ -60,6 +64,34 @@ class DriveSource:
         return open_drive(self.folder, device)
 
 
+@dataclass(frozen=True)
+class LongDriveSource:
+    """A drive that was cut into blocks, of which all or some are served: `scene_ids` are the ids of these, by number.
+    `folder` is results/{scene}."""
+
+    folder: Path
+    blocks: Blocks
+    scene_ids: Mapping[int, str]
+
+    @property
+    def first(self) -> str:
+        """The id of its first block that is served."""
+        return self.scene_ids[min(self.scene_ids)]
+
+    @cached_property
+    def record(self) -> Scene:
+        """The scene of the whole drive."""
+        return read_scene(self.folder / "scene.json")
+
+    def place(self, scene_id: str, times: FrameTimes) -> ScenePlace:
+        """The block in which the vehicle is at the moment that a frame shows. Raises ServiceError (NOT_FOUND) for one
+        that is not served."""
+        number = self.blocks.at(times.shown_us[0])
+        if number not in self.scene_ids:
+            raise ServiceError("NOT_FOUND", f"block {number} of {scene_id} is not served: {self.blocks.names[number]}")
+        return ScenePlace(self.scene_ids[number], self.blocks.blocks[number].origin)
+
+
 def find_sources(paths: Iterable[Path]) -> dict[str, DriveSource]:
     """The trained drives of result folders (all trained methods of all scenes below), of methods' folders, and of
     scenes for AlpaSim (`*.usdz`, also those of a folder that has nothing else), by scene id: the name of the scene, or
@@ -82,9 +114,29 @@ def find_sources(paths: Iterable[Path]) -> dict[str, DriveSource]:
     return found
 
 
+def find_long_drives(sources: Mapping[str, DriveSource]) -> dict[str, LongDriveSource]:
+    """The drives that some of the sources are blocks of, by scene id: the name of the drive, or `drive/method` where
+    several methods of it are served. Raises ResultError for a damaged blocks.json."""
+    found: dict[tuple[Path, str], dict[str, str]] = {}
+    for name, source in sources.items():
+        folder = source.folder.resolve().parents[1] / drive_of(source.scene)
+        if folder.name != source.scene and (folder / BLOCKS).is_file():
+            found.setdefault((folder, source.method), {})[source.scene] = name
+    methods = Counter(folder for folder, _ in found)
+    drives = {}
+    for (folder, method), of_blocks in found.items():
+        blocks = read_blocks(folder / BLOCKS)
+        own = {number: of_blocks[name] for number, name in enumerate(blocks.names) if name in of_blocks}
+        drives[folder.name if methods[folder] == 1 else f"{folder.name}/{method}"] = LongDriveSource(
+            folder, blocks, own
+        )
+    return drives
+
+
 def scene_ids(sources: Mapping[str, DriveSource]) -> list[str]:
-    """The ids that a simulator may know scenes by: their names, and then those of their archives."""
-    return [*sources, *(source.archive_id for source in sources.values() if source.archive_id)]
+    """The ids that a simulator may know scenes by: long drives, scenes, and then archives."""
+    archives = (source.archive_id for source in sources.values() if source.archive_id)
+    return [*find_long_drives(sources), *sources, *archives]
 
 
 def _sources_of(path: Path) -> Iterator[DriveSource]:
@@ -112,15 +164,14 @@ class LoadedDrive:
         """The time of the drive that a frame shows, seconds since its first image. Up to MAX_LEAD seconds before the
         first image and after the last one, as the path of the vehicle is known and where its first and last exposures
         begin and end, it is that of this image. Raises ServiceError (OUT_OF_RANGE) for a time farther outside."""
-        scene = self.drive.scene
-        doubled = 2 * times.start_us if times.at_start else times.start_us + times.end_us
-        time = scene.seconds(doubled // 2) + 0.5e-6 * (doubled % 2)
+        whole, half = times.shown_us
+        time = self.drive.scene.seconds(whole) + 0.5e-6 * half
         if not -MAX_LEAD <= time <= self.drive.duration + MAX_LEAD:
             stamps = self.recorded_us
             raise ServiceError(
                 "OUT_OF_RANGE",
                 f"{self.drive.where} was recorded from {stamps[0]} to {stamps[1]} us, and the frame is at "
-                f"{doubled / 2:.1f} us",
+                f"{whole + half / 2:.1f} us",
             )
         return min(max(time, 0.0), self.drive.duration)
 
@@ -139,18 +190,29 @@ class LoadedDrives:
     def __init__(self, offered: Mapping[str, DriveSource], device: str, max_loaded: int):
         """`device` is 'cpu' or 'cuda'."""
         self.offered, self.max_loaded = offered, max_loaded
+        self.long_drives = find_long_drives(offered)
         self._device = device
         self._aliases = {source.full_name: name for name, source in offered.items()}
         self._aliases |= {source.archive_id: name for name, source in offered.items() if source.archive_id}
         self._loaded: dict[str, LoadedDrive] = {}  # the one used last is the last
 
+    def place(self, scene_id: str, times: FrameTimes) -> ScenePlace:
+        """The scene that a request is about: of a long drive the block at its time. Raises ServiceError (NOT_FOUND) for
+        one that is not served."""
+        long_drive = self.long_drives.get(scene_id)
+        return ScenePlace(self.name_of(scene_id)) if long_drive is None else long_drive.place(scene_id, times)
+
     def name_of(self, scene_id: str) -> str:
-        """The scene id of a request as it is offered; `scene/method` also names a scene of one method, and the id of
-        its archive any scene. Raises ServiceError (NOT_FOUND) for a scene that is not served."""
+        """The scene id of a request as it is offered; `scene/method` also names a scene of one method, the id of its
+        archive any scene, and the id of a long drive its first block. Raises ServiceError (NOT_FOUND) for a scene that
+        is not served."""
+        if scene_id in self.long_drives:
+            return self.long_drives[scene_id].first
         name = scene_id if scene_id in self.offered else self._aliases.get(scene_id)
         if name is None:
             raise ServiceError(
-                "NOT_FOUND", f"there is no scene {scene_id[:80]!r}; there are: {', '.join(self.offered)}"
+                "NOT_FOUND",
+                f"there is no scene {scene_id[:80]!r}; there are: {', '.join([*self.long_drives, *self.offered])}",
             )
         return name
 

@@ -14,8 +14,10 @@ from jaxtyping import UInt8
 
 from drivesplat.drive.drive_view import DriveScan
 from drivesplat.drive.world_state import WorldState
+from drivesplat.editing.sensor_path import recorded_ego
 from drivesplat.rendering.color_bytes import uint8_images
 from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.scene import Scene
 from drivesplat.serve.camera_specs import spec_of
 from drivesplat.serve.encoding import encoded, jpeg_on_device
 from drivesplat.serve.faults import ServiceError, as_service_errors
@@ -112,23 +114,22 @@ class SensorService:
 
     def get_available_trajectories(self, request: Any, active: IsActive) -> Any:
         """The recorded path of the vehicle of a scene, at the times of its images (of its sweeps, without cameras)."""
-        trajectory = wire.Trajectory()
-        with self._loaded(request.scene_id, active) as loaded:
-            drive = loaded.drive
-            first = drive.cameras[0] if drive.cameras else None
-            recordings = [frame for frame in drive.scene.frames if frame.camera == first] or drive.scene.sweeps
-            stamps = sorted({int(recording.timestamp) for recording in recordings})
-            seconds = np.array([drive.scene.seconds(stamp) for stamp in stamps])
-            for stamp, pose in zip(stamps, drive.ego_path(seconds), strict=True):
-                trajectory.poses.add(pose=pose_message(pose), timestamp_us=stamp)
+        long_drive = self._drives.long_drives.get(request.scene_id)
         reply = wire.AvailableTrajectoriesReturn()
+        if long_drive is None:
+            with self._loaded(request.scene_id, active) as loaded:
+                trajectory = _trajectory(loaded.drive.scene)
+        else:
+            with as_service_errors():
+                trajectory = _trajectory(long_drive.record)
         reply.available_trajectories.add(trajectory=trajectory)
         return reply
 
     def get_available_ego_masks(self, request: Any, active: IsActive) -> Any:
         """The ego masks of all scenes: by camera, with the scene as `rig_config_id`."""
         reply = wire.AvailableEgoMasksReturn()
-        for name, source in self._sources.items():
+        of_drives = [(name, self._sources[drive.first]) for name, drive in self._drives.long_drives.items()]
+        for name, source in [*of_drives, *self._sources.items()]:
             for camera in source.ego_mask.outlines:
                 reply.ego_mask_metadata.add(
                     ego_mask_id=wire.EgoMaskId(camera_logical_id=camera, rig_config_id=name)
@@ -157,17 +158,17 @@ class SensorService:
 
     def render_lidar(self, request: Any, active: IsActive) -> Any:
         """One scan. Points are in the frame of the sensor at the end of the spin."""
-        return self._scan(RequestReader().scan(request, self._drives.name_of(request.scene_id)), active)
+        return self._scan(RequestReader(self._drives.place).scan(request), active)
 
     def render_aggregated(self, request: Any, active: IsActive) -> Any:
         """Images and scans; all of them, or the first error."""
-        reader = RequestReader()
+        reader = RequestReader(self._drives.place)
         if len(request.lidar_requests) > MAX_REQUEST_SCANS:
             raise ServiceError(
                 "RESOURCE_EXHAUSTED",
                 f"the request asks for {len(request.lidar_requests)} scans; it may ask for {MAX_REQUEST_SCANS}",
             )
-        scans = [reader.scan(own, self._drives.name_of(own.scene_id)) for own in request.lidar_requests]
+        scans = [reader.scan(own) for own in request.lidar_requests]
         images = [_or_raise(image) for image in self._images(request.rgb_requests, active)]
         return wire.AggregatedRenderReturn(
             rgb_returns=[wire.RGBRenderReturn(image_bytes=image) for image in images],
@@ -176,8 +177,8 @@ class SensorService:
 
     def _images(self, messages: Sequence[Any], active: IsActive) -> list[Answered[bytes]]:
         """The images of requests; those of one world are rendered together, and all are encoded side by side."""
-        reader = RequestReader()
-        read = [_attempt(partial(self._read, reader, message)) for message in messages]
+        reader = RequestReader(self._drives.place)
+        read = [_attempt(partial(reader.image, message)) for message in messages]
         require_affordable(read, self.options.max_loaded)
         groups: dict[WorldKey, list[int]] = {}
         for number, one in enumerate(read):
@@ -193,10 +194,6 @@ class SensorService:
                     pictures.update(zip(numbers, each, strict=True))
         waiting = [self._encoders.submit(self._encoded, read[i], pictures[i]) for i in range(len(read))]
         return [_attempt(future.result) for future in waiting]
-
-    def _read(self, reader: RequestReader, message: Any) -> ImageRequest:
-        """A request for an image of a scene that is served."""
-        return reader.image(message, self._drives.name_of(message.scene_id))
 
     def _rendered(self, requests: Sequence[ImageRequest]) -> list[Picture]:
         """The images of requests of one world, rendered by the thread that uses the device."""
@@ -298,6 +295,16 @@ def _attempt(work: Callable[[], Result]) -> Answered[Result]:
             return work()
     except ServiceError as error:
         return error
+
+
+def _trajectory(scene: Scene) -> Any:
+    """The recorded path of the vehicle as a message, by the images of the first camera."""
+    first = scene.frames[0].camera if scene.frames else None
+    recordings = [frame for frame in scene.frames if frame.camera == first] or scene.sweeps
+    stamps = sorted({int(recording.timestamp) for recording in recordings})
+    path = recorded_ego(scene, first)(np.array([scene.seconds(stamp) for stamp in stamps]))
+    poses = [wire.PoseAtTime(pose=pose_message(pose), timestamp_us=at) for at, pose in zip(stamps, path, strict=True)]
+    return wire.Trajectory(poses=poses)
 
 
 def _or_raise(answered: Answered[Result]) -> Result:

@@ -22,7 +22,7 @@ import drivesplat
 from drivesplat.scene.lens import pixels_of
 from drivesplat.serve.camera_specs import camera_of
 from drivesplat.serve.messages import wire
-from drivesplat.serve.requests import RequestReader
+from drivesplat.serve.requests import RequestReader, ScenePlace
 
 SCENE, SECONDS, LENGTH_US = "0001/street", 1.0, 40_000
 ROLLING = {
@@ -221,10 +221,10 @@ def test_every_format_has_the_same_image(client, results, frame, path):
 
 def test_the_exposure_is_that_of_the_recorded_camera(frame, path):
     request = wire.RGBRenderRequest.FromString(image_request(SCENE, frame, path).SerializeToString())
-    read = RequestReader().image(request, SCENE)
+    read = RequestReader(lambda scene, _: ScenePlace(scene)).image(request)
     assert read.placed(1.0).view(torch.device("cpu")).camera == CAMERA
     request.camera_intrinsics.logical_id = ""
-    assert RequestReader().image(request, SCENE).camera.exposure_of is None
+    assert RequestReader(lambda scene, _: ScenePlace(scene)).image(request).camera.exposure_of is None
 
 
 def test_ego_masks_are_offered_and_drawn_in_black(client, frame, path):
