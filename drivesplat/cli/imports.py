@@ -57,5 +57,5 @@ def run_import(parsed: argparse.Namespace) -> int:
     for note in done.notes:
         print(f"note: {note}")
     counts = ", ".join(f"{count} of {name}" for name, count in done.counts.items())
-    print(f"{done.path}: {counts}; check it with python -m drivesplat.readers.drive check {parsed.out}")
+    print(f"{done.path}: {counts}; check it with drivesplat check {parsed.out}")
     return 0

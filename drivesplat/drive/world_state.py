@@ -19,8 +19,9 @@ from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.world_actor import ActorsById, WorldActor
 from drivesplat.editing.placed_model import PlacedModel, actor_placements
 from drivesplat.editing.shown_objects import ShownObjects, box_of, seen_objects
-from drivesplat.errors import RequestError
+from drivesplat.errors import RequestError, ResultError
 from drivesplat.machine.device import explain_out_of_memory
+from drivesplat.model.scans import WITHOUT_LIDAR
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
@@ -341,6 +342,8 @@ class WorldState:
         Raises RequestError as `render`, ResultError for a model that was trained without LiDAR.
         """
         at = GivenPose.checked("the LiDAR", ego_to_world, sensor_to_world, velocity)
+        if any("lidar_logits" not in part.params for part in self._fixed.model.parts):
+            raise ResultError(WITHOUT_LIDAR)
         sensor, spread = self._sensors.placed_lidar(lidar, self.time, at)
         with explain_out_of_memory(lambda: len(self._fixed.model)):
             return self._sampled().scan(sensor, spread, with_instance)

@@ -15,6 +15,8 @@ from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, r
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import RecordedScan
 
+WITHOUT_LIDAR = "the model was trained without LiDAR: train it with train.scans.per_image above 0"
+
 
 @dataclass(frozen=True)
 class ScanView:
@@ -84,7 +86,7 @@ def scan_picture(sets: GaussianSets, view: ScanView, before: Float[Tensor, "b a"
     values, sensor = [], view.sensor_to_world[:3, 3]
     for own in sets:  # two values of each Gaussian are concatenated, not its eight coefficients
         if own.lidar_logits is None:
-            raise ResultError("the model was trained without LiDAR: train it with train.scans.per_image above 0")
+            raise ResultError(WITHOUT_LIDAR)
         values.append(lidar_response(own.lidar_logits, own.means, sensor))
     rendering = composited_scan(sets.shapes, view, torch.cat(values), before)
     intensity, returned = rendering.values.unbind(dim=-1)

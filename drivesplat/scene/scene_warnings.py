@@ -103,8 +103,7 @@ def scene_warnings(scene: Scene, brightness: float | None) -> list[str]:
     if not scene.tracks:
         found.append(
             "nothing is annotated: figures of vehicles are null, and methods with annotated tracks have no actors: "
-            "moving objects count as static and smear (docs/without_boxes.md finds them in LiDAR scans); street has "
-            "the parts of vanilla and differs in its losses alone (methods: {street: null} leaves it out)"
+            "moving objects count as static and smear (docs/without_boxes.md finds them in LiDAR scans)"
         )
     elif not any(track.object_class.is_vehicle for track in moving_tracks(scene)):
         found.append(

@@ -112,7 +112,8 @@ class Config(Settings):
     random_seed: int = Field(0, ge=0, lt=2**31)
     """:printed: Random seed of all stages."""
     results_dir: ResultsFolder = "results"
-    """:printed: Folder of all results, ~ for your home folder. Give each experiment a folder of its own."""
+    """:printed: Folder of all results, ~ for your home folder. Give each experiment a folder of its own.
+    Targets begin with it as it is written here: `<results_dir>/0103/metrics.json`."""
 
     @field_validator("accept_nuscenes_terms", mode="before")
     @classmethod

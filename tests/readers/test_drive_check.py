@@ -116,7 +116,8 @@ def test_an_ego_vehicle_that_jumps_is_one_warning(content, folder, capsys):
 
 
 def settings_in(lines: list[str]) -> Content:
-    return yaml.safe_load("\n".join(lines[lines.index("settings to copy:") + 1 :]))
+    first, last = lines.index("settings to copy:"), next(i for i, line in enumerate(lines) if "mine.yaml" in line)
+    return yaml.safe_load("\n".join(lines[first + 1 : last]))
 
 
 def test_the_settings_that_it_ends_with_are_taken(content, folder, capsys):

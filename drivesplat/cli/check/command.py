@@ -24,7 +24,7 @@ from drivesplat.readers.drive_warnings import drive_warnings
 from drivesplat.readers.record_names import counted
 from drivesplat.scene.scene import UNPOSED, Scene
 from drivesplat.scene.scene_warnings import luminance, scene_warnings
-from drivesplat.settings.config import for_scene
+from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.without_boxes import DISCOVERED, DRIFTING, HOW, REPLACED, reason
 from drivesplat.workflow.gpus import any_gpu
 
@@ -97,8 +97,18 @@ def _print_findings(chosen: ChosenScene, checked: CheckedScene) -> bool:
         fit = "settings: those of the config file fit"
         print(f"settings to add:\n\n{as_yaml(lacking)}".rstrip() if lacking else fit)
     else:
-        print(f"settings to copy:\n\n{as_yaml(needed)}", end="")
+        print(f"settings to copy:\n\n{as_yaml(needed)}\n{_next_step(config, chosen.name)}")
     return True
+
+
+def _next_step(config: Config, scene: str) -> str:
+    """How to go on with the settings to copy."""
+    films = " films" if config.cameras else ""
+    return (
+        f"save them as mine.yaml, then: snakemake --cores {len(os.sched_getaffinity(0))} --configfile mine.yaml -- "
+        f"{config.results_dir}/{scene}/metrics.json{films}\n"
+        "(add `train: {iterations: 300}` for a first try)"
+    )
 
 
 def _instead_of_street(methods: list[str]) -> str:

@@ -27,7 +27,9 @@ def expected_costs(chosen: ChosenScene, config: Config, methods: list[str], outl
     cores = len(os.sched_getaffinity(0))
     jobs = list(_planned(config, name, methods, on_gpu, max(1, cores // 2)))
     found = estimate(jobs, Expectations(config, read_costs(results)[0]), Machine(cores, visible_gpus()), results)
-    yield f"metrics of {', '.join(methods)}: {in_one_line(found)}"
+    iterations = sorted({for_scene(config, name, method).train.iterations for method in methods})
+    many = " or ".join(map(str, iterations))
+    yield f"metrics of {', '.join(methods)}, with {many} iterations of training: {in_one_line(found)}"
     config.outlines[name] = outline
     size = image_gb(config, name) or 0.0
     gaussians = max(for_scene(config, name, method).train.cap_max for method in methods) * 1e-6

@@ -16,7 +16,12 @@ from drivesplat.workflow.stages import SCANS, stages_of_metrics, track_stages, t
 from drivesplat.workflow.without_cameras import has_cameras
 from drivesplat.workflow.without_tracks import methods_of
 
-PRESETS = ("presets/people.yaml", "presets/lidar.yaml", "presets/without_boxes.yaml")
+PRESETS = (
+    "presets/people.yaml",
+    "presets/lidar.yaml",
+    "presets/without_boxes.yaml",
+    "presets/people_without_boxes.yaml",
+)
 """Config files that add methods."""
 OWN = ("by default", "of the config file")
 """Sources of methods that are trained without a preset: where settings are proposed, and with a config file."""

@@ -41,8 +41,9 @@ def needed_settings(chosen: ChosenScene, checked: CheckedScene, outline: Outline
     scene = checked.whole
     cameras = [camera.name for camera in scene.cameras if scene.key_frames(camera.name)]
     ahead = {frame.camera: round(float(frame.camera_to_ego[0, 2]), 1) for frame in scene.frames}
+    shipped = {"nuscenes": {"batch": False}} if chosen.dataset == DATASET else {}
     settings: dict[str, Any] = {
-        "datasets": {chosen.dataset: _dataset(chosen)},
+        "datasets": shipped | {chosen.dataset: _dataset(chosen)},
         "cameras": cameras,
         "eval_camera": max(cameras, key=ahead.__getitem__) if cameras else None,
     }

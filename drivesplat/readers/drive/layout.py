@@ -54,7 +54,7 @@ def camera_names(root: Path, version: str) -> list[str]:
             except (AttributeError, OSError, RecursionError, TypeError, ValueError) as error:
                 raise DatasetError(
                     f"{file} names no cameras ({type(error).__name__}: {str(error)[:200]}); "
-                    f"`python -m drivesplat.readers.drive check {file.parent}` lists all of its faults"
+                    f"`drivesplat check {file.parent}` lists all of its faults"
                 ) from error
     return list(names)
 

@@ -22,7 +22,7 @@ from drivesplat.settings.extract import SceneSource
 log = logging.getLogger(__name__)
 
 READER = "drive"
-CHECK = "python -m drivesplat.readers.drive check"
+CHECK = "drivesplat check"
 VISIBILITY_LEVELS = (0.4, 0.6, 0.8)
 """Visible shares at which nuScenes' levels 2, 3 and 4 begin."""
 MIN_TRACK_GAP, MAX_TRACK_GAP, MAX_INTERVALS = 3e5, 1e6, 1.5
