@@ -40,7 +40,7 @@ from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
-from drivesplat.kernels.relocation import relocation
+from drivesplat.kernels.mcmc import relocation
 from drivesplat.machine.device import choose_device
 from drivesplat.model.background import Background
 from drivesplat.model.exposure import Exposures

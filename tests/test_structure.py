@@ -17,6 +17,7 @@ from helpers.structure import (
     package_graph,
     packages,
     sibling_graph,
+    small_modules,
     top,
 )
 from helpers.syntax_trees import source_of, statements, tree_of
@@ -24,6 +25,7 @@ from helpers.syntax_trees import source_of, statements, tree_of
 MAX_PLACES, MAX_LOOSE_MODULES = 27, 2
 MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 9, 18
 MAX_LINES = 400
+MAX_SMALL_MODULES = 15
 SIGNED = packages(LIBRARY, "benchmarks")
 
 
@@ -37,6 +39,7 @@ def test_few_places_are_directly_in_the_library():
 def test_modules_are_short_and_packages_say_what_they_hold():
     long = {name: lines for name in modules() if (lines := len(source_of(modules()[name]).splitlines())) > MAX_LINES}
     assert not long, "a concept is missing: move it to a module of its own"
+    assert len(small_modules()) <= MAX_SMALL_MODULES, "a small module of one user joins it, unless it is a concept"
     assert [package for package, path in SIGNED.items() if not ast.get_docstring(tree_of(path))] == []
 
 

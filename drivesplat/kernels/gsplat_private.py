@@ -15,7 +15,7 @@ from gsplat.strategy import ops
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat.kernels.relocation import relocation
+from drivesplat.kernels.mcmc import relocation
 
 
 def update_parameters(

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.io.storage import unwritable
-from drivesplat.kernels.finite import NEVER, record_not_finite
+from drivesplat.kernels.optimization import NEVER, record_not_finite
 from drivesplat.model.picture import Picture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.views import TrainingView

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from drivesplat.kernels import torch_private
-from drivesplat.kernels.adam import adam_step
+from drivesplat.kernels.optimization import adam_step
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.schedule import Schedule

@@ -10,8 +10,8 @@ from gsplat.strategy import ops
 from torch import Tensor
 from torch.optim import Adam
 
-from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import HookedDefaultStrategy
+from drivesplat.kernels.mcmc import explore
 from drivesplat.model.part import Part
 from drivesplat.training.graphs.preallocation import activate, release_rows, reserve_rows
 from drivesplat.training.schedule import Schedule

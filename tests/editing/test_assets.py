@@ -19,8 +19,7 @@ from PIL import Image
 
 from drivesplat.editing.assets import asset as asset_module
 from drivesplat.editing.assets.asset import LIDAR, Asset, AssetGait, read_asset, write_asset
-from drivesplat.editing.assets.extraction import assets_of
-from drivesplat.editing.assets.stage import write_assets
+from drivesplat.editing.assets.stage import assets_of, write_assets
 from drivesplat.editing.assets.turntable import VIEWS
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians

@@ -20,9 +20,9 @@ from torch import nn
 
 from drivesplat.editing.actors import EditedModel, edited_model
 from drivesplat.editing.assets.asset import NO_INSERTS, Asset, AssetGait, Inserts, write_asset
-from drivesplat.editing.assets.extraction import assets_of
 from drivesplat.editing.assets.inserted import mean_lidar_logits, part_of, with_assets
 from drivesplat.editing.assets.library import digests_of, read_inserts
+from drivesplat.editing.assets.stage import assets_of
 from drivesplat.editing.placed_model import PlacedModel, placed_models
 from drivesplat.editing.render_plan import image_render_plan
 from drivesplat.editing.scans import scan_render_plan

@@ -15,7 +15,7 @@ from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 from torch.cuda import _utils
 
-from drivesplat.kernels.relocation import relocation
+from drivesplat.kernels.mcmc import relocation
 
 LIBRARIES = ("torch", "gsplat", "numba", "triton")
 MODULES = {"drivesplat/kernels/torch_private.py", "drivesplat/kernels/gsplat_private.py"}

@@ -24,15 +24,14 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.kernels import triton_support
-from drivesplat.kernels.adam import adam_step
 from drivesplat.kernels.alpha_entropy import mean_cross_entropy, mean_entropy
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.cube_map import CubeMap, over_cube_map
 from drivesplat.kernels.depth_error import mean_depth_error
-from drivesplat.kernels.exploration import explore
-from drivesplat.kernels.finite import NEVER, record_not_finite
 from drivesplat.kernels.gsplat_private import sh_basis
+from drivesplat.kernels.mcmc import explore
 from drivesplat.kernels.object_poses import corrected
+from drivesplat.kernels.optimization import NEVER, adam_step, record_not_finite
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, colors_in_world, place
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness, sums_of_squares
@@ -138,7 +137,7 @@ def test_the_first_iterations_of_values_that_are_not_finite_agree_with_torch():
 
 
 def test_adam_steps_agree_with_torch():
-    from drivesplat.kernels.triton.adam import adam_step as fused_step
+    from drivesplat.kernels.triton.optimization import adam_step as fused_step
 
     torch.manual_seed(0)
     theirs = torch.randn(400, 3, device=DEVICE)
@@ -514,10 +513,10 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.kernels.triton import adam, alpha_entropy, chunks, color_difference, cube_map, exploration
+from drivesplat.kernels.triton import alpha_entropy, chunks, color_difference, cube_map, exploration
 from drivesplat.kernels.triton import placement, probe, regularizers, tiles, time_varying_colors, view_colors
 from drivesplat.kernels.triton import colored_projection, road_distance
-from drivesplat.kernels.triton import depth_error, finite, joined_chunks, lidar_response, object_poses
+from drivesplat.kernels.triton import depth_error, joined_chunks, lidar_response, object_poses, optimization
 from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_sums
 from drivesplat.kernels.triton import scan_tiles, track_penalties
 
@@ -547,7 +546,7 @@ SCAN |= dict.fromkeys((regularizers._sums, regularizers._spread), SUMS)
 ROAD = {"offsets": FLOATS, "keys": "*i64", "known": "i32", "edge": "fp32", "reach": "fp32", "roughness": "fp32",
         "cells": "*i32"}
 SCAN |= dict.fromkeys((road_distance._distances, road_distance._distances_backward), ROAD)
-SCAN[finite._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
+SCAN[optimization._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
@@ -560,7 +559,7 @@ def compiled(kernel, **constants):
              for name in kernel.arg_names}
     if kernel in (cube_map._blend, cube_map._gradients):
         kinds["pixels"] = "i32"
-    if kernel in (adam._step, chunks._split, joined_chunks._composite, joined_chunks._composite_backward):
+    if kernel in (optimization._step, chunks._split, joined_chunks._composite, joined_chunks._composite_backward):
         kinds["values"] = FLOATS
     kinds |= {name: kind for name, kind in SCAN.get(kernel, {}).items() if name in kinds}
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
@@ -568,8 +567,9 @@ def compiled(kernel, **constants):
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
 
 for module, names in (
-    (probe, "_increment"), (road_distance, "_distances_backward"), (adam, "_step"), (tiles, "_count_tiles _list"),
-    (lidar_response, "_values _values_backward"), (finite, "_record"), (placement, "_place _place_backward"),
+    (probe, "_increment"), (road_distance, "_distances_backward"), (tiles, "_count_tiles _list"),
+    (lidar_response, "_values _values_backward"), (placement, "_place _place_backward"),
+    (optimization, "_record _step"),
     (regularizers, "_sums _means _spread _thinnest _spread_to_thinnest"), (depth_error, "_errors _gradients"),
     (scan_tiles, "_count_tiles _compact _list"), (scan_sums, "_pass"), (scan_compositing, "_arrive"),
     (exploration, "_move"), (cube_map, "_blend _gradients"), (object_poses, "_correct _correct_backward"),

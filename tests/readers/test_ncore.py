@@ -30,8 +30,8 @@ from drivesplat.preprocess.scans import scan_records
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.ncore.calibration import camera_of
 from drivesplat.readers.ncore.layout import camera_names, find_root, outline, table_files
-from drivesplat.readers.ncore.object_classes import object_class
 from drivesplat.readers.ncore.store_metadata import METADATA, store_metadata
+from drivesplat.readers.ncore.tracks import object_class
 from drivesplat.readers.sweeps import read_returns, read_scan
 from drivesplat.scene.lens import pixels_of
 from drivesplat.scene.object_class import ObjectClass

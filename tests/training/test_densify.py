@@ -12,9 +12,8 @@ from helpers.densification import ALL, a_model, a_view, settings_of, train_step
 from helpers.hand_made import actors_of, motion_through, round_gaussians, track_of
 from helpers.samples import sampled
 
-from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import cpu_strategies
-from drivesplat.kernels.relocation import relocation
+from drivesplat.kernels.mcmc import explore, relocation
 from drivesplat.model.actors import Actors
 from drivesplat.model.gaussians import GaussianSets
 from drivesplat.model.picture import Picture

@@ -12,7 +12,7 @@ from helpers.hand_made_truth import depth_values, write_array
 
 from drivesplat.editing.actors import edited_model
 from drivesplat.editing.assets.asset import Asset, Inserts
-from drivesplat.editing.assets.extraction import assets_of
+from drivesplat.editing.assets.stage import assets_of
 from drivesplat.editing.placed_model import placed_models
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.synthetic import DriveTruth

@@ -18,7 +18,7 @@ CHUNK = 4096
 
 @torch.no_grad()
 def explore(params: nn.ParameterDict, strength: float) -> None:
-    """See `drivesplat.kernels.exploration.explore`; all random numbers are drawn from torch's global generator."""
+    """See `drivesplat.kernels.mcmc.explore`; all random numbers are drawn from torch's global generator."""
     means, noise = params["means"], torch.randn_like(params["means"])
     shapes = arrays(params["quats"], params["scales"], params["opacities"])
     parallel_for(_move, len(means), CHUNK, means.numpy(), noise.numpy(), *shapes, strength)

@@ -20,7 +20,7 @@ SEEDS = 2**31
 
 @torch.no_grad()
 def explore(params: nn.ParameterDict, strength: float) -> None:
-    """See `drivesplat.kernels.exploration.explore`; only a seed is drawn from torch's global generator."""
+    """See `drivesplat.kernels.mcmc.explore`; only a seed is drawn from torch's global generator."""
     names = ("means", "quats", "scales", "opacities")
     means, quats, scales, opacities = (params[name] for name in names)
     seed = int(torch.randint(SEEDS, ()))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.optim import Adam
 
 from drivesplat.kernels import gsplat_private
-from drivesplat.kernels.relocation import relocation
+from drivesplat.kernels.mcmc import relocation
 from drivesplat.model.part import Part, preallocate
 
 INACTIVE = -1000.0

@@ -1,8 +1,11 @@
-"""Opacity and scale of Gaussians that MCMC relocates or copies (Kheradmand et al. 2024, equation 9)."""
+"""What MCMC (Kheradmand et al. 2024) does to Gaussians: relocation (equation 9) and the noise with which they explore
+(equation 8)."""
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
+
+from drivesplat.kernels import triton_support
 
 
 def relocation(
@@ -29,3 +32,22 @@ def relocation(
     coefficients = torch.cumsum(binoms.double(), dim=0)[ratios - 1]
     shrink = opacities / (coefficients * series).sum(dim=1).to(opacities.dtype)
     return new_opacities, shrink[:, None] * scales
+
+
+def explore(params: nn.ParameterDict, strength: float) -> None:
+    """Moves `means` (n, 3) at random, as gsplat's `inject_noise_to_position` does: along each Gaussian's own extent,
+    and the farther the lower its opacity.
+
+    `quats` (n, 4), log `scales` (n, 3) and `opacities` (n,), logits, give the distribution, `strength` its factor. The
+    random numbers follow from torch's global generator.
+    """
+    if triton_support.usable_for(params["means"]):
+        from drivesplat.kernels.triton.exploration import explore as move
+    elif params["means"].is_cuda:
+        from gsplat.strategy.ops import inject_noise_to_position
+
+        inject_noise_to_position(params, {}, {}, strength)
+        return
+    else:
+        from drivesplat.kernels.numba.exploration import explore as move
+    move(params, strength)

@@ -1,4 +1,5 @@
-"""One step of Adam (Kingma and Ba 2015, algorithm 1), limited by memory bandwidth alone."""
+"""One step of Adam (Kingma and Ba 2015, algorithm 1), limited by memory bandwidth alone, and the first iterations at
+which values were not finite, in one kernel each."""
 
 import math
 from typing import no_type_check
@@ -11,6 +12,8 @@ from torch import Tensor
 
 BLOCK = 1024
 """Values per program."""
+WATCHED_BLOCK = 128
+"""Watched values per program."""
 
 
 @torch.no_grad()
@@ -23,7 +26,7 @@ def adam_step(
     eps: float,
     broken: Float[Tensor, ""],
 ) -> None:
-    """See `drivesplat.kernels.adam.adam_step`; `gradient` is the parameter's."""
+    """See `drivesplat.kernels.optimization.adam_step`; `gradient` is the parameter's."""
     count = parameter.numel()
     if count == 0:
         return
@@ -54,3 +57,17 @@ def _step(
     tl.store(averages + i, average, mask=inside)
     tl.store(squares + i, square, mask=inside)
     tl.store(values + i, value - size * average / (tl.sqrt(square) / spread + eps), mask=inside)
+
+
+def record(values: Tensor, step: Tensor, first: Tensor) -> None:
+    """`drivesplat.kernels.optimization.record_not_finite`, with `step` on the device."""
+    _record[(triton.cdiv(len(values), WATCHED_BLOCK),)](values, step, first, len(values), WATCHED_BLOCK)
+
+
+@triton.jit(do_not_specialize=["count"])
+@no_type_check
+def _record(values, step, first, count, BLOCK: tl.constexpr):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    known = tl.load(first + i, mask=i < count, other=0)
+    finite = tl.abs(tl.load(values + i, mask=i < count, other=0.0)) < float("inf")  # false for NaN, too
+    tl.store(first + i, tl.where(finite, known, tl.minimum(known, tl.load(step))), mask=i < count)
