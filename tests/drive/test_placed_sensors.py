@@ -15,7 +15,7 @@ from drivesplat.drive import world_state
 from drivesplat.drive.cameras import mounted_velocity
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.drive.world_state import WorldState
-from drivesplat.editing.scans import scan_render_plan
+from drivesplat.editing.scan_folder import scan_render_plan
 from drivesplat.errors import DriveSplatError, RequestError, ResultError
 from drivesplat.lidar.moved_sensor import steady_motion
 from drivesplat.scene.lens import directions, pixels_of

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import drivesplat
 from drivesplat.cli.__main__ import main
-from drivesplat.drive.pose_files import read_poses
+from drivesplat.drive.render_files import read_poses
 from drivesplat.errors import RequestError
 from drivesplat.readers.truth import DEPTH_UNITS_PER_METRE
 from drivesplat.scene.rigid import rigid

@@ -25,7 +25,7 @@ from drivesplat.editing.assets.library import digests_of, read_inserts
 from drivesplat.editing.assets.stage import assets_of
 from drivesplat.editing.placed_model import PlacedModel, placed_models
 from drivesplat.editing.render_plan import image_render_plan
-from drivesplat.editing.scans import scan_render_plan
+from drivesplat.editing.scan_folder import scan_render_plan
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.storage import sha256_file
 from drivesplat.model.gaussians import Gaussians

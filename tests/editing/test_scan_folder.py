@@ -12,8 +12,7 @@ from helpers.hand_made_street import AHEAD, DRIVERS, GONE, TURNING, checkpoint_o
 from helpers.scanned_street import LIDAR_LOGITS, SPEED, UNMEASURED, WALL_AT, parked_truck, scan_records, scanned_street
 from plyfile import PlyData
 
-from drivesplat.editing.scan_folder import write_scan_folder
-from drivesplat.editing.scans import ScanRenderPlan, SimulatedScan, scan_render_plan
+from drivesplat.editing.scan_folder import ScanRenderPlan, SimulatedScan, scan_render_plan, write_scan_folder
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.scans import scan_of

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from drivesplat.export import depth_fusion
-from drivesplat.export.depth_fusion import DepthImage, fused_mesh, without_small_pieces
+from drivesplat.export import drive_mesh
+from drivesplat.export.drive_mesh import DepthImage, fused_mesh, without_small_pieces
 from drivesplat.io.triangle_mesh import TriangleMesh
 from drivesplat.model.height_field import HeightField
 
@@ -111,7 +111,7 @@ def test_the_ground_closes_what_no_image_shows():
 def test_too_many_blocks_make_the_voxels_coarser(monkeypatch):
     images = [image_of_ball(place) for place in around(6.0, 16)]
     fine = fused_mesh(images, EDGE)
-    monkeypatch.setattr(depth_fusion, "MAX_BLOCKS", 30)
+    monkeypatch.setattr(drive_mesh, "MAX_BLOCKS", 30)
     coarse = fused_mesh(images, EDGE)
     assert 0 < len(coarse) < 0.75 * len(fine)
     assert np.abs(np.linalg.norm(coarse.vertices, axis=1) - RADIUS).max() < 0.5

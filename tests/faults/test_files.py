@@ -227,7 +227,7 @@ NO_RESULTS = {
     "runs.py": "what Snakemake says, as it says it",
     "nuscenes_mini.py": "a lock",
     "file_lock.py": "a lock",
-    "syntax_digest.py": "a cache; a truncated entry is computed again",
+    "code_digest.py": "a cache; a truncated entry is computed again",
     "fetch.py": "a download, which is checked before it counts",
     "reader.py": "tables of one scene in a temporary folder",
     "scene_tables.py": "files in the making in a temporary folder, which go that way when whole",

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from drivesplat.lidar.objects.boxes import Discovered
+from drivesplat.lidar.objects.boxes import Discovered, smooth_path
 from drivesplat.lidar.objects.clusters import Chain, Cluster
 from drivesplat.lidar.objects.discover import least_misfit, misfit, misfit_along
-from drivesplat.lidar.objects.smoothing import smooth_path
 from drivesplat.scene.object_class import ObjectClass
 
 GRID = np.stack(np.meshgrid([0.0], np.arange(0.0, 1.8, 0.1), np.arange(0.4, 1.5, 0.2)), axis=-1).reshape(-1, 3)

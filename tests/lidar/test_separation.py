@@ -3,11 +3,10 @@
 import numpy as np
 from helpers.street_scans import Mover, street_scans
 
-from drivesplat.lidar.objects.boxes import Discovered
+from drivesplat.lidar.objects.boxes import Discovered, smooth_path
 from drivesplat.lidar.objects.clusters import Chain, Cluster
 from drivesplat.lidar.objects.discover import continues, discovered
 from drivesplat.lidar.objects.separation import beyond, separated
-from drivesplat.lidar.objects.smoothing import smooth_path
 from drivesplat.scene.object_class import ObjectClass
 
 SECONDS = 0.1 * np.arange(45)

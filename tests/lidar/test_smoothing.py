@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivesplat.lidar.objects.smoothing import smooth_path
+from drivesplat.lidar.objects.boxes import smooth_path
 
 SECONDS = 0.1 * np.arange(50)
 

@@ -3,9 +3,8 @@
 import numpy as np
 from helpers.street_scans import Mover, street_scans
 
-from drivesplat.lidar.objects.boxes import Discovered
+from drivesplat.lidar.objects.boxes import Discovered, smooth_path
 from drivesplat.lidar.objects.clusters import Cluster
-from drivesplat.lidar.objects.smoothing import smooth_path
 from drivesplat.lidar.objects.standing import StandingMap
 from drivesplat.scene.object_class import ObjectClass
 

@@ -12,9 +12,8 @@ from drivesplat.errors import DatasetError, ResultError
 from drivesplat.lidar.objects import tracks
 from drivesplat.lidar.objects.boxes import Discovered
 from drivesplat.lidar.objects.discover import discovered
-from drivesplat.lidar.objects.quality import tracks_quality
 from drivesplat.lidar.objects.record import DiscoveredTracks, read_discovered, write_discovered
-from drivesplat.lidar.objects.tracks import discovered_tracks, searched, tracks_of
+from drivesplat.lidar.objects.tracks import discovered_tracks, searched, tracks_of, tracks_quality
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import RecordedScan, ScanRecords
 from drivesplat.scene.scene import Scene, Track

@@ -12,10 +12,9 @@ from helpers.samples import sampled, sampled_with
 
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.model.build import ModelInit, build_model, definitions, rebuild_model
-from drivesplat.model.deformable import Deformable
+from drivesplat.model.deformable import Deformable, Lattice, Undeformed, roughness
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.harmonics import rotated
-from drivesplat.model.lattice import Lattice, Undeformed, roughness
 from drivesplat.model.states import SCAN, ActorPlacement, State
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.deformable import GaitSettings, LatticeSettings

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.preprocess.poses.from_sweeps import align_sweeps
+from drivesplat.preprocess.poses.from_sweeps import align_sweeps, pairs_of
 from drivesplat.preprocess.poses.refinement import refine_or_keep
-from drivesplat.preprocess.poses.registration import pairs_of
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.settings.refine_poses import RefinePosesJob

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.preprocess.poses.from_images import align_poses
-from drivesplat.preprocess.poses.scale import depth_at, enough_from_lidar, scale_drift
+from drivesplat.preprocess.poses.from_images import align_poses, depth_at, enough_from_lidar, scale_drift
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.refine_poses import PriorSettings
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from drivesplat.provenance.code import syntax_digest as module
-from drivesplat.provenance.code.syntax_digest import cached_digest, canonical_tree, syntax_digest
+from drivesplat.provenance.code import code_digest as module
+from drivesplat.provenance.code.code_digest import cached_digest, canonical_tree, syntax_digest
 
 CODE = 'import a.b\nfrom . import c\nfrom ..d import e as f\n\nNAME = "g.h"\nWORDS = "i. j"\n'
 

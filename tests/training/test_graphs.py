@@ -30,9 +30,9 @@ from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
-from drivesplat.training.graphs import iteration_graphs
+from drivesplat.training.graphs import captured_steps
+from drivesplat.training.graphs.captured_steps import GaussianCount, IterationGraphs, Recording, can_capture
 from drivesplat.training.graphs.inputs import ScanInputs, SharedImageInputs, SharedScanInputs, can_share
-from drivesplat.training.graphs.iteration_graphs import GaussianCount, IterationGraphs, Recording, can_capture
 from drivesplat.training.loop import Trainer
 from drivesplat.training.losses import depth_loss, loss_terms
 from drivesplat.training.scans import TrainingScan, load_scans, scan_terms
@@ -165,7 +165,7 @@ def test_which_trainings_capture_graphs(settings, device, compiles, scans, expec
     """None with classes, or with more recordings than the limit."""
     monkeypatch.setattr(triton_support, "compiles", lambda: compiles)
     views, chosen, place = guided_views(), TrainSettings(**settings), torch.device(device)
-    monkeypatch.setattr(iteration_graphs, "MAX_RECORDINGS", len(views) + 1)
+    monkeypatch.setattr(captured_steps, "MAX_RECORDINGS", len(views) + 1)
     assert can_capture(chosen, images_of(views), place, scans=scans) == expected
     labelled = [dataclasses.replace(view, classes=torch.zeros_like(view.sky, dtype=torch.uint8)) for view in views]
     assert not can_capture(chosen, images_of(labelled), place)

@@ -17,7 +17,7 @@ from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.settings.train_geometry import RoadSettings
 from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier
-from drivesplat.training.graphs.iteration_graphs import IterationGraphs
+from drivesplat.training.graphs.captured_steps import IterationGraphs
 from drivesplat.training.losses import loss_terms, surface_terms
 from drivesplat.training.optimizers import Optimizers, make_optimizers
 from drivesplat.training.road import driven_road

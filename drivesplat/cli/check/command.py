@@ -1,15 +1,14 @@
-"""What `drivesplat check` does and prints."""
+"""What `drivesplat check` does and prints, and what the methods of a recording cost on this machine."""
 
 import argparse
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 from drivesplat.cli.check.chosen import ChosenScene, chosen_scene, config_of
 from drivesplat.cli.check.contents import contents, lacks, outline_of, sweep_columns
-from drivesplat.cli.check.expected_costs import expected_costs
 from drivesplat.cli.check.fitness import OWN, verdicts
 from drivesplat.cli.check.needed_settings import as_yaml, lacking_settings, needed_settings
 from drivesplat.cli.check.reading import CheckedScene, read_recording
@@ -18,18 +17,28 @@ from drivesplat.preprocess.intrinsics import intrinsics_warnings
 from drivesplat.preprocess.undistort import distortion_fault, undistorted
 from drivesplat.readers.by_name import dataset_module, has_module
 from drivesplat.readers.check_picture import write_picture
-from drivesplat.readers.datasets import layout
+from drivesplat.readers.datasets import layout, unpacker
 from drivesplat.readers.drive.format import grouped
 from drivesplat.readers.drive_warnings import drive_warnings
+from drivesplat.readers.outline import Outline
 from drivesplat.readers.record_names import counted
 from drivesplat.scene.scene import UNPOSED, Scene
 from drivesplat.scene.scene_warnings import luminance, scene_warnings
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.without_boxes import DISCOVERED, DRIFTING, HOW, REPLACED, reason
-from drivesplat.workflow.gpus import any_gpu
+from drivesplat.workflow.costs.estimate import Expectations, Machine, PlannedJob, estimate, in_one_line
+from drivesplat.workflow.costs.measured import JobId, read_costs
+from drivesplat.workflow.gpus import any_gpu, visible_gpus
+from drivesplat.workflow.recording_faults import image_gb
+from drivesplat.workflow.stages import TRAIN, stages_of_metrics, track_stages, training_inputs
 
 EXAMINE = "drivesplat.readers.*.check"
 """The module of a reader that lists every fault of a recording, where there is more to it than reading it."""
+BASE_GB, GB_PER_MILLION = 1.5, 1.2
+"""GPU memory of a training of `street` without its images: in all, and for each million Gaussians (docs/measured.md,
+presets)."""
+BYTES_PER_GAUSSIAN = 400
+"""Of a method's checkpoint and exported files, about."""
 
 
 def run_check(asked: argparse.Namespace) -> int:
@@ -157,3 +166,45 @@ def memory_gb() -> float:
             if torch.cuda.is_available():
                 return torch.cuda.mem_get_info()[1] * 1e-9
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 1e-9
+
+
+def expected_costs(chosen: ChosenScene, config: Config, methods: list[str], outline: Outline) -> Iterator[str]:
+    """Sentences about the cost of metrics.json for some methods of a config, on this machine."""
+    results, on_gpu, name = Path(config.results_dir), any_gpu(), chosen.name
+    cores = len(os.sched_getaffinity(0))
+    jobs = list(_planned(config, name, methods, on_gpu, max(1, cores // 2)))
+    found = estimate(jobs, Expectations(config, read_costs(results)[0]), Machine(cores, visible_gpus()), results)
+    iterations = sorted({for_scene(config, name, method).train.iterations for method in methods})
+    many = " or ".join(map(str, iterations))
+    yield f"metrics of {', '.join(methods)}, with {many} iterations of training: {in_one_line(found)}"
+    config.outlines[name] = outline
+    size = image_gb(config, name) or 0.0
+    gaussians = max(for_scene(config, name, method).train.cap_max for method in methods) * 1e-6
+    kind = "GPU memory" if on_gpu else "main memory, without a GPU"
+    yield (
+        f"a training takes about {BASE_GB + GB_PER_MILLION * gaussians + size:.1f} GB of {kind}, of which its images "
+        f"take {size:.1f} GB; images.width and train.cap_max lower it"
+    )
+    written = _unpacked_bytes(chosen) + len(methods) * gaussians * 1e6 * BYTES_PER_GAUSSIAN
+    yield f"results take very roughly {written * 1e-9:.1f} GB at most in {results}/"
+
+
+def _planned(config: Config, name: str, methods: list[str], on_gpu: bool, threads: int) -> Iterator[PlannedJob]:
+    """The jobs behind a scene's metrics.json."""
+    of_scene, of_method = stages_of_metrics(config, name)
+    more = [s for m in methods for s in (*training_inputs(config, name, m), *track_stages(config, name, m))]
+    for stage in dict.fromkeys((*of_scene, *more)):
+        yield PlannedJob(JobId(stage, name), 1, False)
+    for method in methods:
+        for stage in of_method:
+            yield PlannedJob(JobId(stage, name, method), threads, on_gpu and stage == TRAIN)
+
+
+def _unpacked_bytes(chosen: ChosenScene) -> float:
+    """Bytes of the images and sweeps that a reader writes as files of their own: those of its recording, about."""
+    if unpacker(chosen.reader) is None:
+        return 0.0
+    files = layout(chosen.reader).table_files(chosen.root, chosen.version, chosen.name)
+    folders = {file if file.is_file() and file.suffix != "" else file.parent for file in files}
+    every = (file for place in folders for file in ([place] if place.is_file() else place.rglob("*")))
+    return float(sum(file.stat().st_size for file in every if file.is_file()))
