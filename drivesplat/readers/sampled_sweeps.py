@@ -1,5 +1,6 @@
 """A few sweeps of a drive in the world, by which the checks compare its poses, boxes and images."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,19 +26,25 @@ class SampledSweep(NamedTuple):
     offsets_s: Float64[np.ndarray, " n"]
 
 
-def sampled_sweeps(scene: Scene) -> list[SampledSweep]:
-    """PAIRS pairs of sweeps of each LiDAR, in the order of time; sweeps without a sound file are left out."""
-    found = []
+def pairs_of_sweeps(scene: Scene, sweeps: Iterable[Sweep]) -> list[Sweep]:
+    """Of these sweeps PAIRS pairs of each LiDAR of a scene, in the order of time."""
+    chosen, found = list(sweeps), []
     for lidar in scene.lidars:
-        own = [sweep for sweep in scene.sweeps if sweep.lidar == lidar.name and Path(sweep.path).is_file()]
-        own.sort(key=lambda sweep: sweep.timestamp)
+        own = sorted((s for s in chosen if s.lidar == lidar.name), key=lambda sweep: sweep.timestamp)
         times = np.array([sweep.timestamp for sweep in own])
         firsts = np.linspace(0, len(own) - 1, PAIRS).round().astype(int) if own else np.zeros(0, dtype=int)
         seconds = np.minimum(np.searchsorted(times, times[firsts] + PAIR_US), len(own) - 1) if own else firsts
-        for sweep in (own[i] for i in np.union1d(firsts, seconds)):
-            if (returns := sound_returns(sweep)) is not None:
-                offsets = np.zeros(len(returns.points)) if returns.offsets_s is None else returns.offsets_s
-                found.append(SampledSweep(sweep, apply(sweep.sensor_to_world, returns.points), offsets))
+        found += [own[i] for i in np.union1d(firsts, seconds)]
+    return found
+
+
+def sampled_sweeps(scene: Scene) -> list[SampledSweep]:
+    """Pairs of sweeps, as `pairs_of_sweeps` chooses them, of those with a sound file."""
+    found = []
+    for sweep in pairs_of_sweeps(scene, (sweep for sweep in scene.sweeps if Path(sweep.path).is_file())):
+        if (returns := sound_returns(sweep)) is not None:
+            offsets = np.zeros(len(returns.points)) if returns.offsets_s is None else returns.offsets_s
+            found.append(SampledSweep(sweep, apply(sweep.sensor_to_world, returns.points), offsets))
     return found
 
 

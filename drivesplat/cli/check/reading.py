@@ -1,7 +1,7 @@
 """Reads the recording that is checked: all of its records, and the files of as many recordings as the checks need."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +12,8 @@ from drivesplat.cli.check.chosen import ChosenScene
 from drivesplat.errors import DatasetError
 from drivesplat.readers.datasets import index, layout, missing_package, reader, reads_unposed, unpacker
 from drivesplat.readers.recorded_files import faults_of_images, faults_of_sweeps, said_once
-from drivesplat.readers.sampled_sweeps import PAIR_US, PAIRS
-from drivesplat.scene.scene import Frame, Scene, Sweep
+from drivesplat.readers.sampled_sweeps import pairs_of_sweeps
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.extract import SceneSource
 
 SPREAD = 12
@@ -48,7 +48,9 @@ def read_recording(chosen: ChosenScene, folder: Path) -> CheckedScene:
     files = unpacker(chosen.reader)
     if files is None:
         return _with_files(scene, scene)
-    sample = dataclasses.replace(scene, frames=tuple(_sampled_frames(scene)), sweeps=tuple(_sampled_sweeps(scene)))
+    sample = dataclasses.replace(
+        scene, frames=tuple(_sampled_frames(scene)), sweeps=tuple(pairs_of_sweeps(scene, scene.sweeps))
+    )
     sample = files.unpack(sample, chosen.root, _source(chosen, cameras), folder)
     images = {frame.token: frame for frame in sample.frames}
     sweeps = {sweep.token: sweep for sweep in sample.sweeps}
@@ -111,20 +113,10 @@ def _with_files(scene: Scene, sample: Scene, opened: tuple[int, int] | None = No
     return CheckedScene(scene, at_hand, said, list(filter(None, of_sweeps)), opened)
 
 
-def _sampled_sweeps(scene: Scene) -> Iterator[Sweep]:
-    """Of each LiDAR pairs of sweeps, as the checks compare them."""
-    for lidar in scene.lidars:
-        own = sorted((s for s in scene.sweeps if s.lidar == lidar.name), key=lambda sweep: sweep.timestamp)
-        times = np.array([sweep.timestamp for sweep in own])
-        firsts = np.linspace(0, len(own) - 1, PAIRS).round().astype(int) if own else np.zeros(0, dtype=int)
-        seconds = np.minimum(np.searchsorted(times, times[firsts] + PAIR_US), len(own) - 1) if own else firsts
-        yield from (own[i] for i in np.union1d(firsts, seconds))
-
-
 def _sampled_frames(scene: Scene) -> list[Frame]:
     """Of each camera images from the first to the last, those nearest to the sampled sweeps, and those by which its
     lens is judged."""
-    times = sorted({sweep.timestamp for sweep in _sampled_sweeps(scene)})
+    times = sorted({sweep.timestamp for sweep in pairs_of_sweeps(scene, scene.sweeps)})
     found: dict[str, Frame] = {}
     for camera in scene.cameras:
         own = sorted((f for f in scene.frames if f.camera == camera.name), key=lambda frame: frame.timestamp)
