@@ -45,10 +45,6 @@ def with_rest(colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "_ 3"]:
     return np.concatenate([colors, np.full((1, 3), GREY, dtype=np.uint8)])
 
 
-def _depth(view: DriveView) -> Picture:
-    return depth_picture(view.arrays()["depth"])
-
-
 def _alpha(view: DriveView) -> Picture:
     grey = (255.0 * view.arrays()["alpha"].clip(0.0, 1.0)).round().astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=2)
@@ -56,7 +52,7 @@ def _alpha(view: DriveView) -> Picture:
 
 PICTURES: dict[str, tuple[str, Callable[[DriveView], Picture]]] = {
     "colour": ("rgb", lambda view: view.image),
-    "depth": ("depth", _depth),
+    "depth": ("depth", lambda view: depth_picture(view.arrays()["depth"])),
     "opacity": ("alpha", _alpha),
     "objects": ("instance", lambda view: with_rest(name_colors(view.objects))[view.arrays()["instance"]]),
     "classes": ("semantic", lambda view: number_colors(len(view.classes))[view.arrays()["semantic"]]),

@@ -22,26 +22,14 @@ class Encoding:
     quality: int
 
 
-def _jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    return _by_opencv(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def _png(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    return _by_opencv(".png", image, [])
-
-
-def _planar(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    return np.moveaxis(image, -1, 0).tobytes()
-
-
-def _by_opencv(suffix: str, image: np.ndarray, options: list[int]) -> bytes:
+def _by_opencv(suffix: str, image: np.ndarray, *options: int) -> bytes:
     return cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)[1].tobytes()
 
 
 FORMATS: dict[int, Callable[[UInt8[np.ndarray, "h w 3"], int], bytes]] = {
-    wire.ImageFormat.PNG: _png,
-    wire.ImageFormat.JPEG: _jpeg,
-    wire.ImageFormat.RGB_UINT8_PLANAR: _planar,
+    wire.ImageFormat.PNG: lambda image, _: _by_opencv(".png", image),
+    wire.ImageFormat.JPEG: lambda image, quality: _by_opencv(".jpg", image, cv2.IMWRITE_JPEG_QUALITY, quality),
+    wire.ImageFormat.RGB_UINT8_PLANAR: lambda image, _: np.moveaxis(image, -1, 0).tobytes(),
 }
 """The formats that are served: what encodes an image (h, w, 3), red first, at a quality."""
 

@@ -55,7 +55,8 @@ class Densifier:
             return  # no Gaussian is left to grow from; other parts of the model may continue
         self._strategy.cap_max = self._coarse_cap if coarse and step < self._coarse_until else self._cap
         if self._by_gradient:
-            info = _info_of_rows(info, rows)
+            gradient = info["means2d"].grad  # the strategy reads no more of `means2d`
+            info = {**info, "means2d": SimpleNamespace(grad=gradient[:, rows]), "radii": info["radii"][:, rows]}
         extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}
         with nullcontext() if params["means"].is_cuda else self._on_cpu():
             self._strategy.step_post_backward(params, optimizers, self.state, step, info, **extra)
@@ -81,9 +82,3 @@ def coarse_cap(cap: int, schedule: Schedule) -> tuple[int, int]:
         return cap, 0
     steps = math.ceil(-math.log(fraction) / math.log1p(GROWTH)) + 1
     return max(1, int(fraction * cap)), schedule.step_at(settings.refine_stop) - steps * every
-
-
-def _info_of_rows(info: dict[str, Any], rows: slice) -> dict[str, Any]:
-    """The `info` of a rendering for gsplat's DefaultStrategy, of some rows only."""
-    gradient = info["means2d"].grad
-    return {**info, "means2d": SimpleNamespace(grad=gradient[:, rows]), "radii": info["radii"][:, rows]}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.io.prefetch import prefetch
 from drivesplat.readers.drive.bag.bag_file import BagFile, BagMessage, header_stamp, microseconds
-from drivesplat.readers.drive.bag.bag_map import BagCamera, BagLidar, BagMap, Calibration
+from drivesplat.readers.drive.bag.bag_map import BagCamera, BagMap, Calibration
 from drivesplat.readers.drive.bag.clouds import sweep_columns
 from drivesplat.readers.drive.bag.images import EncodedImage, image_file
 from drivesplat.readers.drive.bag.transforms import EgoTrack
@@ -91,7 +92,6 @@ class SensorRecordings:
         return WrittenFile(self, timestamp, name)
 
     def add(self, file: WrittenFile) -> None:
-        """Counts a file."""
         if file.fault:
             self._count_damage(file.fault)
         else:
@@ -151,7 +151,7 @@ def recordings_of(bag_map: BagMap, calibrations: dict[str, Calibration]) -> dict
         convert = _camera_converter(calibrations[name], bag_map.raw_images, camera)
         found[name] = SensorRecordings(name, "image", f"images/{name}", shift, convert)
     for name, lidar in bag_map.lidars.items():
-        found[name] = SensorRecordings(name, "sweep", f"sweeps/{name}", 0, _lidar_converter(lidar))
+        found[name] = SensorRecordings(name, "sweep", f"sweeps/{name}", 0, partial(sweep_columns, lidar=lidar))
     return found
 
 
@@ -169,10 +169,6 @@ def _camera_converter(calibration: Calibration, raw: str, camera: BagCamera) -> 
         return file
 
     return convert
-
-
-def _lidar_converter(lidar: BagLidar) -> Callable[[Any], dict[str, np.ndarray]]:
-    return lambda message: sweep_columns(message, lidar)
 
 
 def unposed_sentence(recordings: Sequence[SensorRecordings]) -> str | None:
