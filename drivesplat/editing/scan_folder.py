@@ -126,7 +126,6 @@ def _written(folder: Path, found: SimulatedScan, formats: Sequence[ScanFormat], 
 
 
 def write_rays(path: Path, found: SimulatedScan, _: list[str]) -> None:
-    """Writes all rays as .npz."""
     sensor, rays, rendered = found.sensor, found.sensor.scan.rays, found.rendered
     with atomic_write(path) as file:
         np.savez_compressed(

@@ -72,7 +72,6 @@ class PlacedBox:
 
     @cached_property
     def pose(self) -> Any:
-        """The pose as a message."""
         return _pose(self.object_to_map)
 
 

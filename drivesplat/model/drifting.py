@@ -99,7 +99,6 @@ class Drifting(Part):
         )
 
     def _opacities(self, time: Float[Tensor, ""]) -> Float[Tensor, " n"]:
-        """The opacities at a time."""
         ages = (time - self.params["peaks"]) / self.life_spans
         life = torch.where(ages.abs() >= LIFE_ENDS, 0.0, torch.exp(-0.5 * ages.square()))  # NaN stays NaN
         return torch.sigmoid(self.params["opacities"]) * life

@@ -69,7 +69,6 @@ class Timeline:
 
     @property
     def actor_of_annotations(self) -> Int[Tensor, " m"]:
-        """The index of the actor of each annotation."""
         counts = torch.tensor([len(track.motion.times) for track in self.tracks])
         return torch.repeat_interleave(torch.arange(len(counts)), counts)
 

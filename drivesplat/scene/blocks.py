@@ -67,7 +67,6 @@ def within(timestamps: Int64[np.ndarray, " n"], intervals: Int64[np.ndarray, "i 
 
 
 def write_blocks(path: str | Path, blocks: Blocks) -> None:
-    """Writes blocks.json."""
     write_typed_json(path, blocks, SCHEMA)
 
 

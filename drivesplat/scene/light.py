@@ -79,7 +79,6 @@ def contact_shadow(points: Float[np.ndarray, "n 3"], size: Float[np.ndarray, "n 
 
 
 def write_light(path: str | Path, light: SceneLight, provenance: Provenance) -> None:
-    """Writes light.json."""
     write_json(path, {"schema": 1, **asdict(light), "provenance": provenance})
 
 

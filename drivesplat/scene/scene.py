@@ -174,7 +174,6 @@ def place_of(recording: Frame | Sweep) -> str:
 
 
 def write_scene(path: str | Path, scene: Scene) -> None:
-    """Writes `scene.json`."""
     write_typed_json(path, scene, SCHEMA)
 
 

@@ -81,7 +81,6 @@ class TrainingRecord:
 
     @property
     def train_images(self) -> list[int]:
-        """The indices of the training images."""
         return self.splits["train"].tolist()
 
     @property

@@ -31,7 +31,6 @@ class ServiceFigures:
         self._rpc.labels(rpc, code).observe(seconds)
 
     def encoded(self, image_format: str, size: int) -> None:
-        """Counts an image."""
         self._images.labels(image_format).inc()
         self._bytes.labels(image_format).inc(size)
 

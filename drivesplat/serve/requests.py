@@ -61,7 +61,6 @@ class ImageRequest:
 
     @property
     def pixels(self) -> int:
-        """Of the image."""
         return self.camera.width * self.camera.height
 
     def placed(self, time: float) -> PlacedCamera:

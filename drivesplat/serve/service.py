@@ -87,7 +87,6 @@ class SensorService:
         return wire.VersionId(version_id=f"drivesplat {self.options.version}", grpc_api_version=version)
 
     def get_available_scenes(self, request: Any, active: IsActive) -> Any:
-        """The ids of all scenes."""
         return wire.AvailableScenesReturn(scene_ids=scene_ids(self._sources))
 
     def get_loaded_scenes(self, request: Any, active: IsActive) -> Any:
@@ -139,7 +138,6 @@ class SensorService:
     # ---- images and scans
 
     def render_rgb(self, request: Any, active: IsActive) -> Any:
-        """One image."""
         (image,) = self._images([request], active)
         return wire.RGBRenderReturn(image_bytes=_or_raise(image))
 

@@ -346,7 +346,6 @@ class Step(Settings):
 
     @property
     def change(self) -> Change:
-        """The change of the step."""
         return getattr(self, self.kind)
 
     @property

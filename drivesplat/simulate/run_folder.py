@@ -87,7 +87,6 @@ class _Recorder:
         self._sweeps: list[Sweep] = []
 
     def note(self, now: Simulation) -> None:
-        """Measures."""
         self.times.append(self._start + round(now.time * 1e6))
         world = now.world()
         if now.cameras:

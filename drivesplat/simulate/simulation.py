@@ -199,7 +199,6 @@ class Simulation:
         return float(values[0]), float(values[1])
 
     def _recorded_state(self, time: float) -> VehicleState:
-        """The state of the recorded vehicle."""
         first, last = self._driven_span
         times = np.clip(time + np.array([0.0, -PATH_S, PATH_S]), first, last)
         now, before, after = self.drive.ego_path(times)

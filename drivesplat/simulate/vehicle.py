@@ -45,7 +45,6 @@ class VehicleState:
 
 
 def shape_of(settings: VehicleSettings) -> VehicleShape:
-    """The shape of a vehicle of the settings."""
     return VehicleShape(
         settings.length, settings.width, settings.height, settings.wheelbase, settings.rear_overhang
     )  # fmt: skip

@@ -25,7 +25,6 @@ class TrainingImages:
         self._factor, self._reduced = 1, views
 
     def at(self, step: int) -> TrainingView:
-        """The image of a step."""
         factor = self.factor(step)
         if factor != self._factor:
             self._reduced = self.views if factor == 1 else [reduced(view, factor) for view in self.views]

@@ -35,11 +35,9 @@ class Schedule:
 
     @property
     def steps(self) -> int:
-        """The number of all steps."""
         return self.fine_tuning_from + self.fine_tuning
 
     def fits_scan(self, step: int) -> bool:
-        """Whether a step fits a scan."""
         return self.scans_before(step + 1) > self.scans_before(step)
 
     def scans_before(self, step: int) -> int:

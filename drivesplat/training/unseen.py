@@ -149,7 +149,6 @@ class _TexelColors:
         self._sums = torch.zeros(len(self._texels), 4).to(self._texels)
 
     def add(self, model: SplatModel, view: TrainingView, shown: _Shown) -> None:
-        """Adds a view and what the model shows in it."""
         alpha, seen_from = shown.alpha, model.seen_from(view.view)
         unmasked = torch.ones_like(alpha)
         for mask in (view.ego_mask, view.moving):

@@ -157,8 +157,6 @@ def _paced(path: ActorPath, clock: Clock, start: float) -> ActorPath:
 def _added_offsets(
     path: ActorPath, added: Callable[[np.ndarray], dict[str, np.ndarray]]
 ) -> Callable[[np.ndarray], PathOffsets]:
-    """The offsets of `path` plus those `added`."""
-
     def offsets(times: np.ndarray) -> PathOffsets:
         before = path.offsets(times)
         return replace(before, **{name: getattr(before, name) + value for name, value in added(times).items()})

@@ -83,7 +83,6 @@ class LidarFrames:
         self._background = self._drawn_background(scans[0], title)
 
     def frame(self, recorded: RecordedScan, rendered: RenderedScan) -> UInt8[np.ndarray, "h w 3"]:
-        """The frame of a recorded scan and its rendering."""
         frame, scan, measured, ahead = self._background.copy(), recorded.scan, recorded.measured, self._ahead
         beams, firings = shown_order(scan.rays, ahead)
         for place, ranges, returned in (

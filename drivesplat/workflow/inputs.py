@@ -155,7 +155,6 @@ class Inputs:
         return self.scene(wildcards, shown=True)
 
     def shown_masks(self, wildcards: Any) -> str:
-        """The masks of these tracks."""
         return self._of(self.tracks(wildcards, shown=True), wildcards, "masks/masks.json")
 
     @property
@@ -247,7 +246,6 @@ class Inputs:
         return [f"{self.config.results_dir}/{wildcards.scene}/{SCANS}.npz"] if rendered else []
 
     def renders_lidar(self, scene: str, method: str) -> bool:
-        """Whether a method renders the LiDAR of a scene."""
         return SCANS in training_inputs(self.config, scene, method)
 
     def scan_baselines(self, wildcards: Any) -> list[str]:

@@ -113,7 +113,6 @@ class Outputs(Inputs):
 
     @property
     def methods_with_lidar_in_any_scene(self) -> list[str]:
-        """The methods that render the LiDAR of any scene."""
         methods = self.config.all_methods
         return [name for name in methods if any(self.renders_lidar(scene, name) for scene in self._first_scenes)]
 

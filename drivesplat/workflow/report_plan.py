@@ -33,7 +33,6 @@ class ReportPlan:
 
     @property
     def scenes(self) -> list[str]:
-        """Its scenes."""
         scenes = self._plan.config.batch_scenes
         if not self._alone:
             return scenes

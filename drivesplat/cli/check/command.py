@@ -135,7 +135,6 @@ def _section(title: str, lines: Iterable[str]) -> None:
 
 
 def _about_picture(scene: Scene, picture: Path) -> str:
-    """Where the picture is, and what to look at."""
     boxes = scene.tracks and scene.poses != UNPOSED
     seen = ["returns must lie on surfaces, also those of other times"] if scene.frames and scene.sweeps else []
     seen += ["boxes around objects" if seen else "boxes must lie around objects"] if boxes else []

@@ -69,7 +69,6 @@ def _fault(config: Config, outline: Outline, name: str, method: str) -> str | No
 
 
 def _notes(config: Config, scene: Scene, name: str, method: str) -> Iterator[str]:
-    """What a method makes of a scene."""
     settings, found = config.all_methods[method], for_scene(config, name, method)
     moving = moving_tracks(scene)
     if settings.tracks == "discovered":

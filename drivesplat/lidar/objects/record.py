@@ -25,7 +25,6 @@ class DiscoveredTracks:
 
 
 def write_discovered(path: str | Path, record: DiscoveredTracks) -> None:
-    """Writes discovered.json."""
     write_typed_json(path, record, SCHEMA)
 
 

@@ -173,7 +173,6 @@ def compiler(facts: Facts) -> Iterator[Finding]:
 
 
 def config(facts: Facts) -> Iterator[Finding]:
-    """The configuration."""
     if facts.config_problem:
         yield fix("config", facts.config_problem)
     elif facts.config:

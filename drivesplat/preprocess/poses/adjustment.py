@@ -151,7 +151,6 @@ def poses_of(reconstruction: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def observations_of(reconstruction: pycolmap.Reconstruction) -> Observations:
-    """All observations of a reconstruction."""
     numbers = sorted(reconstruction.points3D)
     index = {number: i for i, number in enumerate(numbers)}
     rows: list[tuple[int, int, float]] = []

@@ -77,7 +77,6 @@ def match_pairs(numbers: list[tuple[int, int]], job: RefinePosesJob, database: P
 
 
 def image_name(number: int) -> str:
-    """The name of image `number` in pycolmap."""
     return f"{number:06d}"
 
 

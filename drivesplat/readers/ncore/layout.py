@@ -216,7 +216,6 @@ def _resolution(metadata: Metadata, camera: str) -> tuple[int, int]:
 
 
 def _has_rows(metadata: Metadata, lidar: str) -> bool:
-    """Whether the rays of a LiDAR have rows."""
     frames = f"lidars/{lidar}/frames/"
     return any(key.startswith(frames) and key.endswith("/ray_bundle/model_element/.zarray") for key in metadata)
 
@@ -293,7 +292,6 @@ def _content(file: Path, _: int) -> Any:
 
 
 def _manifest_cameras(manifest: Path) -> list[str]:
-    """The cameras that a manifest lists."""
     names: list[str] = []
     for store in _content(manifest, manifest.stat().st_mtime_ns)["component_stores"]:
         components = store.get("components")

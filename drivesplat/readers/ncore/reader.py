@@ -52,7 +52,6 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
 
 
 def scene_of(clip: Clip, source: SceneSource) -> Scene:
-    """The scene of a clip."""
     if fault := unknown_camera(source.scene, sorted(clip.cameras), source.cameras):
         raise DatasetError(fault)
     key_sensor = key_frame_sensor(clip.metadata)
@@ -126,7 +125,6 @@ class _ClipReading:
         return camera_of(name, self._camera_model(name), readout_s)
 
     def lidar(self, name: str) -> Any:
-        """A LiDAR."""
         with refusing(f"LiDAR {name}: its model"):
             return lidar_of(name, self.clip.intrinsics.get_lidar_model_parameters(name))
 

@@ -154,7 +154,6 @@ def _flush(lines: dict[Path, list[str]]) -> None:
 
 
 def _rows_of_scenes(tables: Path, scenes: Sequence[str]) -> Iterator[Found]:
-    """The rows of `scenes` in a folder of tables."""
     owners: dict[str, dict[str, tuple[str, ...]]] = defaultdict(dict)
     yield from _scene_rows(tables, scenes, owners)
     samples: set[str] = set()

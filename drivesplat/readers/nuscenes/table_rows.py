@@ -34,7 +34,6 @@ class TableRows:
             self.add("attribute", token(attribute), name=attribute, description="")
 
     def add(self, table: str, token: str, **values: Any) -> dict[str, Any]:
-        """Adds a row."""
         row = {"token": token, **values}
         self.rows[table].append(row)
         return row

@@ -67,7 +67,6 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
 
 
 def scene_of(segment: Segment, source: SceneSource) -> Scene:
-    """The scene of a segment."""
     numbers = {name: number for number, name in CAMERAS.items()}
     unknown = [camera for camera in source.cameras if camera not in numbers]
     if unknown:
@@ -164,7 +163,6 @@ class _SegmentReading:
         return round(seconds * 1e6)
 
     def sweeps(self, number: int) -> Iterator[Sweep]:
-        """The sweeps of a laser."""
         name, mount = LASERS[number], laser_mount(self.segment.laser(number))
         of_laser = Counter(time for time, laser in self.segment.sweeps if laser == number)
         twice = next((time for time, count in of_laser.items() if count > 1), None)

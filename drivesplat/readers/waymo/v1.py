@@ -248,7 +248,6 @@ def masked_crc(data: bytes) -> int:
 
 @cache
 def message(name: str) -> type[Any]:
-    """The class of a message."""
     return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{_PACKAGE}.{name}"))
 
 

@@ -36,7 +36,6 @@ class CityBlock:
 
 
 def neighbour(crossing: Crossing, heading: int) -> Crossing:
-    """The next crossing in a heading."""
     east, north = FORWARD[heading % 4].astype(int).tolist()
     return crossing[0] + east, crossing[1] + north
 

@@ -107,7 +107,6 @@ class ColoredMesh:
 
 
 def concatenate(meshes: Sequence[ColoredMesh]) -> ColoredMesh:
-    """One mesh of several."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)])
     rows = [np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in ("vertices", "texture")]
@@ -167,7 +166,6 @@ def torus(center: Numbers, radius: float, thickness: float, material: Material, 
 
 
 def hull(points: Sequence[Numbers], material: Material, color: Color) -> ColoredMesh:
-    """The convex hull of points."""
     return uniform(trimesh.convex.convex_hull(np.array(points)), material, color)
 
 

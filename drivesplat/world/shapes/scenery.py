@@ -56,7 +56,6 @@ def street_name_sign() -> ColoredMesh:
 
 
 def cone() -> ColoredMesh:
-    """A traffic cone."""
     mesh = trimesh.creation.cone(0.17, 0.7, sections=16)
     base = box((-0.2, -0.2, 0), (0.2, 0.2, 0.04), Material.PLAIN, TYRE)
     return concatenate([base, uniform(mesh, Material.STRIPES, (0.8, 0.25, 0.03))])

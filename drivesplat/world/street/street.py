@@ -71,7 +71,6 @@ def build_street(world: WorldSettings) -> Street:
 
 
 def road_of(world: WorldSettings) -> ReferenceLine:
-    """The course of the road."""
     if not world.bend_deg and not world.grade:
         return STRAIGHT
     angle = np.radians(world.bend_deg)
@@ -80,7 +79,6 @@ def road_of(world: WorldSettings) -> ReferenceLine:
 
 
 def ego_path(world: WorldSettings, road: ReferenceLine) -> StreetPath:
-    """The path of the ego vehicle."""
     if world.ego == "stands":
         return StreetPath(12.0, -LANE_CENTER, road=road)
     if world.traffic == "queue":

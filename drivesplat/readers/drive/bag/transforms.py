@@ -71,7 +71,6 @@ class TransformTree:
 
     @property
     def frames(self) -> list[str]:
-        """The names of all frames."""
         return sorted(self._beside)
 
     def route(self, source: str, target: str) -> list[tuple[FrameEdge, bool]] | None:
