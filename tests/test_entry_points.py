@@ -7,8 +7,7 @@ import sys
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.settings.config_document import config_schema, config_yaml, main
-from drivesplat.settings.settings_page import settings_page
+from drivesplat.settings.config_document import config_schema, config_yaml, main, settings_page
 
 IS_COMMAND = re.compile(r'^if __name__ == "__main__":', re.MULTILINE)
 COMMANDS = sorted(

@@ -56,10 +56,14 @@ from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.shutter import Shutter
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.train import GaussianSettings, McmcSettings, TrainSettings
-from drivesplat.settings.train_cameras import ExposureSettings
+from drivesplat.settings.train import (
+    ExposureSettings,
+    GaussianSettings,
+    McmcSettings,
+    ScanTrainingSettings,
+    TrainSettings,
+)
 from drivesplat.settings.train_objects import DeformableSettings
-from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training import step as step_module
 from drivesplat.training import strategies
 from drivesplat.training.augmentation import mirrored_at_random, with_dropout

@@ -43,8 +43,7 @@ from drivesplat.settings.images import ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
-from drivesplat.settings.train import TrainJob
-from drivesplat.settings.train_geometry import RoadSettings
+from drivesplat.settings.train import RoadSettings, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.training.road import lidar_road
 from drivesplat.training.stage import TrainingFiles, read_inputs, run_training

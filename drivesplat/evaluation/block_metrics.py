@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import ResultError
-from drivesplat.evaluation.drive_summary import summarize_swept_drive
+from drivesplat.evaluation.eval_record import summarize_swept_drive
 from drivesplat.evaluation.evaluate import findings
 from drivesplat.evaluation.metrics import MIN_FRAME_PIXELS, RegionMetrics, psnr, with_gap
 from drivesplat.io.storage import Provenance, read_record

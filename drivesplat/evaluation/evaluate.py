@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from drivesplat.evaluation.backbone import read_backbone
-from drivesplat.evaluation.drive_summary import summarize_drive
-from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, training_figures
+from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, summarize_drive, training_figures
 from drivesplat.evaluation.image_metrics import (
     held_out_depths,
     held_out_images,

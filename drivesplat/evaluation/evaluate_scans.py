@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from drivesplat.evaluation.drive_summary import summarize_swept_drive
-from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, training_figures
+from drivesplat.evaluation.eval_record import holdout_figures, rate_figures, summarize_swept_drive, training_figures
 from drivesplat.evaluation.metrics import with_gap
 from drivesplat.evaluation.scan_evaluation import lidar_metrics
 from drivesplat.io.storage import Provenance

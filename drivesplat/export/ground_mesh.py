@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from drivesplat.io.triangle_mesh import TriangleMesh
 from drivesplat.kernels.road_distance import Road
 from drivesplat.model.height_field import HeightField
-from drivesplat.settings.train_geometry import RoadSettings
+from drivesplat.settings.train import RoadSettings
 from drivesplat.training.road import driven_road, lidar_road
 
 log = logging.getLogger(__name__)

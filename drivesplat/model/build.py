@@ -9,8 +9,7 @@ import torch
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.deformable import Deformable
-from drivesplat.model.drifting import Drifting
-from drivesplat.model.drifting_seed import drifting_seed
+from drivesplat.model.drifting import Drifting, drifting_seed
 from drivesplat.model.exposure import Exposures, exposure_nodes
 from drivesplat.model.height_field import HeightField
 from drivesplat.model.parameters import require_rows

@@ -4,25 +4,45 @@ After Periodic Vibration Gaussian (Chen et al. 2023, arXiv 2311.18561): each Gau
 and a life span beta. At time t its opacity is its own times exp(-0.5 ((t - tau) / beta)²). Its centre is at
 mean + (t - tau) v: PVG's vibration, l / (2 pi) sin(2 pi (t - tau) / l) v, in the limit of a long cycle l. Vibrating
 Gaussians return, so that PVG can represent the static world with them, too; here the background does that.
+
+Initial values follow from the poses of training images alone. Nothing is known of moving objects, so these are
+hypotheses: at random places near the ground that a training image shows, at its time, with velocities like those of
+traffic along the ego vehicle's path. Those that no image supports fade, and densification moves them, velocities and
+life peaks included, to those that images support.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from drivesplat.model.drifting_seed import DriftingSeed
 from drivesplat.model.gaussians import Gaussians, no_colors
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import GEOMETRY, Part, PartDefinition, RigidGroup
 from drivesplat.model.states import IMAGE, State, Want
-from drivesplat.settings.drifting import DriftingSettings
+from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.drifting import DriftingSeedSettings, DriftingSettings
 from drivesplat.settings.train import GaussianSettings
 
 LIFE_ENDS = 3.0
 """Life spans from its peak after which a Gaussian is absent: its opacity is 1 % of that at the peak."""
+ANGULAR_SIZE = 0.02
+"""Initial scale of a seed Gaussian per metre of distance from its camera."""
+
+
+@dataclass(frozen=True)
+class DriftingSeed:
+    """n initial Gaussians: `positions` (world metres), `velocities` (m/s), life `peaks` (seconds since the first
+    image), `colors` in [0, 1], and `scales` (metres)."""
+
+    positions: Float[np.ndarray, "n 3"]
+    velocities: Float[np.ndarray, "n 3"]
+    peaks: Float[np.ndarray, " n"]
+    colors: Float[np.ndarray, "n 3"]
+    scales: Float[np.ndarray, " n"]
 
 
 class Drifting(Part):
@@ -121,3 +141,42 @@ class Drifting(Part):
         """Those that are present at the time, as one static group."""
         gaussians = self.sample(self.state(time))
         return {self.name: RigidGroup(gaussians[gaussians.opacities != 0], None)}
+
+
+def drifting_seed(
+    record: TrainingRecord, settings: DriftingSeedSettings, count: int, random: np.random.Generator
+) -> DriftingSeed:
+    """`count` initial Gaussians for a record with training images."""
+    images = np.array(record.train_images)
+    times = np.array([record.seconds(int(i)) for i in images])
+    chosen = random.integers(len(images), size=count)
+    depths = np.exp(random.uniform(*np.log(settings.depths), size=count))
+    own = images[chosen]
+    positions = record.camtoworlds[own][:, :3, 3] + depths[:, None] * _directions(record, own, random)
+    positions[:, 2] = record.ego_to_world[own][:, 2, 3] + random.uniform(0.0, settings.height, size=count)
+    velocities = ego_velocities(record, images)[chosen] * random.uniform(*settings.speeds, size=(count, 1))
+    velocities[:, :2] += settings.spread * random.normal(size=(count, 2))
+    apart = np.diff(np.unique(times))
+    peaks = times[chosen] + random.uniform(-0.5, 0.5, size=count) * (np.median(apart) if len(apart) else 0.0)
+    color = record.points_rgb.mean(axis=0) / 255.0 if len(record.points_rgb) else np.full(3, 0.5)
+    return DriftingSeed(positions, velocities, peaks, np.tile(color, (count, 1)), ANGULAR_SIZE * depths)
+
+
+def ego_velocities(record: TrainingRecord, images: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 3"]:
+    """The velocities (m/s) of the ego vehicle at the times of images, by differences between them; 0 if all have the
+    same time."""
+    times = np.array([record.seconds(int(i)) for i in images])
+    distinct, first = np.unique(times, return_index=True)
+    if len(distinct) < 2:
+        return np.zeros((len(images), 3))
+    velocities = np.gradient(record.ego_to_world[images[first]][:, :3, 3], distinct, axis=0)
+    return velocities[np.searchsorted(distinct, times)]
+
+
+def _directions(
+    record: TrainingRecord, images: Int[np.ndarray, " n"], random: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """The viewing directions (world) of a random column of each image, one metre along the camera's axis."""
+    K, columns = record.Ks[images], random.uniform(0.0, record.image_sizes[images][:, 0])
+    in_camera = np.stack([(columns - K[:, 0, 2]) / K[:, 0, 0], np.zeros(len(K)), np.ones(len(K))], axis=1)
+    return np.einsum("nij,nj->ni", record.camtoworlds[images][:, :3, :3], in_camera)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from drivesplat.model.view import View
-from drivesplat.settings.train_cameras import ExposureSettings
+from drivesplat.settings.train import ExposureSettings
 
 CHANNELS = ("red", "green", "blue")
 CHANGE_RATIO = 2.0

@@ -6,10 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.drifting import DriftingSettings
-from drivesplat.settings.train_cameras import ExposureSettings
-from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
 from drivesplat.settings.train_objects import ActorSettings, DeformableSettings
-from drivesplat.settings.train_scans import ScanTrainingSettings
 
 PartName = Literal["background", "road", "actors", "deformable", "drifting"]
 STAGE_OF_PART: dict[PartName, str] = {"actors": "actors", "deformable": "actors"}
@@ -18,6 +15,93 @@ MOVING_PARTS: tuple[PartName, ...] = (*STAGE_OF_PART, "drifting")
 """The parts whose Gaussians are dynamic, objects or not. The settings of such a part are the field of TrainSettings
 with its name."""
 SkyKind = Literal["none", "mask", "cubemap"]
+Milliradians = Annotated[float, Field(ge=0, le=20)]
+
+
+class FloaterSettings(Settings):
+    radius: float = Field(1.0, ge=0, le=10)
+    """Distance from the path of the training cameras (metres) within which Gaussians are faded out: the ego vehicle
+    drove there, so the space is empty. 0 = off."""
+    below_road: bool = False
+    """Also fade out Gaussians whose centres lie `train.road.reach` to 5 m below the road. Needs `train.road_weight`
+    above 0. Leave this off on wet roads, which mirror what is above them."""
+    every: int = Field(100, ge=1)
+    """Iterations between these steps."""
+
+
+class RoadSettings(Settings):
+    """The surface of the road: for the part `road`, whose Gaussians lie in it, and without this part for the background
+    Gaussians that train.road_weight acts on (docs/geometry.md)."""
+
+    surface: Literal["path", "lidar", "lidar_or_path"] = "path"
+    """'path': the road under the path of the vehicle, which follows from its poses. 'lidar': the ground wherever LiDAR
+    seed points show it. 'lidar_or_path': the latter, and where LiDAR gives no plane of the ground, the former."""
+    half_width: float = Field(1.2, gt=0, le=10)
+    """Maximum lateral distance from the path of the vehicle's centre (metres) of the road under the path. The weight
+    falls with this distance, since kerbs and grass may begin beside the vehicle."""
+    reach: float = Field(0.3, gt=0, le=2)
+    """Maximum height of a centre above or below the road surface (metres). The part `road` has a layer of its own."""
+
+
+class ScanTrainingSettings(Settings):
+    """Rendered LiDAR: Gaussians with an intensity and a probability to return a ray, fitted to recorded scans. Needs
+    strategy: mcmc. Defaults of the weights are those of SplatAD (Hess et al. 2025, arXiv 2411.16816)."""
+
+    per_image: float = Field(0.0, ge=0, le=10)
+    """Iterations that fit a scan, per iteration that fits an image, in addition to these and evenly spread among them.
+    0 = LiDAR is not rendered. Without cameras each of `train.iterations` fits a scan where it is above 0."""
+    geometry: float = Field(1.0, ge=0, le=1)
+    """Factor of the gradient by which scans move and shape Gaussians. 0 = they fit intensities and returns alone, and
+    images are rendered as without LiDAR."""
+    fine_tune: float = Field(0.0, ge=0, le=10)
+    """Further iterations that fit scans and change no image, per iteration that fits an image: they fit offsets of
+    position, rotation, size and opacity of background Gaussians that only the LiDAR sees, intensities and returns.
+    Densification and all schedules of images end before them. 0 = no such offsets."""
+    range_weight: float = Field(0.1, ge=0)
+    """Loss weight of the mean absolute error of ranges (metres), without the worst 5 % of the rays."""
+    intensity_weight: float = Field(1.0, ge=0)
+    """Loss weight of the mean squared error of intensities, in [0, 1]."""
+    drop_weight: float = Field(0.1, ge=0)
+    """Loss weight of the binary cross entropy between the probability of a return and whether there is one."""
+    sight_weight: float = Field(0.1, ge=0)
+    """Loss weight of the mean alpha of what is nearer than a return by `sight_margin`: a ray that returns has passed
+    empty space."""
+    sight_margin: float = Field(0.8, ge=0, le=10)
+    """Distance before a return (metres) that need not be empty."""
+    points: int = Field(100_000, ge=0, le=5_000_000)
+    """Maximum number of seed points from training scans, where no camera saw a surface: a LiDAR looks all around. The
+    limits on the number of Gaussians rise by their number. 0 = none."""
+    beam_spread: tuple[Milliradians, Milliradians] = (0.3, 0.3)
+    """Standard deviation of a beam's footprint in azimuth and elevation (milliradians)."""
+
+    @property
+    def beam_spread_rad(self) -> tuple[float, float]:
+        """`beam_spread` in radians."""
+        azimuth, elevation = self.beam_spread
+        return 1e-3 * azimuth, 1e-3 * elevation
+
+
+class ExposureSettings(Settings):
+    """Exposure of each camera. Cameras of one rig set exposure and white balance independently, which causes seams
+    where their images overlap, and change them while the vehicle drives."""
+
+    kind: Literal["none", "affine"] = "affine"
+    """'affine': a gain and an offset per colour channel for every camera but eval_camera, which is the reference. They
+    are initialised from surfaces that several cameras recorded, then learned; and gains over time of every camera
+    (`interval`)."""
+    interval: float | None = Field(1.0, ge=0.1, le=60)
+    """Seconds between the times at which gains of every camera, eval_camera included, are learned; linear in between
+    and constant beyond the last training image. null: constant exposures."""
+    sigma_gain: float = Field(0.1, gt=0)
+    """Expected deviation of a camera's gains from their initial values (natural logarithm)."""
+    sigma_offset: float = Field(0.02, gt=0)
+    """Expected deviation of a camera's offsets from 0 (1 = full scale)."""
+    weight: float = Field(0.002, ge=0)
+    """Loss weight of the mean square of log gains and offsets, in units of these deviations."""
+    start: float = Field(0.1, ge=0, le=1)
+    """Fraction of the iterations after which exposures are learned."""
+    learning_rate: float = Field(1e-2, gt=0)
+    """Learning rate of log gains and offsets, in the same units. Decays exponentially to a hundredth."""
 
 
 def _complete(parts: tuple[PartName, ...]) -> tuple[PartName, ...]:

@@ -17,7 +17,7 @@ from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import SparseGrid, dilated
 from drivesplat.lidar.ground import GroundMap
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train_geometry import RoadSettings
+from drivesplat.settings.train import RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP
 
 log = logging.getLogger(__name__)

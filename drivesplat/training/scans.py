@@ -18,8 +18,7 @@ from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train import TrainSettings
-from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.settings.train import ScanTrainingSettings, TrainSettings
 from drivesplat.training.losses import Means, regularization, weighted
 from drivesplat.training.views import view_index
 

@@ -22,8 +22,7 @@ from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rasterization import RayGrid
-from drivesplat.settings.train import TrainSettings
-from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.settings.train import ScanTrainingSettings, TrainSettings
 from drivesplat.training.loop import TrainingFolders, train
 from drivesplat.training.scans import TrainingScan
 from drivesplat.training.views import TrainingView

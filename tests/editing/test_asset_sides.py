@@ -11,9 +11,8 @@ from helpers.hand_made_traffic import some_gaussians
 from PIL import Image
 
 from drivesplat.editing.assets.asset import Asset
-from drivesplat.editing.assets.asset_view import AssetView, seen_asset
 from drivesplat.editing.assets.completion import completed, facing_azimuths, filled, mirrored, seen_from
-from drivesplat.editing.assets.turntable import BACKDROP, VIEWS, turntable, write_turntable
+from drivesplat.editing.assets.turntable import BACKDROP, VIEWS, AssetView, seen_asset, turntable, write_turntable
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.object_class import ObjectClass

@@ -12,8 +12,7 @@ from helpers.hand_made_street import street_actors
 
 from drivesplat.editing.assets.ground import MAX_GAIN, ground_color, matching_gains
 from drivesplat.editing.assets.inserted import with_assets
-from drivesplat.editing.placed_model import PlacedModel
-from drivesplat.editing.shading import BELOW, LAYER, shaded
+from drivesplat.editing.placed_model import BELOW, LAYER, PlacedModel, shaded
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel

@@ -10,7 +10,7 @@ from helpers.drives import HELD_OUT, NOTHING_HELD_OUT, World
 from helpers.hand_made import recording_of, round_gaussians
 from PIL import Image
 
-from drivesplat.evaluation.drive_summary import summarize_drive
+from drivesplat.evaluation.eval_record import summarize_drive
 from drivesplat.evaluation.image_metrics import evaluate_groups, held_out_depths, measured_images
 from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, depth_summary, relative_depth_errors
 from drivesplat.lidar.depth_record import PixelDepths

@@ -18,8 +18,7 @@ from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.deformable import Deformable
-from drivesplat.model.drifting import Drifting
-from drivesplat.model.drifting_seed import DriftingSeed
+from drivesplat.model.drifting import Drifting, DriftingSeed
 from drivesplat.model.height_field import HeightField
 from drivesplat.model.road import EDGE, RoadPart, RoadSeed
 from drivesplat.model.sky import ConstantSky
@@ -33,6 +32,7 @@ from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import (
     DefaultSettings,
+    FloaterSettings,
     GaussianSettings,
     McmcSettings,
     PartName,
@@ -40,7 +40,6 @@ from drivesplat.settings.train import (
     TrainJob,
     TrainSettings,
 )
-from drivesplat.settings.train_geometry import FloaterSettings
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
 from drivesplat.training.stage import TrainingFiles, TrainingInputs
 from drivesplat.training.views import LidarDepth, TrainingView

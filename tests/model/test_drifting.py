@@ -12,8 +12,7 @@ from helpers.samples import sampled
 
 from drivesplat.model.background import Background
 from drivesplat.model.build import ModelInit, build_model
-from drivesplat.model.drifting import Drifting
-from drivesplat.model.drifting_seed import DriftingSeed, drifting_seed, ego_velocities
+from drivesplat.model.drifting import Drifting, DriftingSeed, drifting_seed, ego_velocities
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN
 from drivesplat.model.view import View

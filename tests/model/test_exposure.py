@@ -37,8 +37,7 @@ from drivesplat.settings.config import load
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
-from drivesplat.settings.train import TrainJob, TrainSettings
-from drivesplat.settings.train_cameras import ExposureSettings
+from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
 from drivesplat.training.exposure_init import DISTANCE_STEP, Sightings, initial_gains, log_colors, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, report_job, report_of, stages
 
-from drivesplat.report.files import console_table
+from drivesplat.report.files import console_table, report_page
 from drivesplat.report.gaps import gap_report, summary_sentences
-from drivesplat.report.html import report_page
 from drivesplat.report.tables import gap_table, write_figures
 
 METHODS = ("vanilla", "street")

@@ -13,8 +13,8 @@ from helpers.reports import expecting, group, method, metrics, stages
 from PIL import Image
 
 from drivesplat.io.storage import write_json
+from drivesplat.report.files import gap_plot, report_page
 from drivesplat.report.gaps import gap_report
-from drivesplat.report.html import gap_plot, report_page
 from drivesplat.report.media import MAX_WIDTH, collect_media, data_url, read_image
 from drivesplat.settings.report import PICTURES
 

@@ -12,9 +12,8 @@ from helpers.reports import NO_LOGS, expecting, group, method, metrics, region, 
 
 from drivesplat.evaluation.scan_metrics import FIGURES, SCAN_REGIONS
 from drivesplat.io.storage import write_json
-from drivesplat.report.files import console_table
+from drivesplat.report.files import console_table, report_page
 from drivesplat.report.gaps import COLUMNS, gap_report
-from drivesplat.report.html import report_page
 from drivesplat.report.tables import write_figures
 from drivesplat.settings.published import PublishedFigures
 

@@ -7,7 +7,7 @@ import pytest
 from helpers.reports import group, method, metrics, report_of
 
 from drivesplat.errors import ResultError
-from drivesplat.report.html import report_page
+from drivesplat.report.files import report_page
 from drivesplat.report.runs import run_rows, run_table
 
 SCORES = {"pdms": 0.79, "hd_score": 0.55, "alpasim_score": 0.62, "progress_ratio": 0.5, "duration_s": 9.5}

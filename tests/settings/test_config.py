@@ -12,8 +12,7 @@ from helpers import REPOSITORY
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import Config, for_scene, load, merged
-from drivesplat.settings.config_document import config_schema, config_yaml
-from drivesplat.settings.settings_page import settings_page
+from drivesplat.settings.config_document import config_schema, config_yaml, settings_page
 from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
 
 LOOKS = (

@@ -9,8 +9,7 @@ from helpers.samples import sampled
 from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import SparseGrid
 from drivesplat.model.background import Background
-from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
-from drivesplat.settings.train_geometry import RoadSettings
+from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings, RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, SensorPath, fade_floaters, near_path, sensor_path
 from drivesplat.training.road import driven_road
 

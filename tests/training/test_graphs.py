@@ -27,8 +27,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import SCAN
 from drivesplat.model.view import RollingShutter
 from drivesplat.scene.scan_record import RecordedScan
-from drivesplat.settings.train import McmcSettings, TrainSettings
-from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.settings.train import McmcSettings, ScanTrainingSettings, TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.graphs import captured_steps
 from drivesplat.training.graphs.captured_steps import GaussianCount, IterationGraphs, Recording, can_capture

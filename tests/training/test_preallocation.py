@@ -13,8 +13,7 @@ from helpers.trainings import settings_of as settings_of_training
 from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.settings.train import McmcSettings, TrainSettings
-from drivesplat.settings.train_geometry import RoadSettings
+from drivesplat.settings.train import McmcSettings, RoadSettings, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.densify import Densifier
 from drivesplat.training.graphs.captured_steps import IterationGraphs

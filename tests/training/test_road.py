@@ -17,8 +17,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.training_record import SeedInfo, TrainingRecord
-from drivesplat.settings.train import TrainSettings
-from drivesplat.settings.train_geometry import RoadSettings
+from drivesplat.settings.train import RoadSettings, TrainSettings
 from drivesplat.training.floaters import LARGEST_STEP
 from drivesplat.training.losses import surface_terms
 from drivesplat.training.road import CELL, LIDAR_CELL, driven_road, lidar_road, road_of

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivesplat.model.height_field import HeightField
 from drivesplat.model.road import EDGE
 from drivesplat.scene.training_record import SeedInfo, TrainingRecord
-from drivesplat.settings.train_geometry import RoadSettings
+from drivesplat.settings.train import RoadSettings
 from drivesplat.training.road import lidar_road, road_of
 from drivesplat.training.road_seed import gaussians_per_side, pixels_of, road_seed, surface_of
 

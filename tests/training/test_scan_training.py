@@ -29,8 +29,7 @@ from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.scans import ScanPicture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan
-from drivesplat.settings.train import McmcSettings, TrainSettings
-from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.settings.train import McmcSettings, ScanTrainingSettings, TrainSettings
 from drivesplat.training.graphs.captured_steps import IterationGraphs
 from drivesplat.training.loop import Trainer, train
 from drivesplat.training.optimizers import make_optimizers

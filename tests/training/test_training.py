@@ -60,8 +60,14 @@ from drivesplat.scene.images import below_horizon
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.drifting import DriftingSettings
-from drivesplat.settings.train import ActorSettings, DefaultSettings, GaussianSettings, TrainJob
-from drivesplat.settings.train_geometry import FloaterSettings, RoadSettings
+from drivesplat.settings.train import (
+    ActorSettings,
+    DefaultSettings,
+    FloaterSettings,
+    GaussianSettings,
+    RoadSettings,
+    TrainJob,
+)
 from drivesplat.training import resume_state
 from drivesplat.training.loop import Trainer, TrainingRun, train
 from drivesplat.training.monitor import NEVER, FiniteGuard, Monitor

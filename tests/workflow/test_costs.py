@@ -11,8 +11,8 @@ from helpers import REPOSITORY
 from helpers.reports import NO_LOGS, expecting
 
 from drivesplat.io.storage import write_json
+from drivesplat.report.files import report_page
 from drivesplat.report.gaps import gap_report
-from drivesplat.report.html import report_page
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.run_costs import COSTS, RunCosts
 from drivesplat.workflow.costs.table import LIMIT_SECONDS, costs_in_words, costs_record, scene_totals, write_costs

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from drivesplat.editing.assets.asset import VISIBLE, Asset
-from drivesplat.editing.assets.asset_view import AssetView, seen_asset
+from drivesplat.editing.assets.turntable import AssetView, seen_asset
 from drivesplat.model.gaussians import Gaussians, no_colors
 from drivesplat.model.harmonics import rotation_of_harmonics_by
 from drivesplat.scene.object_class import ObjectClass

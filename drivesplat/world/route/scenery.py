@@ -16,9 +16,16 @@ from drivesplat.world.shapes import plants, scenery
 from drivesplat.world.shapes.buildings import building_front
 from drivesplat.world.shapes.mesh import ColoredMesh, Material, SurfaceClass, concatenate
 from drivesplat.world.shapes.vehicles import vehicle
-from drivesplat.world.street.buildings import DEPTH, FORECOURT, WALLS, standing_building
-from drivesplat.world.street.furniture import KERBSIDE, LAMP_ARM, LAMP_HEIGHT
-from drivesplat.world.street.ground import CURB_HEIGHT
+from drivesplat.world.street.roadside import (
+    CURB_HEIGHT,
+    DEPTH,
+    FORECOURT,
+    KERBSIDE,
+    LAMP_ARM,
+    LAMP_HEIGHT,
+    WALLS,
+    standing_building,
+)
 
 FIRST_HOUSE = SIDEWALK + FORECOURT
 """Metres from the middle of a crossing to the first house beside a street to the east; houses beside streets to the

@@ -21,9 +21,9 @@ from drivesplat.world.route.traffic import MAX_LIFE_S, PERIOD_S, RoadUsers
 from drivesplat.world.shapes.body import RigidBody
 from drivesplat.world.shapes.mesh import ColoredMesh, concatenate
 from drivesplat.world.shapes.vehicles import ego_rear, ego_vehicle
-from drivesplat.world.street.furniture import LAMP_ARM
 from drivesplat.world.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject, fixed
 from drivesplat.world.street.road import STRAIGHT
+from drivesplat.world.street.roadside import LAMP_ARM
 from drivesplat.world.street.street import Street
 
 STRETCH_S = 10

@@ -10,13 +10,11 @@ from drivesplat.world.shapes import scenery
 from drivesplat.world.shapes.body import RigidBody
 from drivesplat.world.shapes.mesh import concatenate
 from drivesplat.world.shapes.vehicles import ego_rear, ego_vehicle, vehicle
-from drivesplat.world.street.buildings import rows_of_buildings
-from drivesplat.world.street.furniture import LAMPS, furniture, trees
-from drivesplat.world.street.ground import ground
 from drivesplat.world.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject, fixed
 from drivesplat.world.street.paths import LANE_CENTER, ObjectPath, StreetPath
 from drivesplat.world.street.people import people
 from drivesplat.world.street.road import STRAIGHT, ReferenceLine
+from drivesplat.world.street.roadside import LAMPS, furniture, ground, rows_of_buildings, trees
 
 CONES = np.array([(57.0, -5.0), (59.5, -4.75), (62.0, -4.5)])
 BEND_RADIUS = 90.0
