@@ -25,7 +25,7 @@ from helpers.syntax_trees import source_of, statements, tree_of
 MAX_PLACES, MAX_LOOSE_MODULES = 27, 2
 MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 9, 18
 MAX_LINES = 400
-MAX_SMALL_MODULES = 15
+MAX_SMALL_MODULES = 14
 SIGNED = packages(LIBRARY, "benchmarks")
 
 

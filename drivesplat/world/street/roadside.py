@@ -1,5 +1,5 @@
-"""The street but for what moves: road, curbs and grass as strips along it, rows of buildings with hedges and fences
-between them, trees, lamps, signs and other furniture of the sidewalks."""
+"""The static street: road, curbs and grass as strips along it, rows of buildings with hedges and fences between them,
+trees, lamps, signs and other furniture of the sidewalks."""
 
 from collections.abc import Callable
 
