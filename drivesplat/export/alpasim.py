@@ -54,7 +54,10 @@ def export_alpasim(path: str | Path, drive: TrainedDrive, job: AlpasimJob, prove
     }
     content: dict[str, bytes | Path] = {
         "metadata.yaml": yaml.safe_dump(metadata(scene, own, provenance), sort_keys=True).encode(),
-        **{name: _json(record) for name, record in records.items()},
+        **{
+            name: json.dumps(record, sort_keys=True, allow_nan=False).encode() + b"\n"
+            for name, record in records.items()
+        },
         **{name: ply_bytes(mesh) for name, mesh in meshes.items()},
         **packed_members(drive.folder, drive.scene.name, drive_files(drive)),
     }
@@ -84,7 +87,3 @@ def drive_files(drive: TrainedDrive) -> list[Path]:
     recording = drive.recording
     scans = [recording.scans_file] if drive.renders_lidar and recording.scans_file.is_file() else []
     return [drive.folder / "checkpoint.npz", *recording.files, *scans]
-
-
-def _json(record: object) -> bytes:
-    return json.dumps(record, sort_keys=True, allow_nan=False).encode() + b"\n"

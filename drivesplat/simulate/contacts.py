@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.simulate.driven_run import DrivenRun, OtherObject
+from drivesplat.simulate.driven_run import DrivenRun
 from drivesplat.simulate.footprints import OrientedBoxes, ego_boxes, other_boxes, overlapping, time_to_contact
 
 STOPPED = 0.05
@@ -146,7 +146,7 @@ def contact_kinds(around: Encounters) -> np.ndarray:
     """The kinds (k, n) that contacts have that begin at each step, whether or not there is one."""
     stopped_ego = np.abs(around.run.speed) <= STOPPED
     stopped = np.linalg.norm(around.velocities[..., :2], axis=-1) <= STOPPED
-    stopped |= ~_movable(around.run.others)[:, None]
+    stopped |= np.array([not other.object_class.is_dynamic for other in around.run.others], dtype=bool)[:, None]
     behind = around.bearing(np.zeros(stopped.shape)) < BEHIND
     front = around.end_touched(around.direction)
     kinds = [ContactKind.STOPPED_EGO, ContactKind.STOPPED_OBJECT, ContactKind.REAR, ContactKind.FRONT]
@@ -191,10 +191,6 @@ def counted(around: Encounters, known: Sequence[Contact]) -> Bool[np.ndarray, "k
         if not contact.counts:
             mask[contact.row, contact.first_step : contact.last_step + 1] = False
     return mask
-
-
-def _movable(others: Sequence[OtherObject]) -> np.ndarray:
-    return np.array([other.object_class.is_dynamic for other in others], dtype=bool)
 
 
 def _spans(touching: np.ndarray, seconds: np.ndarray) -> list[tuple[int, int]]:

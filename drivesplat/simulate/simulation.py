@@ -1,7 +1,7 @@
 """A trained drive in which a policy drives: its state from step to step, what it sees, and what it leaves."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -62,7 +62,8 @@ class Simulation:
                 f"{drive.where}: a run cannot begin at {self.settings.start:g} s; the vehicle drives from {first:.2f} "
                 f"to {last:.2f} s"
             )
-        self.cameras = {name: self._camera(name) for name in self._camera_names}
+        names = self.drive.cameras[:1] if self.settings.cameras is None else self.settings.cameras
+        self.cameras = {name: self._camera(name) for name in names}
         self.lidar = None if self.settings.lidar is None else drive.lidar(self.settings.lidar, self.settings.start)
         if not self.step_count:
             raise RequestError(f"{drive.where}: a run from {self.settings.start:g} s on has no step")
@@ -94,10 +95,6 @@ class Simulation:
         wanted = ([IMAGE] if self.cameras else []) + ([SCAN] if self.lidar is not None else [])
         for want in wanted:
             self.drive.model.precompute(within, want)
-
-    @property
-    def _camera_names(self) -> Sequence[str]:
-        return self.drive.cameras[:1] if self.settings.cameras is None else self.settings.cameras
 
     def _camera(self, name: str) -> PoseableCamera:
         camera = self.drive.camera(name, rolling_shutter=self.settings.rolling_shutter)
