@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.report.files import write_film_page
+from drivesplat.report.film_page import write_film_page
 from drivesplat.settings.report import FilmPageJob
 
 with job(snakemake, check_inputs=False) as current:

@@ -10,11 +10,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import torch
-
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.storage import atomic_path
-from drivesplat.model.splat_ply import ALMOST_ONE, TINY, read_splat_ply
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +31,11 @@ def export_spz(path: str | Path, splat: str | Path) -> None:
         raise DriveSplatError(
             "splat.spz needs gsply, which is not installed: run 'make setup', or drop spz from export.formats"
         ) from error
+    # torch takes 1 s, which `export_sog` does without
+    import torch
+
+    from drivesplat.model.splat_ply import ALMOST_ONE, TINY, read_splat_ply
+
     gaussians = read_splat_ply(splat, "export")
     data = GSData(
         means=gaussians.means.numpy(),

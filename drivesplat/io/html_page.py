@@ -7,6 +7,8 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from drivesplat.io.storage import atomic_write
+
 
 def filled_page(package: ModuleType, **values: Any) -> str:
     """The page.html of a package, filled in with `values`: escaped text, unless a value is `Markup`.
@@ -26,3 +28,10 @@ def filled_page(package: ModuleType, **values: Any) -> str:
     pages.globals["file"] = lambda name: Markup((folder / name).read_text(encoding="utf-8"))
     pages.filters["figure"] = lambda value, form: "–" if value is None else form.format(value)
     return pages.get_template("page.html").render(values)
+
+
+def write_page(path: Path, page: str) -> None:
+    """Writes a page to `path`, whose folder is made. Raises ResultError if that fails."""
+    path.parent.mkdir(exist_ok=True)
+    with atomic_write(path) as file:
+        file.write(page.encode())

@@ -20,9 +20,9 @@ from snakemake.iocontainers import FILE_HASH_PREFIX_LEN
 from drivesplat import WORKFLOW
 from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
-from drivesplat.io.html_page import filled_page
-from drivesplat.io.storage import atomic_write, write_json
-from drivesplat.report import film_page, ghosts_page, page
+from drivesplat.io.html_page import filled_page, write_page
+from drivesplat.io.storage import write_json
+from drivesplat.report import ghosts_page, page
 from drivesplat.report.aside import aside_table
 from drivesplat.report.gaps import gap_report, moving_gap, shows_other_tracks, shows_people, summary_sentences
 from drivesplat.report.lidar import page_table
@@ -38,7 +38,7 @@ from drivesplat.report.tables import (
     whole_image_table,
     write_figures,
 )
-from drivesplat.settings.report import FilmPageJob, ReportJob
+from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
 from drivesplat.workflow.film_names import FILM_PAGE
@@ -106,21 +106,10 @@ def write_report(
     }
     totals = {total["scene"]: total for total in scene_totals(read_costs(results)[0], (), of_scenes)}
     costs = [totals[scene] for scene in job.expected if scene in totals]
-    _write_page(ghosts, render_ghosts_page())
-    _write_page(page, report_page(report, media, costs))
-    _write_page(archived, report_page(report, packed, costs, lambda name: address_in_archive(results / name)))
+    write_page(ghosts, render_ghosts_page())
+    write_page(page, report_page(report, media, costs))
+    write_page(archived, report_page(report, packed, costs, lambda name: address_in_archive(results / name)))
     print(console_table(report), flush=True)
-
-
-def write_film_page(path: Path, job: FilmPageJob) -> None:
-    """Writes the page of a scene's films to `path`, in the scene's folder of results."""
-    _write_page(path, filled_page(film_page, job=job))
-
-
-def _write_page(path: Path, page: str) -> None:
-    path.parent.mkdir(exist_ok=True)
-    with atomic_write(path) as file:
-        file.write(page.encode())
 
 
 def console_table(report: dict[str, Any]) -> str:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import bootstrap
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
@@ -59,6 +58,8 @@ def _interval(
     """The bounds of a statistic of paired samples; None where resampled scenes without any gap make it infinite."""
     if len(samples[0]) < 2:
         return None, None
+    from scipy.stats import bootstrap  # 0.3 s, which a report of one scene does without
+
     interval = bootstrap(
         samples, statistic, paired=len(samples) > 1, vectorized=True, method="percentile", n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE, rng=np.random.default_rng(random_seed),

@@ -3,7 +3,9 @@ their base class, and one-line messages for their errors.
 
 Fields are documented by attribute docstrings, so that a reworded comment does not change the code digest (see
 `drivesplat.provenance.code`). A docstring that begins with `:printed:` puts its field into config.yaml, which users
-read first; docs/settings.md and config.schema.json have all fields.
+read first; docs/settings.md and config.schema.json have all fields. Only `make config` reads these docstrings
+(`drivesplat.settings.config_document`), and records are built when they are first used: both take time that every job
+would pay.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,7 +28,7 @@ class Settings(BaseModel):
     """Immutable settings: unknown keys are refused, field docstrings are the documentation."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True, protected_namespaces=()
+        extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True, protected_namespaces=()
     )
 
     @field_validator("*", mode="before")

@@ -5,12 +5,16 @@ docstring is no code: what config.yaml prints reruns nothing. The other two file
 """
 
 import argparse
+import ast
 import difflib
+import inspect
 import json
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -21,6 +25,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from drivesplat.settings import Settings
 from drivesplat.settings.config import Config
 
 ROOT = Path(__file__).parents[2]
@@ -61,6 +66,10 @@ def config_yaml() -> str:
 def config_schema() -> str:
     """The text of config.schema.json, for Snakemake's `validate` and for editors."""
     schema = {"$schema": DIALECT, **Config.model_json_schema(mode="validation")}
+    records = {record.__name__: record for record in _records(Settings)}
+    for name, described_record in (("Config", schema), *schema["$defs"].items()):
+        if name in records:
+            _describe(described_record["properties"], records[name])
     device = schema["properties"]["device"]
     kinds = schema["$defs"]["DeviceSettings"]["properties"]["kind"]["enum"]
     schema["properties"]["device"] = {
@@ -68,6 +77,20 @@ def config_schema() -> str:
         "default": device["default"],
     }
     return json.dumps(_described(schema), indent=1) + "\n"
+
+
+def _records(base: type[Settings]) -> Iterator[type[Settings]]:
+    """All settings records below a class."""
+    for record in base.__subclasses__():
+        yield record
+        yield from _records(record)
+
+
+def _describe(properties: dict[str, Any], record: type[Settings]) -> None:
+    """Adds the docstrings of a record's fields to its properties in the schema, keys in alphabetical order."""
+    for name, text in field_docstrings(record).items():
+        key = record.model_fields[name].alias or name
+        properties[key] = dict(sorted({**properties[key], "description": text}.items()))
 
 
 def _described(node: Any) -> Any:
@@ -87,14 +110,15 @@ def _mapping(record: BaseModel, indent: int, commented: set[tuple[type, str]]) -
     comments in the lines so far."""
     lines, pad = [], " " * indent
     for name, field in _printed_fields(record, commented):
-        about, limits = described(field.description), bounds(field.metadata)
+        about = described(field_docstrings(type(record)).get(name))
+        limits = bounds(field.metadata)
         if limits and about:
             about += f" [{limits.replace(' ', NO_BREAK)}]"
         wrapped = textwrap.wrap(about, WIDTH - len(pad)) if about else []
         comment = "".join(f"{pad}# {line}\n" for line in wrapped).replace(NO_BREAK, " ")
         key = type(record), name
         text = _value(name, getattr(record, name), indent, commented)
-        if text or is_printed(field):
+        if text or is_printed(type(record), name):
             text = text or " {}\n"
             lines.append("\n" * (indent == 0) + comment * (key not in commented) + f"{pad}{name}:{text}")
         commented.add(key)
@@ -108,7 +132,7 @@ def _printed_fields(record: BaseModel, commented: set[tuple[type, str]]) -> list
     return [
         (name, field)
         for name, field in type(record).model_fields.items()
-        if is_printed(field) or isinstance(getattr(record, name), BaseModel)
+        if is_printed(type(record), name) or isinstance(getattr(record, name), BaseModel)
         if not again or getattr(record, name) != field.get_default(call_default_factory=True)
     ]
 
@@ -178,9 +202,23 @@ def described(description: str | None) -> str:
     return " ".join((description or "").removeprefix(PRINTED).split())
 
 
-def is_printed(field: FieldInfo) -> bool:
-    """Whether config.yaml has the field."""
-    return (field.description or "").startswith(PRINTED)
+@cache
+def field_docstrings(record: type[BaseModel]) -> Mapping[str, str]:
+    """The docstrings of a record's fields, its own and those that it inherits, by name."""
+    found: dict[str, str] = {}
+    for kind in reversed(record.__mro__):
+        if issubclass(kind, Settings):
+            (definition,) = ast.parse(inspect.getsource(kind)).body
+            for field, text in pairwise(definition.body):
+                match field, text:
+                    case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(docstring))):
+                        found[name] = inspect.cleandoc(docstring)
+    return found
+
+
+def is_printed(record: type[BaseModel], name: str) -> bool:
+    """Whether config.yaml has the field of a record."""
+    return field_docstrings(record).get(name, "").startswith(PRINTED)
 
 
 def in_one_line(value: Any) -> str:
@@ -222,9 +260,10 @@ def _rows(record: type[BaseModel], path: str, prefix: str) -> tuple[list[str], l
         inner, entry = _record_in(field.annotation)
         where = f"{path}.{name}".lstrip(".") + entry
         folded = inner is not None and len(inner.model_fields) <= FOLDED
-        purpose = described(field.description or (inner.__doc__ if folded else ""))
+        purpose = described(field_docstrings(record).get(name) or (inner.__doc__ if folded else ""))
         if inner is None or purpose:
-            rows.append(_row(prefix + name, field, purpose, "" if folded or inner is None else where))
+            key = f"**`{prefix}{name}`**" if is_printed(record, name) else f"`{prefix}{name}`"
+            rows.append(_row(key, field, purpose, "" if folded or inner is None else where))
         if folded:
             inner_rows, inner_below = _rows(inner, where, f"{prefix}{name}{entry}.")
             rows += inner_rows
@@ -234,9 +273,9 @@ def _rows(record: type[BaseModel], path: str, prefix: str) -> tuple[list[str], l
     return rows, below
 
 
-def _row(name: str, field: FieldInfo, purpose: str, section: str) -> str:
-    """The row of a setting; `section` is the path of the section that has its own settings, if there is one."""
-    key = f"**`{name}`**" if is_printed(field) else f"`{name}`"
+def _row(key: str, field: FieldInfo, purpose: str, section: str) -> str:
+    """The row of a setting; `key` is its first cell, `section` the path of the section that has its own settings, if
+    there is one."""
     values, default = _values(field.annotation, field.metadata), field.get_default(call_default_factory=True)
     if section:
         # the link to a section as GitHub makes it of the heading: without dots and other signs

@@ -9,7 +9,7 @@ from helpers.chromium import chromium, in_a_browser
 from PIL import Image
 
 from drivesplat.io.video import write_video
-from drivesplat.report.files import write_film_page
+from drivesplat.report.film_page import write_film_page
 from drivesplat.settings.report import FilmPageJob, FilmSection, ShownFile
 
 FILMS = ("street/original.mp4", "street/edits/a b.mp4", "street/never made.mp4")
