@@ -12,6 +12,7 @@ from drivesplat.editing.placed_model import PlacedModel, placed_models
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import fill, hull_of
 from drivesplat.scene.rigid import inverse
@@ -70,31 +71,42 @@ class ShownObjects:
     def seen_in_any(self, views: Iterable[View]) -> set[str]:
         """The ids of the others that any of the views shows."""
         seen: set[str] = set()
+        fixed = FixedModel(self.model)
         for view in views:
-            wanted = [i for i, item in enumerate(self.others) if self.parts[i] and item.id not in seen]
-            rest = replace(self, others=[self.others[i] for i in wanted], parts=[self.parts[i] for i in wanted])
-            seen |= {found.id for found in rest.seen_in(view, with_actors=False)} if wanted else set()
+            (placed,) = placed_models(fixed, self.actors, np.array([view.time]))
+            rest = self._chosen(item.id not in seen for item in self.others)
+            seen |= {found.id for found in rest.others_in(view, placed)}
         return seen
 
     @torch.no_grad()
-    def seen_in(self, view: View, with_actors: bool = True) -> list[SeenObject]:
+    def seen_in(self, view: View) -> list[SeenObject]:
         """The objects that a view shows."""
         now = np.array([view.time])
         (placed,) = placed_models(self.model, self.actors, now)
-        found = self.others_in(view, placed)
-        if with_actors:
-            boxes = [box_of(actor, view.time) for actor in self.actors if actor.present(now)[0]]
-            found = [*(item for item in seen_objects(placed, boxes, view) if item is not None), *found]
-        return found
+        boxes = [box_of(actor, view.time) for actor in self.actors if actor.present(now)[0]]
+        found = (item for item in seen_objects(placed, boxes, view) if item is not None)
+        return [*found, *self.others_in(view, placed)]
 
     @torch.no_grad()
     def others_in(self, view: View, placed: PlacedModel) -> list[SeenObject]:
-        """Those of the others that a view shows."""
+        """Those of the others that a view shows. Gaussians are sampled only if a box is in the image."""
+        now = np.array([view.time])
+        in_image = self._chosen(
+            bool(parts) and bool(item.present(now)[0]) and _outline(box_of(item, view.time), view) is not None
+            for item, parts in zip(self.others, self.parts, strict=True)
+        )
+        if not in_image.others:
+            return []
         found = (
             _seen_object(self.model, placed.gaussians_in(view), rows, box_of(item, view.time), view)
-            for item, rows in self.rows_of_others(view, placed)
+            for item, rows in in_image.rows_of_others(view, placed)
         )
         return [item for item in found if item is not None]
+
+    def _chosen(self, chosen: Iterable[bool]) -> "ShownObjects":
+        """The same with the `chosen` ones of the others alone."""
+        pairs = [pair for pair, kept in zip(zip(self.others, self.parts, strict=True), chosen, strict=True) if kept]
+        return replace(self, others=[item for item, _ in pairs], parts=[parts for _, parts in pairs])
 
     def rows_of_others(self, view: View, placed: PlacedModel) -> Iterator[tuple[EditedActor, Bool[Tensor, " n"]]]:
         """Those of the others that are present at the time of a view and may be shown, each with the Gaussians that
@@ -137,15 +149,13 @@ def _seen_object(
     model: SplatModel, gaussians: Gaussians, rows: Bool[Tensor, " n"], box: Box, view: View
 ) -> SeenObject | None:
     """An object in a view that the `rows` of the Gaussians show; None where the image does not show it."""
-    polygon = hull_of(box, view.viewmat.cpu().double().numpy(), view.K.cpu().double().numpy())
-    if polygon is None or not bool(rows.any()):
+    found = _outline(box, view)
+    if found is None or not bool(rows.any()):
         return None
+    polygon, pixels = found
     size = np.array([view.width, view.height])
     low, high = polygon.min(axis=0), polygon.max(axis=0)
     corners = np.concatenate([low.clip(0, size), high.clip(0, size)])
-    pixels = int(fill(polygon, (view.width, view.height)).sum())
-    if not pixels:
-        return None
     inside = _cropped(view, corners[:2], corners[2:])
     whole = _cropped(view, low.clip(-size, 2 * size), high.clip(-size, 2 * size))
     share = model.composited(gaussians, rows.to(gaussians.means)[:, None], inside).image.sum()
@@ -154,6 +164,13 @@ def _seen_object(
     own = gaussians[rows]
     alone = model.composited(own, own.means.new_ones(len(own), 1), whole).alpha.sum()
     return SeenObject(box.track_id, tuple(corners.tolist()), min(1.0, float(share / alone)))
+
+
+def _outline(box: Box, view: View) -> tuple[np.ndarray, int] | None:
+    """The outline (n, 2) of a box in a view, in continuous pixels, and the number of pixels in it; None without any."""
+    polygon = hull_of(box, view.viewmat.cpu().double().numpy(), view.K.cpu().double().numpy())
+    pixels = 0 if polygon is None else int(fill(polygon, (view.width, view.height)).sum())
+    return (polygon, pixels) if pixels else None
 
 
 def _cropped(view: View, low: np.ndarray, high: np.ndarray) -> View:
