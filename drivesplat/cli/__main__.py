@@ -17,7 +17,7 @@ from pathlib import Path
 
 import drivesplat
 from drivesplat import SNAKEFILE, WORKFLOW
-from drivesplat.cli import assets, check, imports, segment, serve
+from drivesplat.cli import assets, check, imports, segment, serve, setup
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import default_config, in_this_copy, of_the_workflow
@@ -97,7 +97,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
 
-    commands.add_parser("setup", help="compile the kernels for this machine's GPUs and processors, once")
+    setup.add_parser(commands)
 
     config = commands.add_parser("config", help="print common settings with defaults: drivesplat config > config.yaml")
     config.add_argument("--all", action="store_true", help="print docs/settings.md, a page of all settings, instead")
@@ -128,12 +128,8 @@ def run_command(parsed: argparse.Namespace) -> int:
         from drivesplat.machine.doctor.__main__ import main as doctor
 
         return doctor(parsed.config)
-    if parsed.command == "setup":
-        from drivesplat.machine.gsplat_build.__main__ import main as compile_gsplat
-        from drivesplat.training.warm_up import main as train_briefly
-        from drivesplat.world.warm_up import main as make_tiny_world
-
-        return compile_gsplat([]) or train_briefly() or make_tiny_world()
+    if parsed.command == setup.COMMAND:
+        return setup.run_setup(parsed)
     if parsed.command == "render":
         drive, outputs = drivesplat.open(parsed.folder, parsed.device), parsed.outputs.split(",")
         count = drivesplat.render_poses(drive, parsed.poses, parsed.camera, outputs, parsed.out, parsed.ego)

@@ -4,6 +4,7 @@ import logging
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,11 +48,27 @@ def _check() -> "Future[str | None]":
     return ThreadPoolExecutor(1).submit(problem)
 
 
+def say_when_compiling() -> None:
+    """Logs once that this process compiles kernels, where Triton tells: versions before 3.4 do not."""
+    try:
+        from triton import knobs
+    except ImportError:
+        return
+
+    def listen(*, cache_hit: bool, **_: Any) -> None:
+        if not cache_hit:
+            knobs.compilation.listener = None
+            log.info("compiling kernels for this card, about 40 s, once (`drivesplat setup` does it beforehand)")
+
+    knobs.compilation.listener = listen
+
+
 def problem() -> str | None:
     """Why Triton cannot compile for the GPU of this process; None where it can."""
     try:
         from drivesplat.kernels.triton import probe
 
+        say_when_compiling()
         probe.run()
     except Exception as error:  # no Triton for this system, no C compiler, no headers of Python, an unsupported GPU
         return (str(error).strip().splitlines() or [type(error).__name__])[0]

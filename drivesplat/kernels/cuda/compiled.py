@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from drivesplat.errors import DeviceError
 from drivesplat.io.storage import atomic_write
 from drivesplat.kernels import torch_private
 from drivesplat.kernels.cache_folder import cache_folder
@@ -33,6 +34,8 @@ class Program(NamedTuple):
 IMAGES = Program("images", source.SOURCE, source.KERNELS)
 IMAGES_WITH_OBJECTS = Program("images-with-objects", "#define OBJECTS 1\n" + source.SOURCE, source.KERNELS)
 SCANS = Program("scans", scan_source.SOURCE, scan_source.KERNELS)
+USED = {IMAGES: (1, 3, 4, 5), IMAGES_WITH_OBJECTS: (1, 3, 4, 5), SCANS: (2, 3)}
+"""The programs, and the numbers of values for which trainings, evaluations and films usually compile them."""
 
 
 def usable_for(tensor: Tensor, program: Program) -> bool:
@@ -58,6 +61,18 @@ def _compiles(program: Program, device: int) -> bool:
         log.warning("CUDA kernels of %s cannot be compiled (%s): trainings take longer", program.name, reason)
         return False
     return True
+
+
+def compile_ahead(capability: str) -> int:
+    """Compiles the programs of USED for GPUs of a compute capability, such as "90", into the cache, where they are not;
+    needs no GPU. Returns their number. Raises DeviceError where NVRTC or the cache cannot be used."""
+    wanted = [(program, channels) for program, numbers in USED.items() for channels in numbers]
+    try:
+        for program, channels in wanted:
+            _binary(program, channels, LENGTH, capability)
+    except (RuntimeError, OSError) as error:
+        raise DeviceError(f"CUDA kernels cannot be compiled for compute capability {capability}: {error}") from error
+    return len(wanted)
 
 
 def _binary(program: Program, channels: int, length: int, capability: str) -> bytes:
