@@ -140,6 +140,15 @@ compile_ahead() {
   fi
 }
 
+# The kernels for GPUs: by jobs on a tiny drive where there is a card; for GSPLAT_ARCHS those that can do without.
+compile_for_gpus() {
+  if command -v nvidia-smi >/dev/null 2>&1; then
+    .venv/bin/python -m drivesplat.cli setup --gpu-kernels
+  elif [ -n "${GSPLAT_ARCHS:-}" ] && [ "$GSPLAT_ARCHS" != none ]; then
+    .venv/bin/python -m drivesplat.cli setup --arch "$GSPLAT_ARCHS"
+  fi
+}
+
 build=${TORCH_CUDA:-$(build_made)}
 
 if [ "${1:-}" = --check ]; then
@@ -179,3 +188,4 @@ if [ -z "$quiet" ] || ! no_card; then
     fail "everything but gsplat's kernels is in place; GSPLAT_ARCHS=none make setup goes without them (CPU only)"
 fi
 [ -e "$compiled" ] || compile_ahead
+compile_for_gpus || say "all packages are in place; the first jobs on a GPU compile its kernels, and take longer"

@@ -15,7 +15,7 @@ from drivesplat.errors import ConfigError
 
 COMMAND = "setup"
 PRESETS = tuple(str(WORKFLOW / "presets" / name) for name in ("lidar.yaml", "warm_up.yaml"))
-TARGETS = ("metrics", "films", "results/demo/street/edits/stop.mp4")
+TARGETS = ("metrics", "films", "results/demo/street/edits/accelerate_then_stop.mp4")
 """What is made on a card: trainings with and without LiDAR, their metrics, films and an edit. Their jobs run side by
 side, and compile the kernels that those of other drives need."""
 JOBS_PER_CARD = 4

@@ -28,6 +28,7 @@ case "$*" in
   *torch_builds*) exec "$REAL_PYTHON" "$@" ;;
   *gsplat_build*) echo "gsplat_build ${*:3}" >> "$FAKE_LOG"; exit "${FAKE_BUILD_STATUS:-0}" ;;
   *compileall*) echo "compileall ${*:4}" >> "$FAKE_LOG" ;;
+  "-m drivesplat.cli setup "*) echo "kernels ${*:4}" >> "$FAKE_LOG"; [ -z "${FAKE_KERNELS_FAIL:-}" ] ;;
   *warm_up*) echo "warm_up" >> "$FAKE_LOG"; [ -z "${FAKE_WARM_UP_FAILS:-}" ] ;;
   *importlib.metadata*) [ -z "${FAKE_WRONG_TORCH:-}" ] ;;
   *) echo "unexpected: $*" >&2; exit 9 ;;
@@ -108,8 +109,10 @@ def test_a_good_venv_is_left_alone_and_remade_for_other_requirements(machine):
     assert done[2] == "pip install --quiet --no-deps nuscenes-devkit==1.2.0", "whatever numpy it asks for"
     second = machine.run()
     assert second.returncode == 0 and machine.done() == [] and second.stderr == ""
-    for environment in ({"GSPLAT_ARCHS": "8.6"}, machine.gpus(ADA)):
-        assert machine.run(**environment).returncode == 0 and machine.done() == ["gsplat_build --if-needed"]
+    assert machine.run(GSPLAT_ARCHS="8.6").returncode == 0
+    assert machine.done() == ["gsplat_build --if-needed", "kernels --arch 8.6"]
+    assert machine.run(**machine.gpus(ADA)).returncode == 0
+    assert machine.done() == ["gsplat_build --if-needed", "kernels --gpu-kernels"]
     with open(machine.checkout / "constraints.txt", "a") as file:
         file.write("# more\n")
     assert machine.run().returncode == 0
@@ -129,6 +132,11 @@ def test_a_machine_that_cannot_train_is_reported_on_every_call(machine):
         assert result.returncode == 0 and machine.begun() == begun, "who has a GPU may do without"
         assert "a first training or world on the processors fails" in result.stderr and "make doctor" in result.stderr
     assert machine.run().returncode == 0 and machine.begun() == ["compileall", "warm_up", "warm_up"]
+
+
+def test_a_card_whose_kernels_cannot_be_compiled_beforehand_does_not_stop_the_setup(machine):
+    result = machine.run(FAKE_KERNELS_FAIL="1", **machine.gpus(ADA))
+    assert result.returncode == 0 and "the first jobs on a GPU compile its kernels" in result.stderr
 
 
 def test_an_interrupted_installation_is_not_trusted_and_remade_whole(machine):
