@@ -1,7 +1,7 @@
 """Renderings compared with the truth of a synthetic world: images and depth from beside the recorded path, and the
 street without the leading car."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from drivesplat.evaluation.metrics import (
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import unreadable
 from drivesplat.lidar.depth_record import PixelDepths
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
@@ -37,6 +37,7 @@ from drivesplat.readers.truth import (
     read_truth,
     truth_image,
 )  # fmt: skip
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.scene.evaluation_data import EvaluationData
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
@@ -163,9 +164,11 @@ def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) 
 
 
 @torch.no_grad()
-def rendered_with_depth(model: SplatModel, view: View) -> tuple[np.ndarray, np.ndarray]:
+def rendered_with_depth(
+    model: SplatModel, view: View, gaussians: Sequence[Gaussians] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The rendering, as of `rendered`, and the depth (h, w) of its surfaces in metres along the camera's axis."""
-    picture = model.render(view, with_surface_depth=True)
+    picture = model.render(view, gaussians=gaussians, with_surface_depth=True)
     assert picture.surface_depth is not None
     return picture.image.float().cpu().numpy(), picture.surface_depth.float().cpu().numpy()
 
@@ -175,13 +178,13 @@ def lateral_metrics(
 ) -> dict[str, Any] | None:
     """The metrics of each lateral view of `camera` by its offset, in metres to the left (negative: to the right); None
     without truth."""
-    views = known.truth.lateral(camera)
-    found = {str(float(view.left_m)): _lateral_view_metrics(model, known, view, lpips_map, device) for view in views}
+    views, fixed = known.truth.lateral(camera), FixedModel(model)
+    found = {str(float(view.left_m)): _lateral_view_metrics(fixed, known, view, lpips_map, device) for view in views}
     return {offset: metrics for offset, metrics in found.items() if metrics} or None
 
 
 def _lateral_view_metrics(
-    model: SplatModel, known: DriveTruth, view: TruthView, lpips_map: LpipsMap | None, device: torch.device
+    fixed: FixedModel, known: DriveTruth, view: TruthView, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any] | None:
     """The metrics of a lateral view over all its key frames by region, and `depth`, over static pixels; None without
     key frames. Moving objects are known from boxes, whatever masks the user supplies for recorded images."""
@@ -191,7 +194,9 @@ def _lateral_view_metrics(
 
     def renderings() -> Iterator[Rendering]:
         for index, frame, truth in frames:
-            yield index, frame, truth, *rendered_with_depth(model, known.view(index, frame, device))
+            seen_from = known.view(index, frame, device)
+            shown = rendered_with_depth(fixed.model, seen_from, fixed.sample_in(seen_from))
+            yield index, frame, truth, *shown
 
     def measure(one: Rendering) -> tuple[dict[str, FrameErrors], np.ndarray]:
         index, frame, truth, image, depth = one
@@ -216,6 +221,7 @@ def removal_metrics(
     recording, empty = known.recording, known.truth.without_leading(camera)
     if empty is None:
         return None
+    fixed = FixedModel(model)
     removed, untouched = RegionMetrics(lpips_map, REMOVAL_REGIONS), RegionMetrics(lpips_map, REMOVAL_REGIONS)
 
     Rendering = tuple[int, str, np.ndarray, np.ndarray, np.ndarray]
@@ -228,7 +234,7 @@ def removal_metrics(
             box, inside = seen
             view = view_of(recording.record, index, device)
             with torch.no_grad():
-                gaussians = model.gaussians_in(view)
+                gaussians = concatenate(fixed.sample_in(view))
                 kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
             yield index, truth.image, inside, rendered(model, view, kept), rendered(model, view, gaussians)
 

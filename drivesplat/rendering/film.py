@@ -18,10 +18,12 @@ from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.video import write_video
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
+from drivesplat.model.gaussians import concatenate
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.captions import Caption, captioned, drive_captions
 from drivesplat.rendering.color_bytes import uint8_image
+from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.images import target_size
@@ -130,7 +132,8 @@ def render_film(
         pictures = recorded_shot(model, shot, device)
     else:
         model.precompute(shot.seconds)
-        pictures = (frames_of_parts(model, view, [parts])[0] for view in shot.views(device))
+        fixed = FixedModel(model)
+        pictures = (frames_of_parts(fixed, view, [parts])[0] for view in shot.views(device))
     figures = write_film(path, pictures, shot, model, panels)
     return {**shot.record(), "offset": job.trajectory.model_dump(exclude={"parts"}), "parts": parts, **figures}
 
@@ -146,7 +149,8 @@ def render_parts(
     model, device = open_model(checkpoint, device_settings)
     panels = Panels(("everything", "static", "moving"), shot.size)
     model.precompute(shot.seconds)
-    of_all = (frames_of_parts(model, view, PARTS_SHOWN) for view in shot.views(device))
+    fixed = FixedModel(model)
+    of_all = (frames_of_parts(fixed, view, PARTS_SHOWN) for view in shot.views(device))
     captions = [PARTS_IN_WORDS[parts] for parts in PARTS_SHOWN]
     figures = write_film(path, map(panels.assembled, of_all), shot, model, panels, labels=captions)
     return {**shot.record(), "shows": ["all", "still", "moving"], "film": panels.record(), **figures}
@@ -201,10 +205,11 @@ def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterat
 
 
 @torch.no_grad()
-def frames_of_parts(model: SplatModel, view: View, shown: Sequence[ShownParts]) -> list[np.ndarray]:
+def frames_of_parts(fixed: FixedModel, view: View, shown: Sequence[ShownParts]) -> list[np.ndarray]:
     """A view (h, w, 3) uint8 of everything, of the static or of the moving parts, for each of `shown`. Moving parts are
     before plain grey."""
-    gaussians, dynamic = model.gaussians_in(view), model.moving()
+    model, gaussians = fixed.model, concatenate(fixed.sample_in(view))
+    dynamic = model.moving()
 
     def frame(parts: ShownParts) -> np.ndarray:
         if parts != "moving":
