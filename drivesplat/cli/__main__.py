@@ -129,7 +129,7 @@ def run_command(parsed: argparse.Namespace) -> int:
 
         return doctor(parsed.config)
     if parsed.command == setup.COMMAND:
-        return setup.run_setup(parsed)
+        return (0 if setup.is_for_gpus_alone(parsed) else _compile_for_processors()) or setup.run_setup(parsed)
     if parsed.command == "render":
         drive, outputs = drivesplat.open(parsed.folder, parsed.device), parsed.outputs.split(",")
         count = drivesplat.render_poses(drive, parsed.poses, parsed.camera, outputs, parsed.out, parsed.ego)
@@ -163,6 +163,15 @@ def run_command(parsed: argparse.Namespace) -> int:
     else:  # config
         print((WORKFLOW / ("docs/settings.md" if parsed.all else "config.yaml")).read_text(encoding="utf-8"), end="")
     return 0
+
+
+def _compile_for_processors() -> int:
+    """Compiles gsplat, where there is an NVIDIA card, and the kernels for processors. Returns the exit status."""
+    from drivesplat.machine.gsplat_build.__main__ import main as compile_gsplat
+    from drivesplat.training.warm_up import main as train_briefly
+    from drivesplat.world.warm_up import main as make_tiny_world
+
+    return compile_gsplat([]) or train_briefly() or make_tiny_world()
 
 
 def snakemake_command(arguments: Sequence[str]) -> list[str]:

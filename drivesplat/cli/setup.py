@@ -1,7 +1,6 @@
 """The command `drivesplat setup`: compiles what jobs otherwise compile at the first use, and wait for."""
 
 import argparse
-import hashlib
 import os
 import subprocess
 import sys
@@ -32,32 +31,28 @@ def add_parser(commands: Any) -> None:
     setup.add_argument("--arch", help=text)
 
 
-def run_setup(parsed: argparse.Namespace) -> int:
-    """Compiles what the arguments ask for. Returns the exit status. Raises ConfigError for an invalid `--arch`."""
-    if parsed.arch is not None:
-        return compile_for(parsed.arch)
-    if not parsed.gpu_kernels:
-        from drivesplat.machine.gsplat_build.__main__ import main as compile_gsplat
-        from drivesplat.training.warm_up import main as train_briefly
-        from drivesplat.world.warm_up import main as make_tiny_world
+def is_for_gpus_alone(parsed: argparse.Namespace) -> bool:
+    """Whether the arguments leave out gsplat and the kernels for processors."""
+    return parsed.gpu_kernels or parsed.arch is not None
 
-        status = compile_gsplat([]) or train_briefly() or make_tiny_world()
-        if status:
-            return status
-    return compile_on_cards()
+
+def run_setup(parsed: argparse.Namespace) -> int:
+    """Compiles the kernels of this package for GPUs. Returns the exit status. Raises ConfigError for an invalid
+    `--arch`."""
+    return compile_on_cards() if parsed.arch is None else compile_for(parsed.arch)
 
 
 def compile_for(archs: str) -> int:
     """Compiles the CUDA C++ kernels for compute capabilities such as "8.6;9.0". Needs no GPU. Returns the exit status.
     Raises ConfigError where one is malformed, DeviceError where NVRTC cannot compile."""
-    from drivesplat.kernels.cuda.compiled import compile_ahead
+    from drivesplat.kernels.warm_up import compile_cuda
     from drivesplat.machine.compute_capability import parse_arch
 
     for arch in archs.replace(";", " ").replace(",", " ").split():
         parsed = parse_arch(arch)
         if parsed is None:
             raise ConfigError(f"--arch: {arch!r} is no compute capability; write numbers such as 8.6,9.0")
-        count = compile_ahead("{}{}".format(*parsed[0]))
+        count = compile_cuda("{}{}".format(*parsed[0]))
         print(f"{count} CUDA C++ programs are compiled for {arch}; Triton's kernels are compiled on the first card")
     return 0
 
@@ -68,14 +63,16 @@ def compile_on_cards(run: Callable[[Sequence[str], Path], int] | None = None) ->
     import torch
 
     from drivesplat.kernels.triton_support import compiles
+    from drivesplat.kernels.warm_up import triton_mark
 
     if not torch.cuda.is_available() or not compiles():
         return 0
-    mark = mark_of_cards()
+    cards = range(torch.cuda.device_count())
+    mark = triton_mark({torch.cuda.get_device_capability(card) for card in cards})
     if mark.exists():
         return 0
     print("drivesplat: compiling the kernels for this card; a minute or two, once", file=sys.stderr)
-    slots = JOBS_PER_CARD * torch.cuda.device_count()
+    slots = JOBS_PER_CARD * len(cards)
     arguments = ["--cores", "all", "--resources", f"gpu={slots}", "--configfile", *PRESETS, "--", *TARGETS]
     with tempfile.TemporaryDirectory() as folder:
         status = (run or _run_workflow)(arguments, Path(folder))
@@ -85,23 +82,6 @@ def compile_on_cards(run: Callable[[Sequence[str], Path], int] | None = None) ->
     mark.parent.mkdir(parents=True, exist_ok=True)
     mark.touch()
     return 0
-
-
-def mark_of_cards() -> Path:
-    """The file beside Triton's compiled kernels which says that those of this copy's code are compiled for the kinds of
-    GPUs of this machine."""
-    import torch
-    import triton
-
-    from drivesplat.kernels import triton as kernels
-    from drivesplat.provenance.code.code_digest import code_digest
-
-    files = sorted(Path(kernels.__file__).parent.glob("*.py"))
-    digest = hashlib.sha256("".join(map(code_digest, files)).encode()).hexdigest()
-    capabilities = {torch.cuda.get_device_capability(number) for number in range(torch.cuda.device_count())}
-    kinds = "-".join(f"sm{major}{minor}" for major, minor in sorted(capabilities))
-    folder = os.environ.get("TRITON_CACHE_DIR") or Path.home() / ".triton" / "cache"
-    return Path(folder) / f"drivesplat-{digest[:16]}-{triton.__version__}-{kinds}"
 
 
 def _run_workflow(arguments: Sequence[str], folder: Path) -> int:
