@@ -28,15 +28,15 @@ def run_warm_up(module: str, warm_up: Callable[[Path], None], arguments: Sequenc
 
 
 def compile_cuda(capability: str) -> int:
-    """Compiles the CUDA C++ programs that jobs use into the cache, where they are not, for GPUs of a compute capability,
-    such as "90". Needs no GPU. Returns their number. Raises DeviceError where they cannot be compiled."""
+    """Compiles the CUDA C++ programs that jobs use into the cache, for GPUs of a compute capability such as "90", where
+    they are missing. Needs no GPU. Returns their number. Raises DeviceError where they cannot be compiled."""
     from drivesplat.kernels.cuda.compiled import compile_ahead
 
     return compile_ahead(capability)
 
 
 def triton_mark(capabilities: Collection[tuple[int, int]]) -> Path:
-    """The path of a file beside Triton's compiled kernels. It exists where those of this code are compiled for GPUs with
+    """The path of a file beside Triton's compiled kernels. It exists where those of this code are compiled for GPUs of
     these compute capabilities."""
     import triton
 
