@@ -123,3 +123,11 @@ def test_no_class_name_is_used_twice():
     for module, node in classes():
         places[node.name].add(module)
     assert not {name: sorted(found) for name, found in places.items() if len(found) > 1}
+
+
+def test_a_main_block_ends_its_module():
+    """What stands below it is not defined when it runs."""
+    for path in sorted(REPOSITORY.glob("drivesplat/**/*.py")):
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+        mains = [i for i, node in enumerate(body) if isinstance(node, ast.If) and "__main__" in ast.dump(node.test)]
+        assert mains in ([], [len(body) - 1]), path

@@ -188,10 +188,6 @@ def main(arguments: Sequence[str], folder: Path = ROOT) -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
-
-
 def settings_page() -> str:
     """The text of docs/settings.md."""
     return PAGE_HEAD + "".join(f"\n## {title}\n\n{text}" for title, text in _sections(Config, ""))
@@ -326,3 +322,7 @@ def _values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
 def _linked(text: str) -> str:
     """A text in which names of pages are links."""
     return re.sub(r"\bdocs/([\w-]+)\.md\b", r"[\1.md](\1.md)", text)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
