@@ -67,6 +67,7 @@ rule evaluate_blocks:
     """
     input:
         scene=plan.annotated_scene,
+        blocks="<results>/{scene}/blocks.json",
         evals=long_drives.results("{method}/eval.json"),
         objects=long_drives.results("{method}/eval_objects.json"),
     output:
@@ -123,7 +124,7 @@ rule film_blocks:
         mem_mb=8000,
         runtime=240,
     params:
-        settings=plan.settings("film"),
+        settings=plan.settings("film_blocks"),
         code=plan.code("film_blocks"),
     script:
         "../workflow_scripts/film_blocks.py"
@@ -151,7 +152,7 @@ rule export_blocks:
         mem_mb=8000,
         runtime=60,
     params:
-        settings=plan.settings("export"),
+        settings=plan.settings("export_blocks"),
         code=plan.code("export_blocks"),
     script:
         "../workflow_scripts/export_blocks.py"

@@ -48,4 +48,5 @@ onerror:
             from drivesplat.report.partial import write_partial_report
 
             write_partial_report(plan)
+        run_costs.name_failed_blocks()
         run_costs.end()

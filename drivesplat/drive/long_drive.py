@@ -12,12 +12,14 @@ from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.drive.world_state import AnyCamera
 from drivesplat.errors import RequestError
+from drivesplat.io.storage import read_json
 from drivesplat.scene.blocks import BLOCKS, read_blocks
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 
 POSES = {"ego_to_world", "camera_to_world", "sensor_to_world"}
 """The arguments of a rendering that are poses."""
+CHECKPOINT = "checkpoint.npz"
 MAX_OPEN = 2
 """The blocks that are in memory."""
 
@@ -59,6 +61,22 @@ class LongDrive:
         """The timestamp of second 0."""
         return min(recording.timestamp for recording in self.scene.frames or self.scene.sweeps)
 
+    @property
+    def left_out(self) -> list[int]:
+        """The numbers of the blocks that cannot be rendered: those without a trained model, and those that the figures
+        of the drive leave out (`datasets.*.blocks.leave_out`)."""
+        measured = self.folder / "eval.json"
+        names = read_json(measured, "evaluate_blocks")["protocol"].get("left_out", []) if measured.is_file() else []
+        return [
+            number
+            for number, name in enumerate(self.blocks.names)
+            if name in names or not (self._folder_of(number) / CHECKPOINT).is_file()
+        ]
+
+    def _folder_of(self, number: int) -> Path:
+        """The folder of a block's method."""
+        return self.folder.parents[1] / self.blocks.names[number] / self.folder.name
+
     @cached_property
     def duration(self) -> float:
         """The time of the last image in seconds; of the last sweep without images."""
@@ -67,20 +85,24 @@ class LongDrive:
 
     def block(self, number: int) -> TrainedDrive:
         """A block as a drive of its own, with times from its first image and a world with an origin of its own. Raises
-        RequestError for an unknown one, and one that is not trained."""
+        RequestError for an unknown one, and one that is `left_out`."""
         if not 0 <= number < len(self.blocks.blocks):
             raise RequestError(f"{self.folder} has no block {number}; it has {len(self.blocks.blocks)}, from 0 on")
         if number not in self._open:
-            folder = self.folder.parents[1] / self.blocks.names[number] / self.folder.name
+            if number in self.left_out:
+                raise RequestError(
+                    f"block {number} of {self.folder} is left out or not trained: {self._folder_of(number)} cannot be "
+                    "rendered as part of the drive; LongDrive.left_out lists such blocks (docs/long_drives.md)"
+                )
             while len(self._open) >= MAX_OPEN:
                 self._open.pop(next(iter(self._open)))
-            self._open[number] = open_drive(folder, self._device)
+            self._open[number] = open_drive(self._folder_of(number), self._device)
         self._open[number] = self._open.pop(number)
         return self._open[number]
 
     def at(self, time: float) -> tuple[TrainedDrive, float]:
         """The block in which the vehicle is at a time, and that time in seconds since the block's first image. Raises
-        RequestError for a time outside of the recording."""
+        RequestError for a time outside of the recording, and in a block that is `left_out`."""
         if not 0.0 <= time <= self.duration:
             raise RequestError(f"{self.folder} was recorded from 0 to {self.duration:.2f} s, not at {time:g} s")
         timestamp = self._first + round(time * 1e6)

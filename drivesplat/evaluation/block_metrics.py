@@ -12,9 +12,10 @@ from drivesplat.evaluation.eval_record import summarize_swept_drive
 from drivesplat.evaluation.evaluate import findings
 from drivesplat.evaluation.metrics import MIN_FRAME_PIXELS, RegionMetrics, psnr, with_gap
 from drivesplat.io.storage import Provenance, read_record
+from drivesplat.scene.blocks import Blocks, within
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import HELD_OUT_GROUPS, held_out_key_frames, training_images
-from drivesplat.settings.images import HoldoutSettings
+from drivesplat.settings.blocks import PooledJob
 
 COMPARED = ("version", "cameras", "eval_camera", "sweeps", "holdout", "poses", "regions", "extra_points")
 """Of a protocol, what follows from settings: it is the same in all blocks of a drive."""
@@ -41,43 +42,45 @@ class BlockEvaluation:
 
 
 def pooled(
-    scene: Scene, holdout: HoldoutSettings, blocks: Mapping[str, BlockEvaluation]
+    scene: Scene, blocks: Blocks, job: PooledJob, measured: Mapping[str, BlockEvaluation]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The contents of the eval.json and the eval_objects.json of a drive, without provenance, from the measurements of
-    its blocks by name. Pixels of all blocks count alike. Truth, LiDAR scans and LiDAR depth are those of blocks alone.
+    its blocks that are not left out, by name. Pixels of all these blocks count alike. Truth, LiDAR scans and LiDAR
+    depth are those of blocks alone.
 
     Raises ResultError where blocks were measured differently.
     """
-    first, *others = blocks.values()
-    for name, other in zip(list(blocks)[1:], others, strict=True):
+    first, *others = measured.values()
+    for name, other in zip(list(measured)[1:], others, strict=True):
         for key in COMPARED:
             if other.record["protocol"].get(key) != first.record["protocol"].get(key):
                 raise ResultError(
-                    f"blocks {next(iter(blocks))} and {name} were measured differently ({key}); delete the older "
+                    f"blocks {next(iter(measured))} and {name} were measured differently ({key}); delete the older "
                     "eval.json and rerun"
                 )
-    every, header = list(blocks.values()), {"schema": 1, "scene": scene.name, "dataset": scene.dataset}
+    every, header = list(measured.values()), {"schema": 1, "scene": scene.name, "dataset": scene.dataset}
     groups = {group: _pooled_group(every, group) for group in HELD_OUT_GROUPS}
     objects = {group: _pooled_objects(every, group) for group in HELD_OUT_GROUPS}
-    shown = next(iter(blocks))
+    shown = next(iter(measured))
     result = {
         **groups,
         "tracks": first.record["result"]["tracks"],
         **_pooled_training(every),
         "findings": findings(groups["interpolation"]),
         "shown": {**first.record["result"]["shown"], "block": shown},
-        "blocks": {name: _of_block(own) for name, own in blocks.items()},
+        "blocks": {name: _of_block(own) for name, own in measured.items()},
     }
     if "lpips_unavailable" in first.record["result"]:
         result["lpips_unavailable"] = first.record["result"]["lpips_unavailable"]
-    measured = next((own for own in every if _frames([own], "interpolation").get("all")), first)
+    with_images = next((own for own in every if _frames([own], "interpolation").get("all")), first)
     seen = [own.record["protocol"].get("visibility") for own in every]
     protocol = {
-        **measured.record["protocol"],
+        **with_images.record["protocol"],
         "visibility": next((kind for kind in ("estimated", "annotated") if kind in seen), None),
         "images_missing": scene.missing_images,
-        "held_out_frames": held_out_key_frames(scene, holdout),
-        "train_images": len(training_images(scene, holdout)),
+        "held_out_frames": _held_out(scene, blocks, job),
+        "train_images": _training_images(scene, blocks, job),
+        "left_out": [blocks.names[number] for number in job.left_out],
         "key_frame_range": scene.key_frame_range,
         "lidar_missing": sum(own.record["protocol"]["lidar_missing"] for own in every),
     }
@@ -87,6 +90,20 @@ def pooled(
     drive = {**summarize_swept_drive(scene), **{group: _pooled_drive(every, group) for group in HELD_OUT_GROUPS}}
     record = {**header, "protocol": protocol, "drive": drive, "result": result}
     return record, {**header, "groups": objects}
+
+
+def _held_out(scene: Scene, blocks: Blocks, job: PooledJob) -> dict[str, list[int]]:
+    """The held-out key frames of a drive by group, without those of blocks that are left out."""
+    stamps = scene.key_frame_timestamps.tolist()
+    every = held_out_key_frames(scene, job.holdout).items()
+    return {group: [i for i in indices if blocks.at(stamps[i]) not in job.left_out] for group, indices in every}
+
+
+def _training_images(scene: Scene, blocks: Blocks, job: PooledJob) -> int:
+    """The number of the training images of a drive, without those that only blocks which are left out have."""
+    stamps = [scene.frames[i].timestamp for i in training_images(scene, job.holdout)]
+    used = np.concatenate([blocks.blocks[number].used for number in blocks.without(job.left_out)])
+    return int(within(np.array(stamps, dtype=np.int64), used).sum())
 
 
 def _frames(blocks: Sequence[BlockEvaluation], group: str) -> dict[str, list[Sequence[int | float]]]:

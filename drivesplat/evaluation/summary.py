@@ -43,6 +43,8 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
         lines.append("The scene has no camera, so there are figures of LiDAR alone")
     elif not any(_psnr(method[group], "static") for method in metrics["methods"].values() for group in GROUP_PLACES):
         lines.append("No image is held out (holdout), so there are no figures of held-out images")
+    if left_out := metrics.get("protocol", {}).get("left_out"):
+        lines.append(f"Blocks are left out of the drive, and of all figures: {', '.join(left_out)}")
     for name, method in metrics["methods"].items():
         lines += [f"{name}{text}" for text in _of_method(method, metrics.get("lidar_baselines", {}))]
     folder = Path(path).parent

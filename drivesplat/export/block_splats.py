@@ -15,6 +15,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.splat_ply import write_splat_ply
 from drivesplat.scene.blocks import Blocks
 from drivesplat.scene.scene import Scene
+from drivesplat.settings.export import BlockSplatsJob
 
 log = logging.getLogger(__name__)
 
@@ -24,25 +25,28 @@ CONVENTIONS = {
     "translation": "From a file's coordinates to those of the drive, in metres: drive = file + translation.",
     "origin": "From the drive's coordinates to the dataset's global frame: global = drive + origin.",
     "lower": "The least x, y, z of the file's centres, in the file's coordinates; upper: the largest.",
+    "left_out": "Blocks without a file. What others know of their place is in the files of these.",
     "core": "The intervals [first, end) in microseconds in which the vehicle is in the block.",
 }
 
 
 def export_blocks(
-    folder: Path, scene: Scene, blocks: Blocks, checkpoints: Sequence[str], sh_degree: int | None
+    folder: Path, scene: Scene, blocks: Blocks, checkpoints: Sequence[str], job: BlockSplatsJob
 ) -> tuple[dict[str, Any], list[Provenance]]:
-    """Writes a PLY of every block into a folder, from its checkpoint. A Gaussian belongs to the block whose path is
-    nearest to it. Returns the content of the index without provenance, and the provenances of the checkpoints."""
+    """Writes a PLY of every block that is not left out into a folder, from their checkpoints in order. A Gaussian
+    belongs to the one of these blocks whose path is nearest to it. Returns the content of the index without provenance,
+    and the provenances of the checkpoints."""
     entries, upstream = [], []
-    for number, (name, path) in enumerate(zip(blocks.names, checkpoints, strict=True)):
+    for number, path in zip(blocks.without(job.left_out), checkpoints, strict=True):
+        name = blocks.names[number]
         checkpoint, origin = read_checkpoint(path), blocks.blocks[number].origin
         upstream.append(checkpoint.provenance)
         every = _static(trained_model(checkpoint))
         places = every.means.double().numpy()[:, :2] + origin[:2]
-        own = every[torch.from_numpy(blocks.nearest(places) == number)]
+        own = every[torch.from_numpy(blocks.nearest(places, job.left_out) == number)]
         log.info("%s: %d of %d static Gaussians", name, len(own), len(every))
         note = {"scene": name, "origin": (scene.origin + origin).tolist(), **digests(checkpoint.provenance)}
-        write_splat_ply(folder / f"{name}.ply", with_sh_degree(own, sh_degree or 0), note)
+        write_splat_ply(folder / f"{name}.ply", with_sh_degree(own, job.sh_degree or 0), note)
         bounds = {"lower": own.means.amin(dim=0).tolist(), "upper": own.means.amax(dim=0).tolist()} if len(own) else {}
         entries.append(
             {
@@ -54,8 +58,10 @@ def export_blocks(
                 "core": blocks.blocks[number].core.tolist(),
             }
         )
+    for number in job.left_out:  # of an earlier run
+        (folder / f"{blocks.names[number]}.ply").unlink(missing_ok=True)
     index = {"schema": SCHEMA, "scene": scene.name, "origin": scene.origin.tolist(), "conventions": CONVENTIONS}
-    return {**index, "blocks": entries}, upstream
+    return {**index, "blocks": entries, "left_out": [blocks.names[number] for number in job.left_out]}, upstream
 
 
 @torch.no_grad()

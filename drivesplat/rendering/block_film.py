@@ -1,6 +1,6 @@
 """The stage `film_blocks`: the film of a long drive, of which one block at a time is in memory."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -13,7 +13,7 @@ import torch
 from drivesplat.io.storage import Provenance
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import open_model, read_checkpoint
-from drivesplat.rendering.captions import drive_captions
+from drivesplat.rendering.captions import drive_captions, text_picture
 from drivesplat.rendering.film import Shot, encode_film, shot_of
 from drivesplat.rendering.fixed_model import FixedModel
 from drivesplat.rendering.frames import film_frames
@@ -21,11 +21,13 @@ from drivesplat.rendering.panels import Panels
 from drivesplat.scene.blocks import Blocks, within
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.render import FilmJob
+from drivesplat.settings.render import BlockFilmJob
 from drivesplat.trajectories.camera_path import CameraPath, film_path
 
 BLEND_M = 5.0
 """Metres of path before and after a border between blocks in which images of both are blended."""
+LEFT_OUT = "block {} left out"
+"""What frames of a block that is left out show, on dark grey."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,9 @@ class BlockShare:
     weight: float = 1.0
 
 
-def block_shares(blocks: Blocks, path: CameraPath) -> list[BlockShare]:
+def block_shares(blocks: Blocks, path: CameraPath, left_out: Collection[int] = ()) -> list[BlockShare]:
     """The blocks of each frame of a path: from BLEND_M before a border to BLEND_M behind it, one block fades into the
-    other, as far as both have recordings there."""
+    other, as far as both have recordings there and neither is `left_out`."""
     places, stamps = path.camera_to_world[:, :3, 3], path.timestamps
     arcs = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
     numbers = [blocks.at(int(timestamp)) for timestamp in stamps]
@@ -49,16 +51,17 @@ def block_shares(blocks: Blocks, path: CameraPath) -> list[BlockShare]:
         for i in np.flatnonzero(np.abs(arcs - border) < BLEND_M).tolist():
             own, other = (after - 1, after) if i < after else (after, after - 1)
             known = within(stamps[i : i + 1], blocks.blocks[numbers[other]].used)[0]
-            if numbers[i] == numbers[own] and known:
+            if numbers[i] == numbers[own] and known and not {numbers[i], numbers[other]} & {*left_out}:
                 weight = 0.5 + 0.5 * abs(arcs[i] - border) / BLEND_M
                 shares[i] = BlockShare(numbers[i], numbers[other], float(weight))
     return shares
 
 
 class _OpenBlocks:
-    """The models of a drive's blocks, of which the last two that were used are in memory."""
+    """The models of a drive's blocks, given by their files by number, of which the last two that were used are in
+    memory."""
 
-    def __init__(self, scenes: Sequence[str], checkpoints: Sequence[str], device_settings: DeviceSettings):
+    def __init__(self, scenes: Mapping[int, str], checkpoints: Mapping[int, str], device_settings: DeviceSettings):
         self._scenes, self._checkpoints, self._device_settings = scenes, checkpoints, device_settings
         self._open: dict[int, tuple[FixedModel, Scene, torch.device]] = {}
         self.provenances: dict[int, Provenance] = {}
@@ -90,28 +93,35 @@ def render_block_film(
     blocks: Blocks,
     scenes: Sequence[str],
     checkpoints: Sequence[str],
-    job: FilmJob,
+    job: BlockFilmJob,
     device_settings: DeviceSettings,
     path: Path,
 ) -> tuple[dict[str, Any], list[Provenance]]:
-    """Writes the MP4 `path` of a drive from the files of its blocks, in order. Returns the content of the record of its
-    cameras as `render_film` does, and the provenances of the checkpoints. Raises what `render_film` raises."""
+    """Writes the MP4 `path` of a drive from the files of its blocks that are not left out, in order; frames of those
+    that are say so. Returns the content of the record of its cameras as `render_film` does, with the names of blocks
+    that are `left_out`, and the provenances of the checkpoints. Raises what `render_film` raises."""
     shot = shot_of(scene, film_path(scene, job.camera, job.fps, job.trajectory), job)
     panels = Panels((f"{path.parent.name}: {job.trajectory.in_words}",), shot.size)
     captions = drive_captions(panels.labels, shot.seconds, shot.trained_until)
-    opened = _OpenBlocks(scenes, checkpoints, device_settings)
+    numbers = blocks.without(job.left_out)
+    files = (dict(zip(numbers, paths, strict=True)) for paths in (scenes, checkpoints))
+    opened = _OpenBlocks(*files, device_settings)
     with explain_out_of_memory(lambda: len(opened)):
-        frames = zip(_pictures(shot, blocks, opened), captions, strict=True)
+        frames = zip(_pictures(shot, blocks, opened, job.left_out), captions, strict=True)
         figures = encode_film(path, frames, len(captions), panels, shot.format)
     offset = job.trajectory.model_dump(exclude={"parts"})
-    record = {**shot.record(), "offset": offset, "parts": "all", **figures}
+    left_out = [blocks.names[number] for number in job.left_out]
+    record = {**shot.record(), "offset": offset, "parts": "all", "left_out": left_out, **figures}
     return record, list(opened.provenances.values())
 
 
-def _pictures(shot: Shot, blocks: Blocks, opened: _OpenBlocks) -> Iterator[np.ndarray]:
-    shares = block_shares(blocks, shot.cameras)
+def _pictures(shot: Shot, blocks: Blocks, opened: _OpenBlocks, left_out: Collection[int]) -> Iterator[np.ndarray]:
+    shares = block_shares(blocks, shot.cameras, left_out)
     for (number, other), run in groupby(range(len(shares)), lambda i: (shares[i].number, shares[i].other)):
         indices = list(run)
+        if number in left_out:
+            yield from [text_picture(LEFT_OUT.format(number), shot.size)] * len(indices)
+            continue
         own = opened.frames(shot, number, indices)
         if other is None:
             yield from own

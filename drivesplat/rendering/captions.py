@@ -14,6 +14,8 @@ HEIGHT_SHARE = 0.04
 """Height of the letters as a share of a panel's height."""
 MIN_HEIGHT = 9
 """Pixels; smaller letters cannot be read."""
+DARK = 24
+"""Grey level, of 255, of pictures that show a text alone."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ def drive_captions(
 
 def captioned(frames: Iterable[tuple[np.ndarray, Caption]], panels: Panels) -> Iterator[np.ndarray]:
     """Each picture (h, w, 3) uint8 of a film with its caption."""
-    size = max(MIN_HEIGHT, round(HEIGHT_SHARE * panels.size[1]))
+    size = _letters(panels.size[1])
     margin = size // 2
     for picture, caption in frames:
         result = picture.copy()
@@ -55,6 +57,19 @@ def captioned(frames: Iterable[tuple[np.ndarray, Caption]], panels: Panels) -> I
         clock = text_mask(caption.clock, size)
         _write(result, clock, result.shape[1] - margin - clock.shape[1], margin)
         yield result
+
+
+def text_picture(text: str, size: tuple[int, int]) -> np.ndarray:
+    """A dark picture (h, w, 3) uint8 of `size`, width and height in pixels, with a text in its middle."""
+    width, height = size
+    picture, mask = np.full((height, width, 3), DARK, np.uint8), text_mask(text, _letters(height))
+    _write(picture, mask, (width - mask.shape[1]) // 2, (height - mask.shape[0]) // 2)
+    return picture
+
+
+def _letters(height: int) -> int:
+    """The height of letters in a panel of a height, in pixels."""
+    return max(MIN_HEIGHT, round(HEIGHT_SHARE * height))
 
 
 @lru_cache(maxsize=256)

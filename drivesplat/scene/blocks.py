@@ -1,5 +1,6 @@
 """Blocks of a long drive: stretches of its path, each of which is a scene of its own."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -54,10 +55,17 @@ class Blocks:
         before = [pair for pair in firsts if pair[0] <= timestamp]
         return max(before)[1] if before else min(firsts)[1]
 
-    def nearest(self, places: Float64[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
-        """The number of the block whose path is nearest to each of some places in the drive's world (metres)."""
-        owners = np.repeat(np.arange(len(self.blocks)), [len(block.path) for block in self.blocks])
-        return owners[cKDTree(np.concatenate([block.path for block in self.blocks])).query(places)[1]]
+    def without(self, left_out: Collection[int]) -> list[int]:
+        """The numbers of the blocks, without those that are left out."""
+        return [number for number in range(len(self.blocks)) if number not in left_out]
+
+    def nearest(self, places: Float64[np.ndarray, "n 2"], left_out: Collection[int] = ()) -> Int64[np.ndarray, " n"]:
+        """The number of the block whose path is nearest to each of some places in the drive's world (metres), of the
+        blocks that are not left out."""
+        numbers = self.without(left_out)
+        paths = [self.blocks[number].path for number in numbers]
+        owners = np.repeat(np.array(numbers), [len(path) for path in paths])
+        return owners[cKDTree(np.concatenate(paths)).query(places)[1]]
 
 
 def within(timestamps: Int64[np.ndarray, " n"], intervals: Int64[np.ndarray, "i 2"]) -> Bool[np.ndarray, " n"]:

@@ -1,8 +1,10 @@
 """Settings of long drives, which are cut into blocks along their path, and the names of blocks."""
 
 import re
+from collections.abc import Sequence
+from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.images import HoldoutSettings
@@ -10,7 +12,9 @@ from drivesplat.settings.images import HoldoutSettings
 _BLOCK = re.compile(r"(.+)\.(\d{3,})")
 
 
-class BlockSettings(Settings):
+class CutSettings(Settings):
+    """Where a drive is cut."""
+
     length_m: float = Field(150.0, ge=20, le=10_000)
     """:printed: Length in metres of the path of a block. Time does not count: a vehicle that stands makes no block."""
     overlap_m: float = Field(40.0, ge=0, le=1_000)
@@ -20,16 +24,63 @@ class BlockSettings(Settings):
     the block of the first time."""
 
     @model_validator(mode="after")
-    def _overlap_is_shorter(self) -> "BlockSettings":
+    def _overlap_is_shorter(self) -> "CutSettings":
         if self.overlap_m > self.length_m:
             raise ValueError(f"overlap_m must be at most length_m ({self.length_m:g})")
         return self
 
 
+class BlockSettings(CutSettings):
+    leave_out: tuple[int | str, ...] = ()
+    """:printed: Blocks without which the results of the drive are made, such as those whose training fails, by number:
+    [3]. Where the dataset has several scenes, by name: ["commute.003"]. docs/long_drives.md"""
+
+    @field_validator("leave_out", mode="before")
+    @classmethod
+    def _names_are_quoted(cls, value: Any) -> Any:
+        for one in value if isinstance(value, (list, tuple)) else ():
+            if isinstance(one, float):
+                raise ValueError(f"{one} is a number to YAML: write the name of a block in quotes")
+            if isinstance(one, bool) or (isinstance(one, int) and one < 0):
+                raise ValueError(f"{one} is no number of a block; they are counted from 0")
+        return value
+
+    def require_drives(self, drives: Sequence[str]) -> None:
+        """Raises ValueError where `leave_out` names no block of any of the `drives` of a dataset, or a number while
+        there are several drives."""
+        for one in self.leave_out:
+            if isinstance(one, int) and len(drives) != 1:
+                raise ValueError(
+                    f"blocks.leave_out names block {one}, and there are {len(drives)} scenes: name the block, such as "
+                    f'"{block_scene_name(drives[0] if drives else "commute", one)}"'
+                )
+            if isinstance(one, str) and (drive_of(one) == one or drive_of(one) not in drives):
+                raise ValueError(
+                    f"blocks.leave_out names {one!r}, which is no block of any of its scenes; their names are like "
+                    f"{block_scene_name(drives[0] if drives else 'commute', 3)}"
+                )
+
+    def left_out(self, drive: str) -> tuple[int, ...]:
+        """The numbers of the blocks of a drive that are left out, in order."""
+        numbers = (
+            one if isinstance(one, int) else int(one.rpartition(".")[2])
+            for one in self.leave_out
+            if isinstance(one, int) or drive_of(one) == drive
+        )
+        return tuple(sorted(set(numbers)))
+
+
 class BlocksJob(Settings):
     """All settings that determine the blocks of a drive."""
 
-    blocks: BlockSettings
+    blocks: CutSettings
+    holdout: HoldoutSettings
+
+
+class PooledJob(Settings):
+    """All settings that determine the figures of a drive, given those of its blocks."""
+
+    left_out: tuple[int, ...]
     holdout: HoldoutSettings
 
 

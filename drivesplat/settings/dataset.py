@@ -62,6 +62,10 @@ class DatasetSettings(Settings):
         path = Path(self.dataroot).expanduser()
         return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
+    def left_out(self, scene: str) -> tuple[int, ...]:
+        """The numbers of the blocks of a scene without which its results are made; none unless it is cut."""
+        return self.blocks.left_out(scene) if self.blocks else ()
+
     @field_validator("scenes", mode="before")
     @classmethod
     def _scenes_are_quoted(cls, value: Any) -> Any:
@@ -78,6 +82,8 @@ class DatasetSettings(Settings):
                 raise ValueError(f"frames names scene {scene!r}, which is not in scenes")
             if not 0 <= first < last:
                 raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
+        if self.blocks:
+            self.blocks.require_drives(self.scenes)
         for scene in self.edits:
             if scene not in self.scenes and not (self.blocks and drive_of(scene) in self.scenes):
                 raise ValueError(f"edits names scene {scene!r}, which is not in scenes")

@@ -97,6 +97,13 @@ class SplatJob(Settings):
     time_s: float | None = None
 
 
+class BlockSplatsJob(Settings):
+    """All settings that determine the splats of a drive that is cut into blocks, some of which may be left out."""
+
+    left_out: tuple[int, ...]
+    sh_degree: int | None
+
+
 class DriveJob(Settings):
     """All settings that determine one rendered drive folder: the `edit` of its drive, or the `trajectory` beside the
     recorded one. `width` is that of its images in pixels; None: that of the training images. `labels` are the kinds of

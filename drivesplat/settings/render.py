@@ -112,6 +112,12 @@ class FilmJob(FilmFormat):
     trajectory: TrajectorySettings
 
 
+class BlockFilmJob(FilmJob):
+    """All settings that determine one film of a drive that is cut into blocks: the blocks that are left out, too."""
+
+    left_out: tuple[int, ...] = ()
+
+
 class EditJob(FilmFormat):
     """All settings that determine the film of one edit; `frames`: write its frames, too."""
 

@@ -28,6 +28,16 @@ def is_cut_short(text: str) -> bool:
     return has_begun(text) and not _ENDS.search(text) and not failures(text)
 
 
+def has_failed(log: Path, since: float) -> bool:
+    """Whether a job that wrote this log since a time (seconds of the epoch), and no longer runs, failed or was
+    killed."""
+    try:
+        text = log.read_text(encoding="utf-8", errors="replace") if log.stat().st_mtime >= since else ""
+    except OSError:
+        return False
+    return bool(failures(text)) or is_cut_short(text)
+
+
 def why_missing(logs: Path, scene: str) -> str:
     """Why a scene has no result: the message of the job that failed last (each log is that of the last attempt), else
     the name of an interrupted job, else NOT_MEASURED."""

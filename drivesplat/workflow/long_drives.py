@@ -10,6 +10,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.settings.blocks import block_scene_name, drive_of
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.outputs import SPLATS, Outputs
+from drivesplat.workflow.without_cameras import scene_methods
 
 OF_DRIVES = (
     "scene.json", "scene_refined.json", "poses.json", "triangulated.npz", "blocks.json", "metrics.json", "index.html",
@@ -17,6 +18,18 @@ OF_DRIVES = (
 """The results of a drive that is cut into blocks; others are those of blocks."""
 OF_DRIVES_ALONE = ("scene_refined.json", "poses.json", "triangulated.npz", "blocks.json")
 """Those of them that blocks do not have."""
+BLOCKS = "blocks.json"
+FILES_OF_TARGETS = {
+    "edits": "{method}/edits/NAME.mp4",
+    "drives": "{method}/edits/NAME/drive/drive.json",
+    "assets": "{method}/assets/assets.json",
+    "runs": "{method}/runs/NAME.json",
+    "mcap": "{method}/drive.mcap",
+    "looks": "{method}/removal.png",
+    "exports": "{method}/viewer.html",
+    "alpasim": "{method}/scene.alpasim.usdz",
+}
+"""What the targets that make nothing, or little, of such a drive make of a scene: a file of each."""
 FILM_FILES = (".mp4", ".cameras.json")
 
 
@@ -41,16 +54,29 @@ class LongDrives:
         return str(self._block(wildcards.scene)["digest"])
 
     def results(self, name: str) -> Callable[[Any], list[str]]:
-        """The function of wildcards that gives the result `name` of every block of a drive, in order. In it, '{method}'
-        is the method of the job."""
+        """The function of wildcards that gives the result `name` of every block of a drive that is not left out, in
+        order. In it, '{method}' is the method of the job."""
 
         def of_blocks(wildcards: Any) -> list[str]:
-            self._blocks_file(wildcards.scene)
+            drive = wildcards.scene
+            self._blocks_file(drive)
             folder, own = self._plan.config.results_dir, name.format(method=getattr(wildcards, "method", ""))
-            count = len(self._blocks(wildcards.scene))
-            return [f"{folder}/{block_scene_name(wildcards.scene, number)}/{own}" for number in range(count)]
+            return [f"{folder}/{block_scene_name(drive, number)}/{own}" for number in self._numbers(drive)]
 
         return of_blocks
+
+    def _numbers(self, drive: str) -> list[int]:
+        """The numbers of the blocks of a drive that are not left out."""
+        config, count = self._plan.config, len(self._blocks(drive))
+        left_out = config.datasets[config.dataset_of(drive)].left_out(drive)
+        for number in left_out:
+            if number >= count:
+                raise ConfigError(
+                    f"blocks.leave_out names block {number} of scene {drive}, which has {count}, counted from 0"
+                )
+        if len(left_out) == count:
+            raise ConfigError(f"blocks.leave_out leaves no block of scene {drive}, which has {count}; keep one")
+        return [number for number in range(count) if number not in left_out]
 
     def _block(self, scene: str) -> dict[str, Any]:
         drive, number = drive_of(scene), int(scene.rpartition(".")[2])
@@ -85,12 +111,62 @@ def refuse_results_of_blocks(config: Config, scene: str, path: Sequence[str]) ->
         )
     if not config.is_cut(scene):
         return
-    trajectories = for_scene(config, scene).render.trajectories.items()
-    films = [name for name, trajectory in trajectories if trajectory.parts == "all"]
+    films = _films(config, scene)
     own = {"eval.json", "eval_objects.json", *(f"{name}{end}" for name in films for end in FILM_FILES)}
     known = path[-1] in (own if len(path) == 2 else OF_DRIVES) if len(path) < 3 else path[1:] == SPLATS.split("/")
     if not known:
         raise ConfigError(
             f"scene {scene} is cut into blocks, and {'/'.join(path)} is a result of one block: ask for "
-            f"{config.results_dir}/{block_scene_name(scene, 0)}/{'/'.join(path)} (docs/long_drives.md)"
+            f"{config.results_dir}/{block_scene_name(scene, 0)}/{'/'.join(path)}; {_what_there_is(config, scene)}"
         )
+
+
+def targets_without_drives(plan: Outputs, targets: Sequence[str]) -> list[str]:
+    """A sentence for each of these targets and each drive of the batch that is cut into blocks and of which the target
+    makes nothing, or no more than its splats."""
+    config = plan.config
+    made: dict[str, Callable[[], list[str]]] = {
+        "edits": plan.edits,
+        "drives": plan.drives,
+        "assets": plan.assets,
+        "runs": plan.runs,
+        "mcap": plan.mcap_files,
+        "looks": plan.looks,
+        "exports": plan.exports,
+        "alpasim": plan.alpasim,
+    }
+    sentences = []
+    for target in (name for name in dict.fromkeys(targets) if name in made):
+        files = [Path(file).relative_to(config.results_dir) for file in made[target]()]
+        of_blocks = {drive_of(file.parts[0]) for file in files if not file.as_posix().endswith(SPLATS)}
+        for scene in config.batch_scenes:
+            if config.is_cut(scene) and scene not in of_blocks:
+                methods = scene_methods(config, scene)
+                method = next((one for one in methods if one in plan.methods_with_actors), methods[0])
+                example = f"{block_scene_name(scene, 0)}/{FILES_OF_TARGETS[target].format(method=method)}"
+                little = "splats alone" if target == "exports" else "nothing"
+                sentences.append(
+                    f"scene {scene} is cut into blocks: {target} makes {little} of it; ask for files of blocks, as "
+                    f"{config.results_dir}/{example}; {_what_there_is(config, scene)}"
+                )
+    return sentences
+
+
+def _what_there_is(config: Config, scene: str) -> str:
+    """The results of a drive that is cut into blocks and the names of its blocks, as the end of a sentence."""
+    films = ", ".join(f"{name}.mp4" for name in _films(config, scene))
+    try:
+        count = len(json.loads(Path(config.results_dir, scene, BLOCKS).read_text(encoding="utf-8"))["blocks"])
+        blocks = f"{block_scene_name(scene, 0)} to {block_scene_name(scene, count - 1)}"
+    except (OSError, ValueError, KeyError, TypeError):  # not cut yet
+        blocks = f"{block_scene_name(scene, 0)}, {block_scene_name(scene, 1)} and so on"
+    return (
+        f"its blocks are {blocks}, and of the whole drive there are metrics.json, index.html and, of each method, "
+        f"{films} and {SPLATS} (docs/long_drives.md)"
+    )
+
+
+def _films(config: Config, scene: str) -> list[str]:
+    """The films of a drive that is cut into blocks."""
+    trajectories = for_scene(config, scene).render.trajectories.items()
+    return [name for name, trajectory in trajectories if trajectory.parts == "all"]

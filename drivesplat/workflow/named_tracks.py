@@ -9,11 +9,13 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from drivesplat.errors import ConfigError, ResultError
+from drivesplat.settings.asset_references import asset_names, asset_of_results
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.track_references import EditReference, TrackReferences
 from drivesplat.settings.tracks import FOUND, Tracks
 from drivesplat.settings.visuals import SubjectSettings
+from drivesplat.settings.world import WorldDonor
 from drivesplat.workflow.film_names import EDITS, QUAD, scene_edits
 from drivesplat.workflow.without_tracks import methods_of
 
@@ -117,6 +119,19 @@ def _of_edit(name: str, edit: Edit) -> Iterable[EditReference]:
             if track is not None and not any(copy.startswith(track) for copy in copies):
                 yield EditReference(edit=name, step=f"step {number} ({step.kind})", track=track)
         copies += [change.name] if hasattr(change, "name") else []
+
+
+def world_donors(config: Config, edit: Edit) -> dict[str, WorldDonor] | None:
+    """The objects of synthetic worlds that an edit inserts, by the names of their assets; None where one is of no such
+    world."""
+    found = {}
+    for name in asset_names(edit):
+        asset = asset_of_results(name, "any")
+        world = asset and asset[0] in config.scenes and config.datasets[config.dataset_of(asset[0])].world
+        if not (asset and world):
+            return None
+        found[name] = WorldDonor(scene=asset[0], track=asset[2], world=world)
+    return found
 
 
 def refuse_wrong_tracks(

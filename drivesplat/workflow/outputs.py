@@ -10,6 +10,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json, sha256_text
 from drivesplat.provenance.code.code_digest import code_digest
 from drivesplat.settings.asset_references import FOLDER, INDEX, LIGHT, asset_names, asset_of_results, files_of_asset
+from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
 from drivesplat.settings.render import TrajectorySettings
@@ -18,7 +19,7 @@ from drivesplat.workflow.film_names import EDITS, QUAD, TRAJECTORIES, no_such_ed
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.named_tracks import fitting_edits
 from drivesplat.workflow.running_code import planned_digest
-from drivesplat.workflow.runs_file import RUNS, runs_of
+from drivesplat.workflow.runs_file import RUNS, config_runs, runs_of
 from drivesplat.workflow.stages import (
     OF_ONE_SCENE,
     SCAN_BASELINES,
@@ -140,9 +141,10 @@ class Outputs(Inputs):
         return [*films, *of_drives, *of_methods, *of_edits]
 
     def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
-        """The films of every edit of `scenes`, by default the batch's, by every method that can be edited. Raises
-        ConfigError where an edits file is invalid."""
-        return self.of_methods(lambda *at: [f"edits/{edit}.mp4" for edit in self._edit_names(*at)], scenes)
+        """The films of every edit of `scenes`, by default the batch's, and of blocks of these that have an edits file,
+        by every method that can be edited. Raises ConfigError where an edits file is invalid."""
+        chosen = self._with_named_blocks(scenes)
+        return self.of_methods(lambda *at: [f"edits/{edit}.mp4" for edit in self._edit_names(*at)], chosen)
 
     def drives(self, _: Any = None) -> list[str]:
         """The rendered drive folders of the batch's scenes: of every edit, by every method that can be edited, and of
@@ -161,8 +163,14 @@ class Outputs(Inputs):
         return self.of_methods(lambda _, method: [f"{FOLDER}/{INDEX}"] if method in self.methods_with_actors else [])
 
     def runs(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
-        """The records of the runs in `scenes`, by default the batch's."""
-        return self.of_methods(lambda *at: [f"{RUNS}/{name}.json" for name in runs_of(self.config, *at)], scenes)
+        """The records of the runs in `scenes`, by default the batch's, and in blocks of these: there, of runs that name
+        the block, or an edit of it."""
+
+        def names(scene: str, method: str) -> list[str]:
+            found, every = runs_of(self.config, scene, method), not self.config.is_block(scene)
+            return [f"{RUNS}/{name}.json" for name, run in found.items() if every or run.scenes or run.edit]
+
+        return self.of_methods(names, self._with_named_blocks(scenes))
 
     def mcap_files(self, _: Any = None) -> list[str]:
         """The MCAP files of the batch's scenes and methods: of the recorded path, of every edit and of every run."""
@@ -262,6 +270,14 @@ class Outputs(Inputs):
         shown = [one for one in (self._with_cameras(chosen) if cameras else chosen) if not self.config.is_cut(one)]
         places = ((scene, method) for scene in shown for method in scene_methods(self.config, scene))
         return [f"{results}/{scene}/{method}/{name}" for scene, method in places for name in names(scene, method)]
+
+    def _with_named_blocks(self, scenes: Iterable[str] | None) -> list[str]:
+        """`scenes`, by default the batch's, and those of their blocks that edits or runs name."""
+        chosen = self.config.batch_scenes if scenes is None else list(scenes)
+        of_edits = (scene for dataset in self.config.datasets.values() for scene in dataset.edits)
+        of_runs = (scene for run in config_runs(self.config).values() for scene in run.scenes or ())
+        named = (scene for scene in dict.fromkeys((*of_edits, *of_runs)) if self.config.is_block(scene))
+        return [*chosen, *(scene for scene in named if drive_of(scene) in chosen)]
 
     def trained(self, cameras: bool | None = None) -> str:
         """The wildcard constraint of scenes with a model: those that are not cut into blocks, and blocks. With

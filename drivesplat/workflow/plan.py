@@ -19,7 +19,7 @@ from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.blocks import drive_of
-from drivesplat.settings.config import for_scene, load
+from drivesplat.settings.config import Config, for_scene, load
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.tracks import OTHER_TRACKS
 from drivesplat.workflow.film_names import (
@@ -41,7 +41,7 @@ from drivesplat.workflow.recordings import Recordings
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.runs_file import RUNS, no_such_run, runs_of
 from drivesplat.workflow.segmented import SEGMENTED
-from drivesplat.workflow.stages import idle_variants
+from drivesplat.workflow.stages import stage_settings
 from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
 from drivesplat.workflow.without_tracks import known_methods, methods_of
 from drivesplat.world.marker import refuse_foreign_data
@@ -56,6 +56,15 @@ def let_scripts_import(folder: str) -> None:
         return
     inherited = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join([folder, *([inherited] if inherited else [])])
+
+
+def idle_variants(config: Config, scene: str) -> list[str]:
+    """The variants of the ablation that have the training settings of the whole method on a scene."""
+    job = config.ablation.job
+    whole, *others = (
+        stage_settings(config, "train", scene, job.method(without, job.seeds[0])) for without in (None, *job.without)
+    )
+    return [without for without, settings in zip(job.without, others, strict=True) if settings == whole]
 
 
 class Plan(JobResources):

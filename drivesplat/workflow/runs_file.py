@@ -13,6 +13,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.io.this_copy import of_the_workflow
 from drivesplat.io.yaml_file import read_yaml
 from drivesplat.settings import quoted, validated
+from drivesplat.settings.blocks import block_scene_name
 from drivesplat.settings.config import Config
 from drivesplat.settings.names import MAX_LENGTH, NAME
 from drivesplat.settings.simulate import RunSettings
@@ -52,6 +53,11 @@ def runs_of(config: Config, scene: str, method: str) -> dict[str, RunSettings]:
     for name, run in runs.items():
         for other in run.scenes or ():
             config.dataset_of(other)
+            if config.is_cut(other):
+                raise ConfigError(
+                    f"run {name!r}: scene {other} is cut into blocks, and a policy drives in one block: name it, "
+                    f"such as {block_scene_name(other, 0)}"
+                )
         unknown = [other for other in run.methods if other not in config.all_methods]
         if unknown:
             raise ConfigError(

@@ -13,16 +13,15 @@ from drivesplat.readers.datasets import reads_unposed
 from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
-from drivesplat.settings.asset_references import asset_names, asset_of_results
-from drivesplat.settings.blocks import BlocksJob
+from drivesplat.settings.blocks import BlocksJob, PooledJob
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.discover import DiscoverJob
-from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import (
     AlpasimJob,
     AssetsJob,
+    BlockSplatsJob,
     DriveJob,
     ExportJob,
     FarJob,
@@ -36,16 +35,24 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, RegionJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
-from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob, TruthFilmJob
+from drivesplat.settings.render import (
+    BlockFilmJob,
+    CompareJob,
+    EditJob,
+    FilmFormat,
+    FilmJob,
+    LidarFilmJob,
+    TruthFilmJob,
+)
 from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.segment import SegmentJob
 from drivesplat.settings.simulate import RunJob
 from drivesplat.settings.tracks import Tracks
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.visuals import PanelJob, RemovalJob, SubjectSettings, TracksJob
-from drivesplat.settings.world import WorldDonor, WorldJob
+from drivesplat.settings.world import WorldJob
 from drivesplat.workflow.film_names import EDITS, no_such_edit, no_such_film, scene_edits
-from drivesplat.workflow.named_tracks import fitting_edits, shows_subject
+from drivesplat.workflow.named_tracks import fitting_edits, shows_subject, world_donors
 from drivesplat.workflow.runs_file import code_of, no_such_run, runs_of
 from drivesplat.workflow.segmented import mask_settings, segment_job
 from drivesplat.workflow.without_cameras import (
@@ -67,7 +74,7 @@ SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
     WORLD, "extract", "masks", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer",
-    "drive_folder", "scan_folder", "run", "run_folder",
+    "drive_folder", "scan_folder", "run", "run_folder", "evaluate_blocks", "film_blocks", "export_blocks",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
@@ -163,15 +170,6 @@ def track_stages(config: Config, scene: str, method: str) -> list[str]:
     return [*found, "relabel", *(["regions"] if has_cameras(config, scene) else [])]
 
 
-def idle_variants(config: Config, scene: str) -> list[str]:
-    """The variants of the ablation that have the training settings of the whole method on a scene."""
-    job = config.ablation.job
-    whole, *others = (
-        stage_settings(config, "train", scene, job.method(without, job.seeds[0])) for without in (None, *job.without)
-    )
-    return [without for without, settings in zip(job.without, others, strict=True) if settings == whole]
-
-
 def _nothing(_: JobScope) -> dict[str, Any]:
     return {}
 
@@ -255,17 +253,17 @@ def _world(at: JobScope) -> dict[str, Any]:
     world, edits = at.dataset.world, scene_edits(at.config, at.scene)
     assert world is not None
     fitting = fitting_edits(at.config, at.scene, "annotated")
-    of_labels = [name for name, edit in fitting.items() if _donors(at, edit) is not None]
+    of_labels = [name for name, edit in fitting.items() if world_donors(at.config, edit) is not None]
     wanted = of_labels if world.truth.edits is None else world.truth.edits
     for name in wanted:
         if name not in edits:
             raise ConfigError(no_such_edit(at.scene, name, edits))
-        if _donors(at, edits[name]) is None:
+        if world_donors(at.config, edits[name]) is None:
             raise ConfigError(
                 f"scene {at.scene}, edit {name!r}: its truth is not known, since it inserts what is in no synthetic "
                 "world of the config; leave it out of world.truth.edits"
             )
-    donors = {asset: donor for name in wanted for asset, donor in (_donors(at, edits[name]) or {}).items()}
+    donors = {asset: donor for name in wanted for asset, donor in (world_donors(at.config, edits[name]) or {}).items()}
     return {
         "donors": donors,
         "scene": at.scene,
@@ -273,19 +271,6 @@ def _world(at: JobScope) -> dict[str, Any]:
         "world": world.with_sensors(at.config.cameras, at.config.sweeps, at.config.lidar_seed.sweeps),
         "edits": {name: edits[name] for name in wanted},
     }
-
-
-def _donors(at: JobScope, edit: Edit) -> dict[str, WorldDonor] | None:
-    """The objects of synthetic worlds that an edit inserts, by the names of their assets; None where one is of no such
-    world."""
-    found = {}
-    for name in asset_names(edit):
-        asset = asset_of_results(name, "any")
-        world = asset and asset[0] in at.config.scenes and at.config.datasets[at.config.dataset_of(asset[0])].world
-        if not (asset and world):
-            return None
-        found[name] = WorldDonor(scene=asset[0], track=asset[2], world=world)
-    return found
 
 
 def _film_format(at: JobScope) -> dict[str, Any]:
@@ -357,7 +342,8 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     **dict.fromkeys(_WITHOUT_SETTINGS, (Settings, _nothing)),
     "demo_world": (WorldJob, _world),
     "extract": (SceneSource, _scene_source),
-    **dict.fromkeys(("blocks", "block", "evaluate_blocks"), (BlocksJob, lambda at: {"blocks": at.dataset.blocks})),
+    **dict.fromkeys(("blocks", "block"), (BlocksJob, lambda at: {"blocks": at.dataset.blocks})),
+    "evaluate_blocks": (PooledJob, lambda at: {"left_out": at.dataset.left_out(at.scene)}),
     "own_car": (EgoMaskJob, _ego_mask),
     "refine_poses": (RefinePosesJob, _lidar_rays),
     "lidar_seed": (SeedJob, _nothing),
@@ -380,6 +366,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
     "tracks": (TracksJob, _nothing),
     "film": (FilmJob, _film),
+    "film_blocks": (BlockFilmJob, lambda at: {**_film(at), "left_out": at.dataset.left_out(at.scene)}),
     "film_parts": (FilmFormat, _film_format),
     "compare": (CompareJob, lambda at: {**_encoding(at), "end": at.config.render.end}),
     "truth_film": (TruthFilmJob, _encoding),
@@ -390,6 +377,10 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     **dict.fromkeys(("run", "run_folder"), (RunJob, _run)),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
+    "export_blocks": (
+        BlockSplatsJob,
+        lambda at: {"sh_degree": at.config.export.sh_degree, "left_out": at.dataset.left_out(at.scene)},
+    ),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),
     "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree, **_shown_time(at)}),
     "export_usd": (ExportJob, lambda at: {"gaussians": at.config.export.usd_gaussians, **_shown_time(at)}),

@@ -74,6 +74,20 @@ def test_two_blocks_are_in_memory_at_most(results, monkeypatch):
     assert drive.block(0) is not first
 
 
+def test_blocks_that_are_left_out_or_not_trained_are_refused(results, tmp_path):
+    copied = shutil.copytree(results, tmp_path / "results")
+    drive = drivesplat.LongDrive(copied / "way/street", device="cpu")
+    late = 0.8 * drive.duration
+    assert drive.left_out == []
+    (copied / "way.001/street/checkpoint.npz").unlink()
+    assert drive.left_out == [1]
+    with pytest.raises(RequestError, match=r"block 1 of .*way/street is left out or not trained.*docs/long_drives.md"):
+        drive.render("CAM_FRONT", late)
+    assert drive.at(0.1)[0].scene.name == "way.000", "the others go on"
+    (copied / "way/street/eval.json").write_text('{"protocol": {"left_out": ["way.000"]}}')
+    assert drive.left_out == [0, 1]
+
+
 def test_what_is_no_long_drive_and_unknown_times_and_blocks_are_refused(results, drive):
     with pytest.raises(RequestError, match=r"way.000 has no blocks.json: it is no drive that is cut into blocks"):
         drivesplat.LongDrive(results / "way.000/street")

@@ -1,6 +1,7 @@
 """Figures of a drive from those of its blocks: every held-out pixel counts alike."""
 
 from copy import deepcopy
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ import pytest
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.block_metrics import BlockEvaluation, pooled
 from drivesplat.evaluation.metrics import FrameErrors, RegionMetrics
+from drivesplat.scene.blocks import Block, Blocks
 from drivesplat.scene.regions import REGIONS
 from drivesplat.scene.scene import Frame, Scene
+from drivesplat.settings.blocks import PooledJob
 from drivesplat.settings.images import HoldoutSettings
 
 HOLDOUT = HoldoutSettings()
@@ -24,6 +27,18 @@ def scene() -> Scene:
         for i, time in enumerate(times)
     )
     return Scene("way", "mine", "", "", np.zeros(3), times, frames, (), (), "drive", 2.0)
+
+
+def cut(count: int = 2) -> Blocks:
+    """The drive in blocks of as many key frames each, which overlap by one."""
+    ends = np.linspace(0, 20, count + 1).astype(int) * 500_000
+    cores = [np.array([pair]) for pair in pairwise(ends)]
+    return Blocks("way", tuple(Block(core, core + np.array([-500_000, 500_000]), np.zeros((1, 2))) for core in cores))
+
+
+def of_drive(blocks: dict[str, BlockEvaluation], left_out: tuple[int, ...] = ()):
+    """The figures of the drive from those of its blocks."""
+    return pooled(scene(), cut(len(blocks) + len(left_out)), PooledJob(left_out=left_out, holdout=HOLDOUT), blocks)
 
 
 def frame_errors(pixels: int = 2000) -> FrameErrors:
@@ -54,7 +69,7 @@ def evaluation(images: int, **regions: int) -> BlockEvaluation:
 
 def test_regions_are_pooled_over_the_images_of_all_blocks():
     blocks = {"way.000": evaluation(2), "way.001": evaluation(3)}
-    record, objects = pooled(scene(), HOLDOUT, blocks)
+    record, objects = of_drive(blocks)
     for region in REGIONS:
         frames = [f for own in blocks.values() for f in own.objects["frames"]["interpolation"][region]]
         pixels = sum(frame.pixels for frame in frames)
@@ -72,12 +87,12 @@ def test_regions_are_pooled_over_the_images_of_all_blocks():
 def test_regions_that_are_small_in_each_block_count_in_the_drive():
     blocks = {f"way.00{i}": evaluation(1, moving_vehicle=600) for i in range(2)}
     assert all(own.record["result"]["interpolation"]["moving_vehicle"] is None for own in blocks.values())
-    found = pooled(scene(), HOLDOUT, blocks)[0]["result"]["interpolation"]["moving_vehicle"]
+    found = of_drive(blocks)[0]["result"]["interpolation"]["moving_vehicle"]
     assert found["pixels"] == 1200
 
 
 def test_the_protocol_is_that_of_the_drive_and_costs_are_summed():
-    record, _ = pooled(scene(), HOLDOUT, {"way.000": evaluation(1), "way.001": evaluation(3)})
+    record, _ = of_drive({"way.000": evaluation(1), "way.001": evaluation(3)})
     assert record["scene"] == "way" and record["protocol"]["held_out_frames"]["interpolation"] == [4, 12]
     assert (record["protocol"]["train_images"], record["protocol"]["key_frame_range"]) == (14, None)
     assert record["protocol"]["lidar_missing"] == 2
@@ -93,11 +108,26 @@ def test_blocks_that_were_measured_differently_are_refused():
     changed = deepcopy(other.record)
     changed["protocol"]["sweeps"] = True
     with pytest.raises(ResultError, match=r"blocks way.000 and way.001 were measured differently \(sweeps\)"):
-        pooled(scene(), HOLDOUT, {"way.000": first, "way.001": BlockEvaluation(changed, other.objects)})
+        of_drive({"way.000": first, "way.001": BlockEvaluation(changed, other.objects)})
 
 
 def test_blocks_may_lack_tracks_and_held_out_images():
     empty, full = evaluation(0), evaluation(2)
     empty.record["protocol"] |= {"visibility": None, "width": 99}
-    record, _ = pooled(scene(), HOLDOUT, {"way.000": empty, "way.001": full})
+    record, _ = of_drive({"way.000": empty, "way.001": full})
     assert (record["protocol"]["visibility"], record["protocol"]["width"]) == ("annotated", 16)
+
+
+def test_blocks_that_are_left_out_are_named_and_their_images_are_not_counted():
+    record, _ = of_drive({"way.000": evaluation(1), "way.002": evaluation(3)}, left_out=(1,))
+    assert record["protocol"]["left_out"] == ["way.001"] and record["result"]["blocks"].keys() == {"way.000", "way.002"}
+    whole = of_drive({f"way.00{i}": evaluation(1) for i in range(3)})[0]["protocol"]
+    assert whole["left_out"] == [] and whole["held_out_frames"] == HOLDOUT.held_out(20)
+    first, last = cut(3).blocks[1].core[0] // 500_000
+    kept = {group: [i for i in own if not first <= i < last] for group, own in whole["held_out_frames"].items()}
+    assert record["protocol"]["held_out_frames"] == kept != whole["held_out_frames"]
+    held_out = {i for own in whole["held_out_frames"].values() for i in own}
+    of_neighbours = {first, last - 1} - held_out
+    assert record["protocol"]["train_images"] == sum(
+        i in of_neighbours or not (first <= i < last or i in held_out) for i in range(20)
+    )

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from drivesplat.rendering.block_film import BLEND_M, block_shares
+from drivesplat.rendering.block_film import BLEND_M, LEFT_OUT, block_shares
+from drivesplat.rendering.captions import DARK, text_picture
 from drivesplat.scene.blocks import Block, Blocks
 from drivesplat.trajectories.camera_path import CameraPath
 
@@ -33,6 +34,20 @@ def test_one_block_fades_into_the_other_about_their_border():
     of_first = [share.weight if share.number == 0 else 1.0 - share.weight for share in shares]
     assert of_first == pytest.approx(np.clip(0.5 - metres / (2 * BLEND_M), 0.0, 1.0))
     assert all(share.other == 1 - share.number for share in shares if share.weight < 1.0)
+
+
+def test_a_block_that_is_left_out_is_not_blended_with_others():
+    shares = block_shares(blocks(overlap=8), path(20), left_out=[1])
+    assert [share.number for share in shares] == [0] * 10 + [1] * 10, "time stays true"
+    assert all(share.other is None for share in shares)
+
+
+def test_a_frame_of_a_block_that_is_left_out_says_so():
+    dark, said = text_picture("", (96, 54)), text_picture(LEFT_OUT.format(3), (96, 54))
+    assert (dark == DARK).all() and said.shape == (54, 96, 3) and said.max() > 200
+    assert (said != text_picture(LEFT_OUT.format(4), (96, 54))).any()
+    written = np.flatnonzero((said != dark).any(axis=(1, 2)))
+    assert written.mean() == pytest.approx(27, abs=2), "in the middle"
 
 
 def test_a_block_is_not_shown_where_it_has_no_recordings():

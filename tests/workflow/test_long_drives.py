@@ -9,7 +9,12 @@ from helpers import REPOSITORY
 from drivesplat.errors import ConfigError
 from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import for_scene
-from drivesplat.workflow.long_drives import LongDrives, refuse_results_of_blocks, require_cameras
+from drivesplat.workflow.long_drives import (
+    LongDrives,
+    refuse_results_of_blocks,
+    require_cameras,
+    targets_without_drives,
+)
 from drivesplat.workflow.plan import Plan
 
 BLOCKS = {"length_m": 100.0, "overlap_m": 10.0}
@@ -96,6 +101,111 @@ def test_a_scene_with_the_name_of_a_block_is_refused():
         plan(other={"scenes": ["way.007"]})
     with pytest.raises(ConfigError, match=r"scene 'way\.001' has the name of a block of scene 'way'; rename it"):
         plan(cut={**CUT, "scenes": ["way", drive_of("way") + ".001"]})
+
+
+@pytest.mark.parametrize(
+    ("target", "little", "example"),
+    [
+        ("edits", "nothing", "street/edits/NAME.mp4"),
+        ("drives", "nothing", "street/edits/NAME/drive/drive.json"),
+        ("assets", "nothing", "street/assets/assets.json"),
+        ("runs", "nothing", "street/runs/NAME.json"),
+        ("mcap", "nothing", "street/drive.mcap"),
+        ("looks", "nothing", "street/removal.png"),
+        ("alpasim", "nothing", "street/scene.alpasim.usdz"),
+        ("exports", "splats alone", "street/viewer.html"),
+    ],
+)
+def test_targets_that_make_nothing_of_a_drive_say_what_there_is(target, little, example):
+    methods = {"vanilla": {}, "street": {"parts": ["background", "actors"]}}
+    made = Plan({"datasets": {"cut": CUT}, "methods": methods, "results_dir": "there"}, str(REPOSITORY))
+    (sentence,) = targets_without_drives(made, [target, "metrics"])
+    assert f"scene way is cut into blocks: {target} makes {little} of it; ask for files of blocks, " in sentence
+    assert f" as there/way.000/{example}; its blocks are way.000, way.001 and so on, and of the whole" in sentence
+    assert "metrics.json, index.html and, of each method, original.mp4" in sentence
+    assert sentence.endswith("splats/splats.json (docs/long_drives.md)")
+
+
+def test_targets_of_drives_and_other_scenes_say_nothing():
+    assert targets_without_drives(plan(), ["metrics", "films", "report", "there/way/metrics.json"]) == []
+    whole = Plan({"datasets": {"whole": {"scenes": ["0001"]}}, "methods": {"vanilla": {}}}, str(REPOSITORY))
+    assert targets_without_drives(whole, ["edits", "runs", "alpasim"]) == []
+
+
+def test_the_blocks_of_a_drive_are_named_where_they_are_known(tmp_path):
+    (tmp_path / "way").mkdir()
+    (tmp_path / "way/blocks.json").write_text(json.dumps({"blocks": [{}] * 12}))
+    config = Plan({"datasets": {"cut": CUT}, "results_dir": str(tmp_path)}, str(REPOSITORY)).config
+    with pytest.raises(ConfigError, match=r"its blocks are way.000 to way.011, and of the whole drive there are"):
+        refuse_results_of_blocks(config, "way", ["street", "assets", "assets.json"])
+
+
+def test_edits_and_runs_of_blocks_are_made_with_those_of_other_scenes(tmp_path):
+    edits, runs = tmp_path / "edits.yaml", tmp_path / "runs.yaml"
+    edits.write_text("edits: {gone: [{remove: {track: abc}}]}")
+    runs.write_text(
+        "runs: {everywhere: {policy: recorded}, here: {policy: recorded, scenes: [way.001]}, "
+        "changed: {policy: recorded, edit: gone}}"
+    )
+    methods = {"street": {"parts": ["background", "actors"]}}
+    cut = {**CUT, "edits": {"way.003": str(edits)}}
+    settings = {"methods": methods, "runs": str(runs), "results_dir": "there"}
+    made = Plan({"datasets": {"cut": cut}, **settings}, str(REPOSITORY))
+    assert made.edits() == ["there/way.003/street/edits/gone.mp4"]
+    assert made.runs() == ["there/way.003/street/runs/changed.json", "there/way.001/street/runs/here.json"]
+    assert targets_without_drives(made, ["edits", "runs"]) == []
+    assert made.edits(scenes=[]) == []
+    runs.write_text("runs: {here: {policy: recorded, scenes: [way]}}")
+    with pytest.raises(ConfigError, match=r"run 'here': scene way is cut into blocks, .* such as way.000"):
+        made.runs()
+
+
+def test_blocks_are_left_out_of_the_results_of_the_drive_alone(drives, tmp_path):
+    blocks = tmp_path / "blocks.json"
+
+    def left_out(*numbers) -> LongDrives:
+        made = plan(cut={**CUT, "blocks": {**BLOCKS, "leave_out": numbers}})
+        return LongDrives(made, lambda _: str(blocks))
+
+    evals = "{method}/eval.json"
+    assert left_out(0).results(evals)(at("way")) == left_out("way.000").results(evals)(at("way"))
+    assert left_out(0).results(evals)(at("way")) == ["there/way.001/vanilla/eval.json"]
+    with pytest.raises(ConfigError, match=r"blocks.leave_out names block 2 of scene way, which has 2, counted from 0"):
+        left_out(2).results(evals)(at("way"))
+    with pytest.raises(ConfigError, match=r"blocks.leave_out leaves no block of scene way, which has 2; keep one"):
+        left_out(0, 1).results(evals)(at("way"))
+    stages = ("blocks", "block", "train", "evaluate", "evaluate_blocks", "export_blocks", "film_blocks")
+    one, other = plan(), plan(cut={**CUT, "blocks": {**BLOCKS, "leave_out": [1]}})
+    films = {"film_blocks": "original"}
+    changed = [
+        stage
+        for stage in stages
+        if one.stage_settings(stage, "way", "vanilla", films.get(stage))
+        != other.stage_settings(stage, "way", "vanilla", films.get(stage))
+    ]
+    assert changed == ["evaluate_blocks", "export_blocks", "film_blocks"]
+
+
+@pytest.mark.parametrize(
+    ("scenes", "leave_out", "message"),
+    [
+        (["way"], ["other.003"], r"leave_out names 'other.003', which is no block of any of its scenes; .* way.003"),
+        (["way"], ["way"], r"leave_out names 'way', which is no block"),
+        (["way", "back"], [3], r'names block 3, and there are 2 scenes: name the block, such as "way.003"'),
+        (["way"], [-1], r"-1 is no number of a block; they are counted from 0"),
+        (["0001"], [1.003], r"1.003 is a number to YAML: write the name of a block in quotes"),
+    ],
+)
+def test_what_is_no_block_of_the_dataset_cannot_be_left_out(scenes, leave_out, message):
+    with pytest.raises(ConfigError, match=message):
+        plan(whole={"scenes": ["whole"]}, cut={**CUT, "scenes": scenes, "blocks": {**BLOCKS, "leave_out": leave_out}})
+
+
+def test_of_several_drives_each_leaves_out_its_own_blocks():
+    named = {**BLOCKS, "leave_out": ["way.001", "back.000"]}
+    made = plan(cut={**CUT, "scenes": ["way", "back"], "blocks": named})
+    jobs = [json.loads(made.stage_settings("evaluate_blocks", scene, "vanilla")) for scene in ("way", "back")]
+    assert [job["left_out"] for job in jobs] == [[1], [0]]
 
 
 def test_nothing_of_a_drive_is_made_from_all_of_its_scans():

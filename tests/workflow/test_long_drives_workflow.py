@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from helpers.drives import World, write_world
@@ -36,6 +37,14 @@ def copy(tmp_path_factory) -> WorkflowCopy:
     return made
 
 
+def frames_of(film: Path) -> list[np.ndarray]:
+    """The frames (h, w, 3) of a film."""
+    reader, found = cv2.VideoCapture(str(film)), []
+    while (read := reader.read())[0]:
+        found.append(read[1])
+    return found
+
+
 def trained(copy: WorkflowCopy) -> dict[str, int]:
     """When each block was trained (ns)."""
     files = Path(copy.folder, "results").glob("0001.*/vanilla/checkpoint.npz")
@@ -66,6 +75,43 @@ def test_every_static_gaussian_of_the_drive_is_in_the_file_of_the_nearest_block(
         assert vertices["x"].min() == pytest.approx(entry["lower"][0]) and entry["scene"] == f"0001.00{number}"
 
 
+def test_a_block_that_fails_is_named_and_the_drive_goes_on_without_it(copy):
+    before = trained(copy)
+    checkpoint, masks = "results/0001.001/vanilla/checkpoint.npz", copy.folder / "results/0001.001/masks/masks.json"
+    (copy.folder / checkpoint).unlink()
+    content = masks.read_text()
+    masks.write_text("{")
+    failed = copy.run(*TARGETS, flags=("--keep-going",))
+    assert failed.returncode and "these blocks failed: 0001.001 (results/logs/0001.001/" in failed.stdout
+    assert "docs/long_drives.md says how to go on without them" in failed.stdout
+    masks.write_text(content)
+    cut = copy.config["datasets"]["nuscenes"]
+    without = {**cut, "blocks": {**cut["blocks"], "leave_out": [1]}}
+    with copy.set_to(datasets={"nuscenes": without}):
+        planned = copy.planned(*TARGETS)
+        assert planned == {"evaluate_blocks": 1, "scene_metrics": 1, "film_blocks": 1, "export_blocks": 1}
+        done = copy.run(*TARGETS)
+        assert done.returncode == 0, done.stdout
+        assert copy.planned(*TARGETS) == {}
+    record = copy.read("results/0001/metrics.json")
+    assert record["protocol"]["left_out"] == ["0001.001"]
+    assert record["methods"]["vanilla"]["blocks"].keys() == {"0001.000", "0001.002"}
+    assert copy.read("results/0001/vanilla/original.cameras.json")["left_out"] == ["0001.001"]
+    index = copy.read(INDEX)
+    assert index["left_out"] == ["0001.001"] and [own["scene"] for own in index["blocks"]] == ["0001.000", "0001.002"]
+    assert not (copy.folder / INDEX).with_name("0001.001.ply").exists()
+    drive = drivesplat.LongDrive(copy.folder / "results/0001/vanilla", device="cpu")
+    assert drive.left_out == [1]
+    frames = frames_of(copy.folder / TARGETS[1])
+    stamps = copy.read("results/0001/vanilla/original.cameras.json")["timestamps"]
+    dark = [np.median(frame) < 40 for frame in frames]
+    assert len(frames) == 31 and dark == [drive.blocks.at(stamp) == 1 for stamp in stamps] and 0 < sum(dark) < 31
+    again = copy.run(*TARGETS)
+    assert again.returncode == 0 and copy.planned(*TARGETS) == {}
+    assert [name for name, time in trained(copy).items() if before[name] != time] == ["0001.001"]
+    assert copy.read("results/0001/metrics.json")["protocol"]["left_out"] == []
+
+
 def test_a_longer_drive_trains_its_last_block_and_new_ones_alone(copy):
     before = trained(copy)
     write_world(copy.folder / "data", world(24))
@@ -78,8 +124,19 @@ def test_a_longer_drive_trains_its_last_block_and_new_ones_alone(copy):
 
 def test_results_of_one_block_are_refused_for_the_drive_in_a_sentence(copy):
     result = copy.run("results/0001/vanilla/splat.ply")
-    assert "ask for results/0001.000/vanilla/splat.ply (docs/long_drives.md)" in result.stdout
+    assert "ask for results/0001.000/vanilla/splat.ply; its blocks are 0001.000 to 0001.003, " in result.stdout
     assert result.returncode
+    said = copy.dry_run("alpasim")
+    assert "drivesplat: scene 0001 is cut into blocks: alpasim makes nothing of it; ask for files of blocks" in said
+
+
+def test_a_run_may_name_a_block(copy):
+    (copy.folder / "runs.yaml").write_text("runs: {here: {policy: recorded, scenes: ['0001.001'], seeds: [0]}}")
+    with copy.set_to(runs="runs.yaml"):
+        done = copy.run("runs")
+    assert done.returncode == 0, done.stdout
+    (episode,) = copy.read("results/0001.001/vanilla/runs/here.json")["episodes"]
+    assert episode["failed"] is None
 
 
 def test_a_drive_that_is_extracted_by_other_code_keeps_its_blocks_and_its_figures(copy):

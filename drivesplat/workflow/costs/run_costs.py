@@ -24,6 +24,8 @@ from drivesplat.workflow.costs.estimate import (
 from drivesplat.workflow.costs.measured import BENCHMARKS, JobId, read_costs
 from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
+from drivesplat.workflow.job_logs import has_failed
+from drivesplat.workflow.long_drives import targets_without_drives
 from drivesplat.workflow.named_tracks import edits_left_out
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.snakemake_log import drop_foreign_records
@@ -41,13 +43,14 @@ class RunCosts:
         self._plan, self._workflow, self._targets = plan, workflow, targets
         self._results = Path(plan.config.results_dir)
         self._jobs: dict[JobId, Any] = {}
+        self._began = time.time()
         self._ended: threading.Event | None = None
 
     def report_at_planning(self) -> None:
         """Prints each setting that an override replaces for the scenes and methods of the targets, the methods of
-        scenes without boxes, those that scenes without cameras leave out, and edits whose tracks no method has:
-        `snakemake -n` and a run with nothing to do print them, too. Removes records on which Snakemake would fail, and
-        prints which."""
+        scenes without boxes, those that scenes without cameras leave out, edits whose tracks no method has, and targets
+        that make nothing of a drive that is cut into blocks. `snakemake -n` and a run with nothing to do print them,
+        too. Removes records on which Snakemake would fail, and prints which."""
         wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
         if wanted or COSTS not in self._targets:
             places = self._plan.scenes_and_methods(wanted)
@@ -55,7 +58,8 @@ class RunCosts:
             config = self._plan.config
             absent = [*methods_left_out(config, scenes), *edits_left_out(config, scenes)]
             unboxed = methods_without_boxes(config, scenes - {""}, places)
-            for sentence in (*without_effect(config, places), *unboxed, *absent):
+            cut = targets_without_drives(self._plan, wanted)
+            for sentence in (*without_effect(config, places), *unboxed, *absent, *cut):
                 _say(sentence)
         sentence = drop_foreign_records()
         if sentence:
@@ -83,7 +87,7 @@ class RunCosts:
                     self._expectations,
                     lambda: {name for name, job in jobs.items() if dag.finished(job)},
                     self._machine,
-                    time.time(),
+                    self._began,
                 )
                 self._ended = watch(watched)
         except Exception as error:  # a failed estimate must not end the run
@@ -113,6 +117,16 @@ class RunCosts:
         for total in record["scenes"]:
             if total["scene"] in here and not total["under_90_minutes"]:
                 _say(f"scene {total['scene']}: {finding(total)}; {self._results / FILES[0]} says where it went")
+
+    def name_failed_blocks(self) -> None:
+        """Prints which blocks of drives failed in this run, with their logs, and which page says what to do."""
+        is_block = self._plan.config.is_block
+        # not the jobs that were planned at first: blocks are known later
+        logs = [(job.scene, str(one.log[0])) for job, one in self._needed().items() if is_block(job.scene) and one.log]
+        failed = {scene: log for scene, log in reversed(logs) if has_failed(Path(log), self._began)}
+        if failed:
+            named = ", ".join(f"{scene} ({log})" for scene, log in failed.items())
+            _say(f"these blocks failed: {named}; docs/long_drives.md says how to go on without them")
 
     def _needed(self) -> dict[JobId, Any]:
         """Snakemake's jobs that are to run, without those that only collect the results of others."""
