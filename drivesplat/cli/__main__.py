@@ -14,13 +14,17 @@ import webbrowser
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drivesplat
 from drivesplat import SNAKEFILE, WORKFLOW
-from drivesplat.cli import assets, check, imports, segment, serve, setup
+from drivesplat.cli import assets, check, estimate, imports, segment, serve, setup
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.standard_output import standard_output
 from drivesplat.io.this_copy import default_config, in_this_copy, of_the_workflow
+
+if TYPE_CHECKING:
+    from drivesplat.settings.config import Config
 
 RUN = "run"
 BROUGHT_ALONG = ("presets/", "profiles/")
@@ -93,6 +97,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     mcap.add_argument("--scans", type=Path, help="scans.json of rendered LiDAR scans, in place of the folder's own")
 
     check.add_parser(commands)
+    estimate.add_parser(commands)
 
     doctor = commands.add_parser("doctor", help="check the machine and suggest remedies")
     doctor.add_argument("config", nargs="*", help="config files or presets whose requirements to check, too")
@@ -124,6 +129,9 @@ def run_command(parsed: argparse.Namespace) -> int:
         from drivesplat.cli.check.command import run_check
 
         return run_check(parsed)
+    if parsed.command == estimate.COMMAND:
+        config = folder_config()
+        return estimate.run_estimate(parsed, parsed.results or Path(config.results_dir), config.device.jobs_per_card)
     if parsed.command == "doctor":
         from drivesplat.machine.doctor.__main__ import main as doctor
 
@@ -196,12 +204,17 @@ def run_workflow(arguments: Sequence[str]) -> int:
         signal.signal(signal.SIGINT, before)
 
 
-def results_folder() -> Path:
-    """The results folder of the current folder's config.yaml, by default `results`. Raises ConfigError."""
+def folder_config() -> "Config":
+    """The settings of the current folder's config.yaml, by default those of the workflow. Raises ConfigError."""
     from drivesplat.io.yaml_file import read_yaml
     from drivesplat.settings.config import load
 
-    return Path(load(read_yaml(default_config(Path.cwd()), "config file") or {}).results_dir)
+    return load(read_yaml(default_config(Path.cwd()), "config file") or {})
+
+
+def results_folder() -> Path:
+    """The results folder of the current folder's config.yaml, by default `results`. Raises ConfigError."""
+    return Path(folder_config().results_dir)
 
 
 def open_viewer(results: Path, scene: str | None, method: str | None) -> str:

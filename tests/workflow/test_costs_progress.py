@@ -33,7 +33,7 @@ def at(step: int, rest: str) -> str:
 def progress(folder: Path, finished: set[JobId], costs: Sequence[Cost] = tuple(COSTS)) -> RunProgress:
     planned = [PlannedJob(job, 1, job is not MASKS) for job in (MASKS, TRAIN, FILM)]
     logs = {job: folder / f"{job.stage}.log" for job in (MASKS, TRAIN, FILM)}
-    return RunProgress(planned, logs, lambda: Expectations(CONFIG, costs), lambda: finished, Machine(1, 1), 0.0)
+    return RunProgress(lambda: planned, logs, lambda: Expectations(CONFIG, costs), lambda: finished, Machine(1, 1), 0.0)
 
 
 def test_trainings_weigh_in_proportion_to_their_seconds(tmp_path):

@@ -1,5 +1,6 @@
 """A drive that is cut into blocks, run as users run it; and the same drive when it has become longer."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 from plyfile import PlyData
 
 import drivesplat
+from drivesplat.cli.__main__ import main
 
 pytestmark = pytest.mark.workflow
 INDEX = "results/0001/vanilla/splats/splats.json"
@@ -62,6 +64,21 @@ def test_a_drive_becomes_blocks_that_are_measured_together_and_shown_in_one_film
     assert copy.planned(*TARGETS) == {}, "nothing is left to be done"
     drive = drivesplat.LongDrive(copy.folder / "results/0001/vanilla", device="cpu")
     assert drive.render("CAM_FRONT", 0.9 * drive.duration).image.shape == (54, 96, 3)
+
+
+def test_the_costs_of_the_blocks_tell_those_of_a_longer_drive(copy, capsys):
+    asked = ["estimate", "--hours", "0.5", "--cameras", "6", "--hz", "10", "--speed-kmh", "36", "--cards", "1,8"]
+    assert main([*asked, "--results", str(copy.folder / "results")]) == 0
+    said = capsys.readouterr().out
+    assert "vanilla, by 3 measured blocks of 0001 in " in said and "(cpu" in said and "; 20 iterations)" in said
+    assert "18.0 km in 600 blocks of 30 m with 300 images of 96x54 each" in said
+    assert "8 machines " in said and "GPU memory not measured" in said
+    (drive,) = copy.read("results/costs.json")["drives"]
+    assert drive["drive"] == "0001" and drive["blocks"] == 3 and drive["bytes"] > 10_000
+    with copy.set_to(train={**copy.config["train"], "iterations": 21}):
+        estimated = copy.run("estimate", TARGETS[0]).stdout
+    assert re.search(r"train +3 x ", estimated) and re.search(r"evaluate +3 x ", estimated), estimated
+    assert "not measured yet" not in estimated, estimated
 
 
 def test_every_static_gaussian_of_the_drive_is_in_the_file_of_the_nearest_block(copy):
@@ -131,7 +148,9 @@ def test_results_of_one_block_are_refused_for_the_drive_in_a_sentence(copy):
 
 
 def test_a_run_may_name_a_block(copy):
-    (copy.folder / "runs.yaml").write_text("runs: {here: {policy: recorded, scenes: ['0001.001'], seeds: [0]}}")
+    (copy.folder / "runs.yaml").write_text(
+        "runs: {here: {policy: recorded, methods: [vanilla], scenes: ['0001.001'], seeds: [0]}}"
+    )
     with copy.set_to(runs="runs.yaml"):
         done = copy.run("runs")
     assert done.returncode == 0, done.stdout

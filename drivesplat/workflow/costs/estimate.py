@@ -4,9 +4,11 @@ import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 from drivesplat.io.free_disk import free_bytes
+from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.costs.measured import TRAIN, WORLD, Cost, JobId
 
@@ -14,6 +16,8 @@ NOT_MEASURED = "not measured yet"
 ROUGH_SECONDS, ROUGH_ITERATION = 10.0, {True: 0.006, False: 0.15}
 """Seconds of a job of any stage, and of a training's iteration with and without a GPU, on other machines. They are used
 for what is not measured yet: a job may take a third or three times as long."""
+MAX_PEERS = 20
+"""Scenes whose files tell what a job leaves, at most: drives have hundreds of blocks."""
 MEMBER_FOLDERS = {
     "masks.json": ".", "checkpoint.npz": "tensorboard", "parts.json": ".", "drive.json": ".", "scans.json": ".",
 }  # fmt: skip
@@ -46,6 +50,7 @@ class Expectations:
     def __init__(self, config: Config, costs: Sequence[Cost]):
         self._config = config
         self._moving = {name for name, method in config.all_methods.items() if method.moving_parts}
+        self._blocks: list[str] | None = None
         self._costs: dict[tuple[str, str], list[Cost]] = defaultdict(list)
         for cost in costs:
             self._costs[self._kind(cost.job)].append(cost)
@@ -83,18 +88,29 @@ class Expectations:
         places = [
             path.relative_to(results / scene) for path in map(Path, planned.outputs) if results / scene in path.parents
         ]
-        peers = (
-            other for other in self._config.scenes if other != scene and self._dataset(other) == self._dataset(scene)
-        )
-        known = [size for other in peers if (size := _size(results / other / place for place in places))]
+        peers = [other for other in self._known_scenes(scene, results) if other != scene]
+        sizes = (size for other in peers if (size := _size(results / other / place for place in places)))
+        known = list(islice(sizes, MAX_PEERS))
         return statistics.median(known) if known else None
 
     def _kind(self, job: JobId) -> tuple[str, str]:
         """The stage and dataset of a job, whose jobs are compared; a synthetic world is compared with no other."""
         return job.stage, job.film if job.stage == WORLD else self._dataset(job.scene)
 
+    def _known_scenes(self, scene: str, results: Path) -> list[str]:
+        """The scenes of the same dataset; for a block all blocks of drives of its dataset that have results."""
+        if self._config.is_block(scene):
+            if self._blocks is None:
+                every = (path.name for path in sorted(results.glob("*.*")))
+                self._blocks = [name for name in every if self._config.is_block(name)]
+            return [name for name in self._blocks if self._dataset(name) == self._dataset(scene)]
+        return [other for other in self._config.scenes if self._dataset(other) == self._dataset(scene)]
+
     def _dataset(self, scene: str) -> str:
-        """A scene's dataset, empty for jobs of no scene; a scene that is no longer configured has one of its own."""
+        """A scene's dataset, empty for jobs of no scene; a scene that is no longer configured has one of its own.
+        Blocks are compared with blocks of the same dataset, and drives that are cut into blocks with such drives."""
+        if self._config.is_block(scene):
+            return f"blocks of {self._config.dataset_of(scene)}"
         return self._config.dataset_names.get(scene, f"?{scene}" if scene else "")
 
     def _scaled(self, cost: Cost, job: JobId) -> float | None:
@@ -117,7 +133,8 @@ def _size(files: Iterable[str | Path]) -> float:
 
 def wall_seconds(planned: Iterable[PlannedJob], machine: Machine) -> float:
     """A lower bound of the time that jobs of known seconds take: cores are never idle, each GPU has one job, and a
-    method's training waits for its scene's stages. Close where there is more work than machine."""
+    method's training waits for its scene's stages, that of a block also for those of its drive. Close where there is
+    more work than machine."""
     jobs = [(one, one.seconds) for one in planned if one.seconds is not None]
     busy = sum(seconds * min(one.threads, machine.cores) for one, seconds in jobs) / max(1, machine.cores)
     on_gpus = sum(seconds for one, seconds in jobs if one.on_gpu) / max(1, machine.gpus)
@@ -130,7 +147,9 @@ def wall_seconds(planned: Iterable[PlannedJob], machine: Machine) -> float:
             trainings[place] += seconds
         else:
             longest[place] = max(longest[place], seconds)
-    chains = [own[scene, ""] + trainings[scene, m] + longest[scene, m] for scene, m in {*own, *trainings, *longest}]
+    of_drives = {scene: own[drive_of(scene), ""] for scene, _ in {*own, *trainings} if drive_of(scene) != scene}
+    before = {scene: own[scene, ""] + of_drives.get(scene, 0.0) for scene, _ in {*own, *trainings, *longest}}
+    chains = [before[scene] + trainings[scene, m] + longest[scene, m] for scene, m in {*own, *trainings, *longest}]
     return max([busy, on_gpus, *chains])
 
 

@@ -21,13 +21,13 @@ _PROGRESS = re.compile(r"iteration (\d+) of (\d+), loss ([^\s,]+)(?:, \S+ it/s, 
 
 @dataclass
 class RunProgress:
-    """The progress of a run of `planned` jobs, whose `logs` tell which are running and how far trainings are; `began`
-    is the time of its begin.
+    """The progress of a run of `planned` jobs, which become more where blocks of a drive are known only in the run;
+    their `logs` tell which are running and how far trainings are; `began` is the time of its begin.
 
     Expected seconds are updated with every line, since jobs that finish in this run are measured, too.
     """
 
-    planned: Sequence[PlannedJob]
+    planned: Callable[[], Sequence[PlannedJob]]
     logs: Mapping[JobId, Path]
     expectations: Callable[[], Expectations]
     finished: Callable[[], set[JobId]]
@@ -38,9 +38,9 @@ class RunProgress:
     def line(self, now: float) -> str:
         """'37 % of the work, 12 of 40 jobs, about 9 min left; at work: 0103 street masks'; without a share of the work
         while the costs of some jobs are unknown. A training is named with its iteration, loss and remaining time."""
-        expectations, finished = self.expectations(), self.finished()
+        planned, expectations, finished = self.planned(), self.expectations(), self.finished()
         done, unknown, left, at_work = 0.0, 0, [], []
-        for one in self.planned:
+        for one in planned:
             seconds, _ = expectations.of(one.job)
             working = False if one.job in finished else self._is_at_work(one.job)
             remaining = seconds if working is None else 0.0
@@ -61,7 +61,7 @@ class RunProgress:
         named = f"; at work: {', '.join(at_work[:MAX_NAMED])}{more}" if at_work else ""
         known = [f"about {time_left}"] if whole > done or not unknown else []
         missing = [f"{unknown} job{'s' * (unknown > 1)} {NOT_MEASURED}"] if unknown else []
-        return f"{share}{len(finished)} of {len(self.planned)} jobs, {' and '.join([*known, *missing])} left{named}"
+        return f"{share}{len(finished)} of {len(planned)} jobs, {' and '.join([*known, *missing])} left{named}"
 
     def _is_at_work(self, job: JobId) -> bool | None:
         """Whether a job is running, by its log of this run, since Snakemake counts a finished job seconds later; None

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ from drivesplat.workflow.snakemake_log import drop_foreign_records
 from drivesplat.workflow.without_cameras import methods_left_out
 from drivesplat.workflow.without_tracks import methods_of, methods_without_boxes
 
+CUT = "blocks"
+"""The stage that makes the blocks of a drive known."""
 COSTS, ESTIMATE = "costs", "estimate"
 """Targets that run no job: the first updates and prints costs.csv, the second prints the estimate."""
 
@@ -43,6 +46,7 @@ class RunCosts:
         self._plan, self._workflow, self._targets = plan, workflow, targets
         self._results = Path(plan.config.results_dir)
         self._jobs: dict[JobId, Any] = {}
+        self._logs: dict[JobId, Path] = {}
         self._began = time.time()
         self._ended: threading.Event | None = None
 
@@ -69,21 +73,24 @@ class RunCosts:
         """Prints the estimate in full if ESTIMATE is a target. Returns whether it is."""
         if ESTIMATE not in self._targets:
             return False
-        self._jobs = self._needed()
+        self._plan_jobs()
         print(in_full(self.estimate()), flush=True)
+        for sentence in self._unknown_blocks():
+            print(f"drivesplat: {sentence}", flush=True)
         return True
 
     def begin(self) -> None:
         """Prints the estimate in a line and, from then on, the progress. A failure is printed and the run goes on."""
         try:
-            self._jobs = self._needed()
+            self._plan_jobs()
             if self._jobs:
                 _say(in_one_line(self.estimate()))
-                logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
+                for sentence in self._unknown_blocks():
+                    _say(sentence)
                 dag, jobs = self._workflow.dag, self._jobs
                 watched = RunProgress(
-                    self._planned,
-                    logs,
+                    self._planned_by_now,
+                    self._logs,
                     self._expectations,
                     lambda: {name for name, job in jobs.items() if dag.finished(job)},
                     self._machine,
@@ -106,7 +113,8 @@ class RunCosts:
             config = self._plan.config
             ran = [scene for scene in config.scenes if (self._results / BENCHMARKS / scene).is_dir()]
             of_scenes = {scene: list(methods_of(config, scene)) for scene in ran}
-            record = write_costs(self._results, list(config.methods), of_scenes)
+            cut = [scene for scene in ran if config.is_cut(scene)]
+            record = write_costs(self._results, list(config.methods), of_scenes, cut)
         except (DriveSplatError, OSError) as error:
             _say(f"costs are not written: {error}")
             return
@@ -121,18 +129,37 @@ class RunCosts:
     def name_failed_blocks(self) -> None:
         """Prints which blocks of drives failed in this run, with their logs, and which page says what to do."""
         is_block = self._plan.config.is_block
-        # not the jobs that were planned at first: blocks are known later
-        logs = [(job.scene, str(one.log[0])) for job, one in self._needed().items() if is_block(job.scene) and one.log]
-        failed = {scene: log for scene, log in reversed(logs) if has_failed(Path(log), self._began)}
+        self._plan_jobs()
+        of_blocks = [(job.scene, log) for job, log in self._logs.items() if is_block(job.scene)]
+        failed = {scene: log for scene, log in reversed(of_blocks) if has_failed(log, self._began)}
         if failed:
             named = ", ".join(f"{scene} ({log})" for scene, log in failed.items())
             _say(f"these blocks failed: {named}; docs/long_drives.md says how to go on without them")
 
-    def _needed(self) -> dict[JobId, Any]:
-        """Snakemake's jobs that are to run, without those that only collect the results of others."""
-        jobs = (job for job in self._workflow.dag.needrun_jobs() if job.benchmark)
+    def _plan_jobs(self) -> None:
+        """Takes note of Snakemake's jobs that are to run, without those that only collect the results of others: more
+        than before where blocks of a drive have become known."""
         folder = self._results / BENCHMARKS
-        return {JobId.of(Path(os.path.relpath(job.benchmark, folder))): job for job in jobs}
+        for job in [job for job in self._workflow.dag.needrun_jobs() if job.benchmark]:
+            name = JobId.of(Path(os.path.relpath(job.benchmark, folder)))
+            self._jobs[name] = job
+            if job.log:
+                self._logs[name] = Path(str(job.log[0]))
+
+    def _unknown_blocks(self) -> list[str]:
+        """A sentence for each drive whose blocks are known only when this run has cut it."""
+        cut = sorted(job.scene for job in self._jobs if job.stage == CUT)
+        return [
+            f"the blocks of scene {scene} are not known yet, and their jobs are not in the estimate: make "
+            f"{self._results}/{scene}/blocks.json first, or use drivesplat estimate (docs/costs.md)"
+            for scene in cut
+        ]
+
+    def _planned_by_now(self) -> list[PlannedJob]:
+        """The planned jobs, in a thread beside Snakemake's own, which may add jobs meanwhile."""
+        with suppress(RuntimeError):  # the set changed while it was read: the next line has them
+            self._plan_jobs()
+        return self._planned
 
     @property
     def _planned(self) -> list[PlannedJob]:
