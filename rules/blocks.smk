@@ -3,7 +3,7 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/scene.json of a drive of a dataset with `blocks`.
 # OUTPUTS: <results>/{scene}/blocks.json; of every block <results>/{scene}.{number}/scene.json, from which the rules of
-# scenes go on; of the drive {method}/eval.json, eval_objects.json and films.
+# scenes go on; of the drive {method}/eval.json, eval_objects.json, films, films of edits, and splats/.
 
 long_drives = LongDrives(plan, lambda drive: checkpoints.blocks.get(scene=drive).output.blocks)
 
@@ -128,6 +128,53 @@ rule film_blocks:
         code=plan.code("film_blocks"),
     script:
         "../workflow_scripts/film_blocks.py"
+
+
+rule edit_blocks:
+    """
+    Renders an edited drive beside the recorded one, block after block, each with the objects that it has learned.
+    """
+    input:
+        scene=plan.annotated_scene,
+        blocks="<results>/{scene}/blocks.json",
+        scenes=long_drives.results("scene.json"),
+        checkpoints=long_drives.results("{method}/checkpoint.npz"),
+    output:
+        film=report(
+            "<results>/{scene}/{method}/edits/{edit}.mp4",
+            caption="../report/edit.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "edit: {edit} (film)"},
+        ),
+        still=report(
+            "<results>/{scene}/{method}/edits/{edit}.png",
+            caption="../report/edit.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "edit: {edit} (still)"},
+        ),
+        labels="<results>/{scene}/{method}/edits/{edit}.json",
+    log:
+        "<logs>/{scene}/{method}/edit_{edit}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/edit_{edit}.tsv"
+    wildcard_constraints:
+        scene=plan.cut,
+        method=plan.known(plan.methods_with_actors),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=240,
+    params:
+        settings=plan.settings("edit_blocks"),
+        code=plan.code("edit_blocks"),
+    script:
+        "../workflow_scripts/edit_blocks.py"
 
 
 rule export_blocks:

@@ -40,6 +40,7 @@ rule edit:
     benchmark:
         "<benchmarks>/{scene}/{method}/edit_{edit}.tsv"
     wildcard_constraints:
+        scene=plan.trained(),
         method=plan.known(plan.methods_with_actors),
     conda:
         "../envs/drivesplat.yaml"

@@ -1,6 +1,6 @@
 """The stage `film_blocks`: the film of a long drive, of which one block at a time is in memory."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -24,6 +24,8 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import BlockFilmJob
 from drivesplat.trajectories.camera_path import CameraPath, film_path
 
+FramesOf = Callable[[Shot, int, Sequence[int]], Iterator[np.ndarray]]
+"""Gives some frames (h, w, 3) uint8 of a shot, by their indices, as the block of a number shows them."""
 BLEND_M = 5.0
 """Metres of path before and after a border between blocks in which images of both are blended."""
 LEFT_OUT = "block {} left out"
@@ -57,33 +59,49 @@ def block_shares(blocks: Blocks, path: CameraPath, left_out: Collection[int] = (
     return shares
 
 
-class _OpenBlocks:
-    """The models of a drive's blocks, given by their files by number, of which the last two that were used are in
-    memory."""
+class OpenBlocks:
+    """The models of a drive's blocks, given by the files of those that are not left out, in order. The last two that
+    were used are in memory."""
 
-    def __init__(self, scenes: Mapping[int, str], checkpoints: Mapping[int, str], device_settings: DeviceSettings):
-        self._scenes, self._checkpoints, self._device_settings = scenes, checkpoints, device_settings
+    def __init__(
+        self,
+        blocks: Blocks,
+        left_out: Collection[int],
+        scenes: Sequence[str],
+        checkpoints: Sequence[str],
+        device_settings: DeviceSettings,
+    ):
+        files = zip(scenes, checkpoints, strict=True)
+        self._files = dict(zip(blocks.without(left_out), files, strict=True))
+        self._device_settings = device_settings
         self._open: dict[int, tuple[FixedModel, Scene, torch.device]] = {}
-        self.provenances: dict[int, Provenance] = {}
+        self._provenances: dict[int, Provenance] = {}
 
     def __len__(self) -> int:
         return sum(len(fixed.model) for fixed, *_ in self._open.values())
 
+    @property
+    def upstream(self) -> list[Provenance]:
+        """The provenances of the checkpoints of all blocks that were used."""
+        return list(self._provenances.values())
+
     def frames(self, shot: Shot, number: int, indices: Sequence[int]) -> Iterator[np.ndarray]:
         """Some frames of a shot, as a block shows them."""
-        fixed, scene, device = self._block(number)
-        within = _in_block(shot, slice(indices[0], indices[-1] + 1), scene)
+        fixed, scene, device = self.block(number)
+        within = shot_in_block(shot, slice(indices[0], indices[-1] + 1), scene)
         fixed.model.precompute(within.seconds)
         return film_frames(fixed, ((view, None) for view in within.views(device)))
 
-    def _block(self, number: int) -> tuple[FixedModel, Scene, torch.device]:
+    def block(self, number: int) -> tuple[FixedModel, Scene, torch.device]:
+        """The model of a block, its scene, and the device of the model."""
         if number not in self._open:
             while len(self._open) > 1:
                 self._open.pop(next(iter(self._open)))
-            checkpoint = read_checkpoint(self._checkpoints[number])
-            self.provenances[number] = checkpoint.provenance
+            scene, file = self._files[number]
+            checkpoint = read_checkpoint(file)
+            self._provenances[number] = checkpoint.provenance
             model, device = open_model(checkpoint, self._device_settings)
-            self._open[number] = FixedModel(model), read_scene(self._scenes[number]), device
+            self._open[number] = FixedModel(model), read_scene(scene), device
         self._open[number] = self._open.pop(number)
         return self._open[number]
 
@@ -103,34 +121,36 @@ def render_block_film(
     shot = shot_of(scene, film_path(scene, job.camera, job.fps, job.trajectory), job)
     panels = Panels((f"{path.parent.name}: {job.trajectory.in_words}",), shot.size)
     captions = drive_captions(panels.labels, shot.seconds, shot.trained_until)
-    numbers = blocks.without(job.left_out)
-    files = (dict(zip(numbers, paths, strict=True)) for paths in (scenes, checkpoints))
-    opened = _OpenBlocks(*files, device_settings)
+    opened = OpenBlocks(blocks, job.left_out, scenes, checkpoints, device_settings)
     with explain_out_of_memory(lambda: len(opened)):
-        frames = zip(_pictures(shot, blocks, opened, job.left_out), captions, strict=True)
+        frames = zip(block_pictures(shot, blocks, opened.frames, job.left_out), captions, strict=True)
         figures = encode_film(path, frames, len(captions), panels, shot.format)
     offset = job.trajectory.model_dump(exclude={"parts"})
     left_out = [blocks.names[number] for number in job.left_out]
     record = {**shot.record(), "offset": offset, "parts": "all", "left_out": left_out, **figures}
-    return record, list(opened.provenances.values())
+    return record, opened.upstream
 
 
-def _pictures(shot: Shot, blocks: Blocks, opened: _OpenBlocks, left_out: Collection[int]) -> Iterator[np.ndarray]:
-    shares = block_shares(blocks, shot.cameras, left_out)
+def block_pictures(
+    shot: Shot, blocks: Blocks, frames_of: FramesOf, left_out: Collection[int], driven: CameraPath | None = None
+) -> Iterator[np.ndarray]:
+    """The frames (h, w, 3) uint8 of a shot: blended near borders, and dark in blocks that are left out. `driven` has
+    the timestamps that tell the block of each frame; None: those of the shot."""
+    shares = block_shares(blocks, driven or shot.cameras, left_out)
     for (number, other), run in groupby(range(len(shares)), lambda i: (shares[i].number, shares[i].other)):
         indices = list(run)
         if number in left_out:
             yield from [text_picture(LEFT_OUT.format(number), shot.size)] * len(indices)
             continue
-        own = opened.frames(shot, number, indices)
+        own = frames_of(shot, number, indices)
         if other is None:
             yield from own
             continue
-        for i, one, two in zip(indices, own, opened.frames(shot, other, indices), strict=True):
+        for i, one, two in zip(indices, own, frames_of(shot, other, indices), strict=True):
             yield cv2.addWeighted(one, shares[i].weight, two, 1.0 - shares[i].weight, 0.0)
 
 
-def _in_block(shot: Shot, frames: slice, block: Scene) -> Shot:
+def shot_in_block(shot: Shot, frames: slice, block: Scene) -> Shot:
     """Some frames of a shot, in the world of a block's scene."""
     cameras = shot.cameras[frames]
     poses = cameras.camera_to_world.copy()

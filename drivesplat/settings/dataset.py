@@ -87,8 +87,6 @@ class DatasetSettings(Settings):
         for scene in self.edits:
             if scene not in self.scenes and not (self.blocks and drive_of(scene) in self.scenes):
                 raise ValueError(f"edits names scene {scene!r}, which is not in scenes")
-            if self.blocks and scene in self.scenes:
-                raise ValueError(f"edits names scene {scene!r}, which is cut into blocks; name a block, {scene}.000")
         return self
 
 

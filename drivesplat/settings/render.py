@@ -125,6 +125,12 @@ class EditJob(FilmFormat):
     frames: bool = False
 
 
+class BlockEditJob(EditJob):
+    """All settings that determine the film of one edit of a drive that is cut into blocks."""
+
+    left_out: tuple[int, ...] = ()
+
+
 class TruthFilmJob(Settings):
     """All settings that determine the film of a method beside the truth of a synthetic world."""
 

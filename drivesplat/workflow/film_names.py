@@ -2,7 +2,9 @@
 
 from collections.abc import Iterable
 
+from drivesplat.errors import ConfigError
 from drivesplat.io.this_copy import of_the_workflow
+from drivesplat.settings.blocks import block_scene_name
 from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
 from drivesplat.workflow.edits_file import read_edits
@@ -19,9 +21,17 @@ FILM_PAGE = "index.html"
 
 
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
-    """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
+    """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid, or inserts
+    an asset into a drive that is cut into blocks."""
     path = config.datasets[config.dataset_of(scene)].edits.get(scene)
-    return read_edits(of_the_workflow(path)) if path else {}
+    edits = read_edits(of_the_workflow(path)) if path else {}
+    for name, edit in edits.items() if config.is_cut(scene) else ():
+        if any(step.insert for step in edit.steps):
+            raise ConfigError(
+                f"{path}: edit {name!r} inserts an asset, and scene {scene} is cut into blocks: insert it in one of "
+                f"a block, named by edits: {{{block_scene_name(scene, 0)}: ...}}"
+            )
+    return edits
 
 
 def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.settings.blocks import block_scene_name, drive_of
 from drivesplat.settings.config import Config, for_scene
+from drivesplat.workflow.film_names import EDITS, scene_edits
 from drivesplat.workflow.outputs import SPLATS, Outputs
 from drivesplat.workflow.without_cameras import scene_methods
 
@@ -30,6 +31,7 @@ FILES_OF_TARGETS = {
     "alpasim": "{method}/scene.alpasim.usdz",
 }
 """What the targets that make nothing, or little, of such a drive make of a scene: a file of each."""
+EDIT_FILES = (".mp4", ".png", ".json")
 FILM_FILES = (".mp4", ".cameras.json")
 
 
@@ -114,6 +116,8 @@ def refuse_results_of_blocks(config: Config, scene: str, path: Sequence[str]) ->
     films = _films(config, scene)
     own = {"eval.json", "eval_objects.json", *(f"{name}{end}" for name in films for end in FILM_FILES)}
     known = path[-1] in (own if len(path) == 2 else OF_DRIVES) if len(path) < 3 else path[1:] == SPLATS.split("/")
+    is_edit = len(path) == 3 and path[1] == EDITS and path[2].endswith(EDIT_FILES)
+    known = known or (is_edit and bool(scene_edits(config, scene)))
     if not known:
         raise ConfigError(
             f"scene {scene} is cut into blocks, and {'/'.join(path)} is a result of one block: ask for "

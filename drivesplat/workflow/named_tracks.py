@@ -19,7 +19,7 @@ from drivesplat.settings.world import WorldDonor
 from drivesplat.workflow.film_names import EDITS, QUAD, scene_edits
 from drivesplat.workflow.without_tracks import methods_of
 
-RULES_OF_EDITS = ("edit", "quad", "drive_folder", "scan_folder")
+RULES_OF_EDITS = ("edit", "edit_blocks", "quad", "drive_folder", "scan_folder")
 """Rules that render an edit; the last two also render trajectories, which name no tracks."""
 RULES_OF_SUBJECT = ("ghost_panel", "remove_actor")
 """Rules that show the vehicle that `subjects` names."""
@@ -69,6 +69,11 @@ def fitting_edits(config: Config, scene: str, tracks: Tracks) -> dict[str, Edit]
         if {"annotated": not any(found), "discovered": all(found), "none": not found}[tracks]:
             fitting[name] = edit
     return fitting
+
+
+def edits_whole(config: Config, scene: str, method: str) -> bool:
+    """Whether a method knows its objects by one id in all of a scene: blocks find other ones each by themselves."""
+    return not config.is_cut(scene) or config.all_methods[method].tracks == "annotated"
 
 
 def shows_subject(subject: SubjectSettings, tracks: Tracks) -> bool:

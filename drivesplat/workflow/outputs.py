@@ -17,7 +17,7 @@ from drivesplat.settings.render import TrajectorySettings
 from drivesplat.settings.tracks import TRACK_FOLDERS
 from drivesplat.workflow.film_names import EDITS, QUAD, TRAJECTORIES, no_such_edit, scene_edits
 from drivesplat.workflow.inputs import Inputs
-from drivesplat.workflow.named_tracks import fitting_edits
+from drivesplat.workflow.named_tracks import edits_whole, fitting_edits
 from drivesplat.workflow.running_code import planned_digest
 from drivesplat.workflow.runs_file import RUNS, config_runs, runs_of
 from drivesplat.workflow.stages import (
@@ -144,7 +144,16 @@ class Outputs(Inputs):
         """The films of every edit of `scenes`, by default the batch's, and of blocks of these that have an edits file,
         by every method that can be edited. Raises ConfigError where an edits file is invalid."""
         chosen = self._with_named_blocks(scenes)
-        return self.of_methods(lambda *at: [f"edits/{edit}.mp4" for edit in self._edit_names(*at)], chosen)
+        of_drives = [
+            f"{self.config.results_dir}/{scene}/{method}/{EDITS}/{edit}.mp4"
+            for scene in chosen
+            if self.config.is_cut(scene)
+            for method in scene_methods(self.config, scene)
+            for edit in self._edit_names(scene, method)
+        ]
+        return of_drives + self.of_methods(
+            lambda *at: [f"{EDITS}/{edit}.mp4" for edit in self._edit_names(*at)], chosen
+        )
 
     def drives(self, _: Any = None) -> list[str]:
         """The rendered drive folders of the batch's scenes: of every edit, by every method that can be edited, and of
@@ -325,7 +334,7 @@ class Outputs(Inputs):
         return [*(name for name, trajectory in settings.trajectories.items() if trajectory.parts == "all"), *lidar]
 
     def _edit_names(self, scene: str, method: str) -> Iterable[str]:
-        if method not in self.methods_with_actors:
+        if method not in self.methods_with_actors or not edits_whole(self.config, scene, method):
             return ()
         return fitting_edits(self.config, scene, self.config.all_methods[method].tracks)
 

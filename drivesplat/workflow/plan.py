@@ -18,7 +18,7 @@ from drivesplat.io.regular_file import regular_file
 from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
-from drivesplat.settings.blocks import drive_of
+from drivesplat.settings.blocks import block_scene_name, drive_of
 from drivesplat.settings.config import Config, for_scene, load
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.tracks import OTHER_TRACKS
@@ -35,7 +35,7 @@ from drivesplat.workflow.film_pages import FilmPages
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
 from drivesplat.workflow.long_drives import refuse_results_of_blocks, require_cameras
-from drivesplat.workflow.named_tracks import refuse_other_tracks, refuse_wrong_tracks, track_references
+from drivesplat.workflow.named_tracks import edits_whole, refuse_other_tracks, refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.recordings import Recordings
 from drivesplat.workflow.report_plan import ReportPlan
@@ -235,6 +235,11 @@ class Plan(JobResources):
         if method not in self.methods_with_actors:
             able = ", ".join(filter(methods_of(self.config, scene).__contains__, self.methods_with_actors)) or "none"
             raise ConfigError(f"method {method!r} knows no actors that could be edited; those do: {able}")
+        if not edits_whole(self.config, scene, method):
+            raise ConfigError(
+                f"scene {scene} is cut into blocks, in each of which {method!r} finds its own objects: edit a block "
+                f"({block_scene_name(scene, 0)}), or take a method with annotated tracks"
+            )
         if edit not in scene_edits(self.config, scene):
             raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
         refuse_other_tracks(self.config, scene, method, edit)

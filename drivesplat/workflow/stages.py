@@ -36,6 +36,7 @@ from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, RegionJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import (
+    BlockEditJob,
     BlockFilmJob,
     CompareJob,
     EditJob,
@@ -75,6 +76,7 @@ SIDE_BY_SIDE = "scene_metrics"
 OF_ONE_SCENE = (
     WORLD, "extract", "masks", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer",
     "drive_folder", "scan_folder", "run", "run_folder", "evaluate_blocks", "film_blocks", "export_blocks",
+    "edit_blocks",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
@@ -252,7 +254,8 @@ def _world(at: JobScope) -> dict[str, Any]:
     """Raises ConfigError where an edit whose truth is asked for does not exist."""
     world, edits = at.dataset.world, scene_edits(at.config, at.scene)
     assert world is not None
-    fitting = fitting_edits(at.config, at.scene, "annotated")
+    # the world of a drive that is cut has no truth of its own, and is not made again for an edit
+    fitting = {} if at.dataset.blocks else fitting_edits(at.config, at.scene, "annotated")
     of_labels = [name for name, edit in fitting.items() if world_donors(at.config, edit) is not None]
     wanted = of_labels if world.truth.edits is None else world.truth.edits
     for name in wanted:
@@ -371,6 +374,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "compare": (CompareJob, lambda at: {**_encoding(at), "end": at.config.render.end}),
     "truth_film": (TruthFilmJob, _encoding),
     "edit": (EditJob, lambda at: {**_quad(at), "frames": at.config.render.edited_frames}),
+    "edit_blocks": (BlockEditJob, lambda at: {**_quad(at), "left_out": at.dataset.left_out(at.scene)}),
     **dict.fromkeys(("quad", "edit_truth"), (EditJob, _quad)),
     "drive_folder": (DriveJob, _drive_folder),
     "scan_folder": (ScanFolderJob, _scan_folder),

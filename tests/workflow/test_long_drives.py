@@ -15,6 +15,7 @@ from drivesplat.workflow.long_drives import (
     require_cameras,
     targets_without_drives,
 )
+from drivesplat.workflow.named_tracks import track_references
 from drivesplat.workflow.plan import Plan
 
 BLOCKS = {"length_m": 100.0, "overlap_m": 10.0}
@@ -158,6 +159,37 @@ def test_edits_and_runs_of_blocks_are_made_with_those_of_other_scenes(tmp_path):
     runs.write_text("runs: {here: {policy: recorded, scenes: [way]}}")
     with pytest.raises(ConfigError, match=r"run 'here': scene way is cut into blocks, .* such as way.000"):
         made.runs()
+
+
+def edited(tmp_path, text: str, **methods) -> Plan:
+    """A drive that is cut into blocks with an edits file."""
+    file = tmp_path / "edits.yaml"
+    file.write_text(f"edits: {text}")
+    every = {"vanilla": {}, "street": {"parts": ["background", "actors"]}, **methods}
+    cut = {**CUT, "edits": {"way": str(file)}}
+    return Plan({"datasets": {"cut": cut}, "methods": every, "results_dir": "there"}, str(REPOSITORY))
+
+
+def test_edits_of_a_whole_drive_are_made_by_methods_whose_objects_have_one_id_in_all_blocks(tmp_path):
+    found = {"parts": ["background", "actors"], "tracks": "discovered"}
+    made = edited(tmp_path, "{gone: [{remove: {track: abc}}]}", found=found)
+    assert made.edits() == ["there/way/street/edits/gone.mp4"] and targets_without_drives(made, ["edits"]) == []
+    for name in ("gone.mp4", "gone.png", "gone.json"):
+        made.refuse_unknown([f"there/way/street/edits/{name}"])
+    settings = json.loads(made.stage_settings("edit_blocks", "way", "street", "gone"))
+    assert settings["edit"] == {"steps": [{"remove": {"track": "abc"}}]} and settings["left_out"] == []
+    with pytest.raises(ConfigError, match=r"in each of which 'found' finds its own objects: edit a block \(way.000\)"):
+        made.refuse_unknown(["there/way/found/edits/gone.mp4"])
+    with pytest.raises(ConfigError, match="scene way has no edit called 'moved'; there are: gone"):
+        made.refuse_unknown(["there/way/street/edits/moved.mp4"])
+    with pytest.raises(ConfigError, match=r"and street/edits/gone/drive/drive.json is a result of one block"):
+        made.refuse_unknown(["there/way/street/edits/gone/drive/drive.json"])
+    assert track_references(made.config, "way").edits[0].track == "abc", "`extract` looks for it"
+
+
+def test_assets_are_inserted_into_blocks_alone(tmp_path):
+    with pytest.raises(ConfigError, match=r"edit 'new' inserts an asset, and scene way is cut into blocks: .* way.000"):
+        edited(tmp_path, "{new: [{insert: {asset: 0061/abc, as: other, at: [10, 0]}}]}").edits()
 
 
 def test_blocks_are_left_out_of_the_results_of_the_drive_alone(drives, tmp_path):

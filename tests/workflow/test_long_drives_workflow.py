@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.drives import World, write_world
-from helpers.shared_runs import VANILLA
+from helpers.shared_runs import TWO_METHODS, VANILLA
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 from plyfile import PlyData
 
@@ -145,6 +145,15 @@ def test_results_of_one_block_are_refused_for_the_drive_in_a_sentence(copy):
     assert result.returncode
     said = copy.dry_run("alpasim")
     assert "drivesplat: scene 0001 is cut into blocks: alpasim makes nothing of it; ask for files of blocks" in said
+
+
+def test_an_edit_of_the_drive_is_planned_from_its_blocks(copy):
+    (copy.folder / "edits.yaml").write_text("edits: {gone: [{remove: {track: '0001 instance 0'}}]}")
+    named = {"nuscenes": {**copy.config["datasets"]["nuscenes"], "edits": {"0001": "edits.yaml"}}}
+    with copy.set_to(methods=TWO_METHODS, datasets=named):
+        planned = copy.planned("results/0001/street/edits/gone.mp4")
+        assert planned["edit_blocks"] == 1 and planned["train"] == 4 and "edit" not in planned
+        assert copy.planned("results/0001.001/street/splat.ply").keys() >= {"train", "export"}
 
 
 def test_a_run_may_name_a_block(copy):

@@ -53,11 +53,11 @@ class PaperRecording:
 
 @dataclass(frozen=True)
 class BlockCosts:
-    """What the blocks of a `drive` took with a `method`, of those of them that have been measured (`blocks`): means of
-    the numbers of their training images, of all `cameras`, of the seconds of their trainings, evaluations and of all other stages, and of
-    the bytes of their results, those of the method and all others. `size` is the width and height of an image in
-    pixels; `model_gb` the least GPU memory that held any training without its images (None: not measured). For the
-    stages of the whole drive seconds and bytes for each of its images."""
+    """What the blocks of a `drive` took with a `method`, of those that have been measured (`blocks`): means of the
+    numbers of their training images, of all `cameras`, of the seconds of their trainings, evaluations and of all other
+    stages, and of the bytes of their results, those of the method and all others. `size` is the width and height of an
+    image in pixels; `model_gb` the least GPU memory that held any training without its images (None: not measured). For
+    the stages of the whole drive seconds and bytes for each of its images."""
 
     drive: str
     method: str
