@@ -48,5 +48,5 @@ onerror:
             from drivesplat.report.partial import write_partial_report
 
             write_partial_report(plan)
-        run_costs.name_failed_blocks()
         run_costs.end()
+        run_costs.name_failed_blocks()

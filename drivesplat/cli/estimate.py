@@ -45,49 +45,54 @@ def run_estimate(parsed: argparse.Namespace, results: Path, per_card: int) -> in
     for costs in chosen_costs(measured_drives(results), results, parsed.drive, parsed.method):
         size = parsed.size or costs.size
         recording = PaperRecording(parsed.hours, parsed.cameras, size, parsed.hz, parsed.speed_kmh)
-        for line in _lines(recording, costs, on_paper(recording, costs), parsed.cards, per_card, results):
+        for line in _lines(recording, costs, parsed.cards, per_card, results):
             print(line)
     return 0
 
 
 def _lines(
-    recording: PaperRecording,
-    costs: BlockCosts,
-    found: PaperEstimate,
-    cards: list[int],
-    per_card: int,
-    results: Path,
+    recording: PaperRecording, costs: BlockCosts, cards: list[int], per_card: int, results: Path
 ) -> Iterator[str]:
     """The estimate in words."""
+    least, most = on_paper(recording, costs)
     on_gpu = not any(device.startswith("cpu") for device in costs.devices)
-    unit = "GPU" if on_gpu else "machine"
-    width, height = recording.size
-    size = recording.pixels / costs.pixels
+    unit, (width, height) = "GPU" if on_gpu else "machine", recording.size
     iterations = " or ".join(f"{steps:,}" for steps in costs.iterations) or "unknown"
+
+    def times(seconds: Callable[[PaperEstimate], float], words: Callable[[float], str] = spelled) -> str:
+        """Both bounds in words, one where they are almost the same."""
+        low, high = seconds(least), seconds(most)
+        return words(high) if high < 1.1 * low else f"{words(low)} to {words(high)}"
+
+    def hours(seconds: float) -> str:
+        return f"{seconds / 3600:,.1f}"
+
     yield (
         f"{costs.method}, by {costs.blocks} measured blocks of {costs.drive} in {results}/ "
-        f"({', '.join(costs.devices) or 'unknown device'}; {iterations} iterations)"
+        f"({', '.join(costs.devices) or 'unknown device'}; {iterations} iterations; {costs.images:,.0f} images of "
+        f"{costs.size[0]}x{costs.size[1]} in a block)"
     )
     yield (
-        f"  {recording.metres / 1000:.1f} km in {found.blocks:,} blocks of {costs.length_m:g} m with "
-        f"{found.images:,.0f} images of {width}x{height} each"
+        f"  {recording.metres / 1000:.1f} km in {least.blocks:,} blocks of {costs.length_m:g} m with "
+        f"{least.images:,.0f} images of {width}x{height} each"
     )
     yield (
-        f"  a block: {spelled(found.device_seconds)} of training and evaluation, {spelled(found.other_seconds)} of "
-        f"other jobs, {_memory(found, on_gpu)}"
+        f"  a block: {times(lambda one: one.device_seconds)} of training and evaluation, "
+        f"{times(lambda one: one.other_seconds)} of other jobs, {_memory(least, on_gpu)}"
     )
-    hours = found.blocks * found.device_seconds / 3600.0
+    together = f" ({per_card} trainings at a time)" * (per_card > 1)
     yield (
-        f"  all blocks: {hours / per_card:,.1f} {unit} hours{f' ({per_card} trainings at a time)' * (per_card > 1)}, "
-        f"{found.blocks * found.other_seconds / 3600.0:,.1f} hours of other jobs on processors"
+        f"  all blocks: {times(lambda one: one.blocks * one.device_seconds / per_card, hours)} {unit} hours{together}, "
+        f"{times(lambda one: one.blocks * one.other_seconds, hours)} hours of other jobs on processors"
     )
-    walls = (f"{count} {unit}{'s' * (count > 1)} {spelled(found.wall_seconds(count, per_card))}" for count in cards)
-    yield f"  wall time: {', '.join(walls)}; {spelled(found.first_seconds)} of it before the first block"
-    yield f"  disk: {found.disk * 1e-9:,.1f} GB"
+    for count in cards:
+        wall = times(lambda one, count=count: one.wall_seconds(count, per_card))
+        yield f"  wall time on {count} {unit}{'s' * (count > 1)}: {wall}"
+    yield f"  of which before the first block: {times(lambda one: one.first_seconds)}"
+    yield f"  disk: {least.disk * 1e-9:,.1f} GB"
     yield (
-        "  for metrics.json, without films and exports, if processors keep up; measured with "
-        f"{costs.images:,.0f} images of {costs.size[0]}x{costs.size[1]} in a block"
-        + (f". Times are scaled by pixels ({size:.1f}), which is rough" if not 0.9 < size < 1.1 else "")
+        "  for metrics.json, without films and exports, if processors keep up. Where images differ from those "
+        "measured, times are bounds (docs/costs.md)"
     )
 
 

@@ -12,7 +12,7 @@ from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.drive.world_state import AnyCamera
 from drivesplat.errors import RequestError
-from drivesplat.io.storage import read_json
+from drivesplat.io.storage import read_record
 from drivesplat.scene.blocks import BLOCKS, read_blocks
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
@@ -66,7 +66,9 @@ class LongDrive:
         """The numbers of the blocks that cannot be rendered: those without a trained model, and those that the figures
         of the drive leave out (`datasets.*.blocks.leave_out`)."""
         measured = self.folder / "eval.json"
-        names = read_json(measured, "evaluate_blocks")["protocol"].get("left_out", []) if measured.is_file() else []
+        names: list[str] = []
+        if measured.is_file():
+            names = read_record(measured, "evaluate_blocks", "protocol")["protocol"].get("left_out", [])
         return [
             number
             for number, name in enumerate(self.blocks.names)

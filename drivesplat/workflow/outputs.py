@@ -143,7 +143,8 @@ class Outputs(Inputs):
     def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
         """The films of every edit of `scenes`, by default the batch's, and of blocks of these that have an edits file,
         by every method that can be edited. Raises ConfigError where an edits file is invalid."""
-        chosen = self._with_named_blocks(scenes)
+        of_edits = (scene for dataset in self.config.datasets.values() for scene in dataset.edits)
+        chosen = self._with_blocks(scenes, of_edits)
         of_drives = [
             f"{self.config.results_dir}/{scene}/{method}/{EDITS}/{edit}.mp4"
             for scene in chosen
@@ -179,7 +180,9 @@ class Outputs(Inputs):
             found, every = runs_of(self.config, scene, method), not self.config.is_block(scene)
             return [f"{RUNS}/{name}.json" for name, run in found.items() if every or run.scenes or run.edit]
 
-        return self.of_methods(names, self._with_named_blocks(scenes))
+        of_edits = (scene for dataset in self.config.datasets.values() for scene in dataset.edits)
+        of_runs = (scene for run in config_runs(self.config).values() for scene in run.scenes or ())
+        return self.of_methods(names, self._with_blocks(scenes, (*of_edits, *of_runs)))
 
     def mcap_files(self, _: Any = None) -> list[str]:
         """The MCAP files of the batch's scenes and methods: of the recorded path, of every edit and of every run."""
@@ -280,13 +283,11 @@ class Outputs(Inputs):
         places = ((scene, method) for scene in shown for method in scene_methods(self.config, scene))
         return [f"{results}/{scene}/{method}/{name}" for scene, method in places for name in names(scene, method)]
 
-    def _with_named_blocks(self, scenes: Iterable[str] | None) -> list[str]:
-        """`scenes`, by default the batch's, and those of their blocks that edits or runs name."""
+    def _with_blocks(self, scenes: Iterable[str] | None, named: Iterable[str]) -> list[str]:
+        """`scenes`, by default the batch's, and those of their blocks that are among the `named` scenes."""
         chosen = self.config.batch_scenes if scenes is None else list(scenes)
-        of_edits = (scene for dataset in self.config.datasets.values() for scene in dataset.edits)
-        of_runs = (scene for run in config_runs(self.config).values() for scene in run.scenes or ())
-        named = (scene for scene in dict.fromkeys((*of_edits, *of_runs)) if self.config.is_block(scene))
-        return [*chosen, *(scene for scene in named if drive_of(scene) in chosen)]
+        blocks = (scene for scene in dict.fromkeys(named) if self.config.is_block(scene))
+        return [*chosen, *(scene for scene in blocks if drive_of(scene) in chosen)]
 
     def trained(self, cameras: bool | None = None) -> str:
         """The wildcard constraint of scenes with a model: those that are not cut into blocks, and blocks. With

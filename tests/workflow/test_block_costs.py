@@ -83,46 +83,56 @@ def test_the_means_of_measured_blocks_are_what_their_jobs_took_and_left(results)
     assert (found.drive_seconds_per_image, found.drive_bytes_per_image) == (16.0 / images, of_drive / images)
 
 
-def test_a_longer_recording_takes_what_blocks_take_scaled_by_images_and_pixels(results):
+def test_a_longer_recording_takes_between_what_blocks_took_and_that_in_proportion_to_images(results):
     (costs,) = measured_drives(results)
-    found = on_paper(RECORDING, costs)
-    assert found.blocks == 36_000 / 150
+    least, most = on_paper(RECORDING, costs)
     images = 6 * 10 * 230 / 10  # on 230 m at 10 m/s
-    share = 4.0 * images / 40
-    assert found.images == images and found.device_seconds == pytest.approx(4.0 * 25.0 + share / 3 * 4.0)
-    assert found.other_seconds == pytest.approx(share * 5.0)
-    assert found.first_seconds == pytest.approx(4.0 * 6 * 10 * 3600 * 16.0 / 80)
-    assert found.memory_gb == pytest.approx(costs.model_gb + images * 1600 * 900 * 3e-9)
-    whole = 4.0 * 6 * 10 * 3600 * costs.drive_bytes_per_image
-    assert found.disk == pytest.approx(240 * (costs.method_bytes + share * 5000.0) + whole)
-    before = found.first_seconds + found.other_seconds
+    share, whole = 4.0 * images / 40, 6 * 10 * 3600
+    for found in (least, most):
+        assert (found.blocks, found.images) == (36_000 / 150, images)
+        assert found.memory_gb == pytest.approx(costs.model_gb + images * 1600 * 900 * 3e-9)
+        of_drive = 4.0 * whole * costs.drive_bytes_per_image
+        assert found.disk == pytest.approx(240 * (costs.method_bytes + share * 5000.0) + of_drive)
+    assert (least.device_seconds, least.other_seconds) == (29.0, 5.0)
+    assert most.device_seconds == pytest.approx(4.0 * 25.0 + share / 3 * 4.0)
+    assert most.other_seconds == pytest.approx(share * 5.0)
+    assert [one.first_seconds for one in (least, most)] == pytest.approx([whole * 16.0 / 80, 4.0 * whole * 16.0 / 80])
+    before = most.first_seconds + most.other_seconds
     for cards, per_card, rounds in ((1, 1, 240), (8, 1, 30), (64, 1, 4), (8, 6, 5), (240, 1, 1), (999, 1, 1)):
-        assert found.wall_seconds(cards, per_card) == pytest.approx(before + rounds * found.device_seconds)
+        assert most.wall_seconds(cards, per_card) == pytest.approx(before + rounds * most.device_seconds)
+    smaller = PaperRecording(hours=1.0, cameras=2, size=(400, 225), hz=1.0, speed_kmh=36.0)
+    least, most = on_paper(smaller, costs)
+    assert least.device_seconds < most.device_seconds == 29.0
 
 
 def test_a_recording_like_the_measured_one_takes_what_that_took(results):
     (costs,) = measured_drives(results)
     same = PaperRecording(hours=30 / 3600, cameras=2, size=SIZE, hz=20 / 15, speed_kmh=3.6 * 230 / 15)
-    found = on_paper(same, costs)
-    assert (found.images, found.device_seconds, found.other_seconds) == pytest.approx((40.0, 29.0, 5.0))
-    assert found.first_seconds == pytest.approx(16.0) and found.memory_gb == pytest.approx(1.0)
+    for found in on_paper(same, costs):
+        assert (found.images, found.device_seconds, found.other_seconds) == pytest.approx((40.0, 29.0, 5.0))
+        assert found.first_seconds == pytest.approx(16.0) and found.memory_gb == pytest.approx(1.0)
 
 
 def test_the_command_prints_what_it_knows_and_how(results, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     line = ["estimate", "--hours", "1", "--cameras", "6", "--size", "1600x900", "--hz", "10", "--speed-kmh", "36"]
-    line += ["--cards", "1,64"]
-    assert main([*line, "--results", str(results)]) == 0
+    assert main([*line, "--cards", "1,64", "--results", str(results)]) == 0
     said = capsys.readouterr().out
-    assert f"street, by 2 measured blocks of way in {results}/ (NVIDIA H200; 3,000 iterations)" in said
+    measured = "(NVIDIA H200; 3,000 iterations; 40 images of 800x450 in a block)"
+    assert f"street, by 2 measured blocks of way in {results}/ {measured}" in said
     assert "36.0 km in 240 blocks of 150 m with 1,380 images of 1600x900 each" in said
-    found = on_paper(RECORDING, measured_drives(results)[0])
-    assert f" {240 * found.device_seconds / 3600:.1f} GPU hours" in said
-    walls = (f"{n} GPU{'s' * (n > 1)} {spelled(found.wall_seconds(n, 1))}" for n in (1, 64))
-    assert f"wall time: {', '.join(walls)}; {spelled(found.first_seconds)} of it before the first block" in said
-    assert f"disk: {found.disk * 1e-9:,.1f} GB" in said and "Times are scaled by pixels (4.0)" in said
+    least, most = on_paper(RECORDING, measured_drives(results)[0])
+    hours = [f"{240 * found.device_seconds / 3600:.1f}" for found in (least, most)]
+    assert f"all blocks: {hours[0]} to {hours[1]} GPU hours, " in said
+    for cards, name in ((1, "1 GPU"), (64, "64 GPUs")):
+        walls = [spelled(found.wall_seconds(cards, 1)) for found in (least, most)]
+        assert f"wall time on {name}: {walls[0]} to {walls[1]}\n" in said
+    assert f"disk: {least.disk * 1e-9:,.1f} GB" in said
     assert main([*line, "--results", str(results), "--per-card", "6"]) == 0
     assert "GPU hours (6 trainings at a time)" in capsys.readouterr().out
+    same = ["--cameras", "2", "--hz", str(20 / 15), "--speed-kmh", str(3.6 * 230 / 15)]
+    assert main(["estimate", "--hours", "0.5", *same, "--results", str(results)]) == 0
+    assert "a block: 29 s of training and evaluation, 5 s of other jobs, 1.0 GB of GPU" in capsys.readouterr().out
 
 
 def test_without_measured_blocks_nothing_is_invented(results, capsys, tmp_path, monkeypatch):

@@ -35,8 +35,15 @@ def copy(tmp_path_factory) -> WorkflowCopy:
         holdout={"every_nth": 5, "offset": 2, "last_block": 1},
         train={**TINY_TRAINING, "iterations": 20},
     )
-    made.run(*TARGETS)
+    done = made.run(*TARGETS)
+    (made.folder / "first_run.txt").write_text(done.stdout)
     return made
+
+
+def test_a_run_that_cuts_a_drive_says_that_it_does_not_know_the_blocks_yet(copy):
+    said = (copy.folder / "first_run.txt").read_text()
+    assert "drivesplat: the blocks of scene 0001 are not known yet, and their jobs are not in the estimate" in said
+    assert "blocks of scene 0001 are not known yet" not in copy.run("estimate", TARGETS[0]).stdout
 
 
 def frames_of(film: Path) -> list[np.ndarray]:
@@ -70,9 +77,13 @@ def test_the_costs_of_the_blocks_tell_those_of_a_longer_drive(copy, capsys):
     asked = ["estimate", "--hours", "0.5", "--cameras", "6", "--hz", "10", "--speed-kmh", "36", "--cards", "1,8"]
     assert main([*asked, "--results", str(copy.folder / "results")]) == 0
     said = capsys.readouterr().out
-    assert "vanilla, by 3 measured blocks of 0001 in " in said and "(cpu" in said and "; 20 iterations)" in said
+    assert (
+        "vanilla, by 3 measured blocks of 0001 in " in said
+        and "(cpu" in said
+        and "; 20 iterations; 5 images of 96x54 in a block)" in said
+    )
     assert "18.0 km in 600 blocks of 30 m with 300 images of 96x54 each" in said
-    assert "8 machines " in said and "GPU memory not measured" in said
+    assert "wall time on 8 machines: " in said and "GPU memory not measured" in said
     (drive,) = copy.read("results/costs.json")["drives"]
     assert drive["drive"] == "0001" and drive["blocks"] == 3 and drive["bytes"] > 10_000
     with copy.set_to(train={**copy.config["train"], "iterations": 21}):

@@ -5,7 +5,7 @@ numbers and the pixels of images.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -201,23 +201,29 @@ class PaperEstimate:
         return self.first_seconds + self.other_seconds + rounds * self.device_seconds
 
 
-def on_paper(recording: PaperRecording, costs: BlockCosts) -> PaperEstimate:
-    """The estimate of a recording by measured blocks. The seconds of a training are scaled by the pixels of an image,
-    those of an evaluation also by the number of images of one camera, those of other stages and bytes by the number of
-    all images."""
-    blocks = max(1, int(recording.metres / costs.length_m + 0.5))
-    images = recording.images(min(recording.metres, costs.length_m + 2.0 * costs.overlap_m))
-    size = recording.pixels / costs.pixels
-    share, whole = size * images / costs.images, size * recording.images(recording.metres)
+def on_paper(recording: PaperRecording, costs: BlockCosts) -> tuple[PaperEstimate, PaperEstimate]:
+    """The least and the most that a recording takes by measured blocks. Its blocks have other images than these: the
+    seconds of a training grow with the pixels of an image at most in proportion, those of an evaluation also with the
+    images of one camera, those of other stages with all images, and at least not at all; likewise where they become
+    less. Bytes and memory are in proportion. The stages of the whole drive take as long for each image at least."""
+    metres = min(recording.metres, costs.length_m + 2.0 * costs.overlap_m)
+    images, size = recording.images(metres), recording.pixels / costs.pixels
+    share, every = size * images / costs.images, recording.images(recording.metres)
     evaluated = size * (images / recording.cameras) / (costs.images / costs.cameras)
     image_gb = images * recording.pixels * BYTES_PER_PIXEL * 1e-9
-    return PaperEstimate(
-        blocks=blocks,
-        images=images,
-        device_seconds=size * costs.train_seconds + evaluated * costs.evaluate_seconds,
-        other_seconds=share * costs.other_seconds,
-        first_seconds=whole * costs.drive_seconds_per_image,
-        memory_gb=None if costs.model_gb is None else costs.model_gb + image_gb,
-        image_gb=image_gb,
-        disk=blocks * (costs.method_bytes + share * costs.scene_bytes) + whole * costs.drive_bytes_per_image,
-    )
+    blocks = max(1, int(recording.metres / costs.length_m + 0.5))
+    of_blocks = blocks * (costs.method_bytes + share * costs.scene_bytes)
+
+    def bound(of: Callable[[float, float], float]) -> PaperEstimate:
+        return PaperEstimate(
+            blocks=blocks,
+            images=images,
+            device_seconds=of(1.0, size) * costs.train_seconds + of(1.0, evaluated) * costs.evaluate_seconds,
+            other_seconds=of(1.0, share) * costs.other_seconds,
+            first_seconds=of(1.0, size) * every * costs.drive_seconds_per_image,
+            memory_gb=None if costs.model_gb is None else costs.model_gb + image_gb,
+            image_gb=image_gb,
+            disk=of_blocks + size * every * costs.drive_bytes_per_image,
+        )
+
+    return bound(min), bound(max)

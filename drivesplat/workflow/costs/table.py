@@ -51,7 +51,9 @@ def scene_totals(
     return totals
 
 
-def drive_totals(results: Path, costs: Sequence[Cost], scenes: Sequence[dict[str, Any]], cut: Collection[str]) -> list:
+def drive_totals(
+    results: Path, costs: Sequence[Cost], scenes: Sequence[dict[str, Any]], cut: Collection[str]
+) -> list[dict[str, Any]]:
     """The summed costs of each of the drives that are `cut` into blocks, over itself and its blocks: the number of
     `blocks`, `seconds` of all their jobs and of trainings, the largest peaks of memory, and `bytes` on disk."""
     totals = []
