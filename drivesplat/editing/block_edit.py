@@ -77,6 +77,13 @@ class EditedDrive:
         actors = edited_actors(recorded, job.edit, where, (), ego_to_world)
         return cls(scene, {actor.id: actor for actor in recorded}, actors)
 
+    @property
+    def changed(self) -> set[str]:
+        """The ids of the recorded objects that the edit changes, copies, or removes."""
+        return {actor.source for actor in self.actors if actor.edited} | self.recorded.keys() - {
+            a.id for a in self.actors
+        }
+
     def in_block(self, own: Sequence[EditedActor], block: Scene) -> list[EditedActor]:
         """The actors of a block after the edit, in its time and world, from those that it has learned (`own`). Those
         that the edit leaves on their paths move as the block has learned it."""
@@ -101,16 +108,19 @@ class EditedDrive:
 
 class _EditedBlocks:
     """The blocks of an edited drive, as `OpenBlocks` gives those of the recorded one; `shown` are the ids of the edited
-    objects that each block has, by its number."""
+    objects that each block has, by its number, and `learned` those of all objects that any block has learned."""
 
     def __init__(self, opened: OpenBlocks, drive: EditedDrive, where: str):
         self._opened, self._drive, self._where = opened, drive, where
         self.shown: dict[int, list[str]] = {}
+        self.learned: set[str] = set()
 
     def frames(self, shot: Shot, number: int, indices: Sequence[int]) -> Iterator[np.ndarray]:
         """Some frames of a shot, as a block shows them."""
         fixed, block, device = self._opened.block(number)
-        actors = self._drive.in_block(trained_actors(fixed.model, block, self._where), block)
+        own = trained_actors(fixed.model, block, self._where)
+        actors = self._drive.in_block(own, block)
+        self.learned |= {actor.id for actor in own}
         self.shown[number] = sorted(actor.id for actor in actors if actor.edited)
         within = shot_in_block(shot, slice(indices[0], indices[-1] + 1), block)
         return edited_frames(fixed.model, within.views(device), actors, np.array(within.seconds))
@@ -148,9 +158,10 @@ def render_block_edit(
     with explain_out_of_memory(lambda: len(opened)):
         figures = encode_film(files.film, zip(pairs, captions, strict=True), len(captions), panels, after.format)
     write_png(files.still, still.picture)
-    for actor in drive.actors:
-        if actor.edited and not any(actor.id in shown for shown in edited.shown.values()):
-            log.warning("%s: no block of the drive has learned %s, which films do not show", where, actor.source)
+    for name in sorted(drive.changed - edited.learned):
+        log.warning(
+            "%s: no block has learned %s as an object of its own, so that the edit does not change it", where, name
+        )
     names = blocks.names
     record = {
         **after.record(),

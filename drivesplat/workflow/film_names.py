@@ -28,8 +28,8 @@ def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
     for name, edit in edits.items() if config.is_cut(scene) else ():
         if any(step.insert for step in edit.steps):
             raise ConfigError(
-                f"{path}: edit {name!r} inserts an asset, and scene {scene} is cut into blocks: insert it into a block, by "
-                f"an edits file of {block_scene_name(scene, 0)}"
+                f"{path}: edit {name!r} inserts an asset, and scene {scene} is cut into blocks: insert it into one of "
+                f"these, by an edits file of {block_scene_name(scene, 0)}"
             )
     return edits
 

@@ -158,7 +158,8 @@ def targets_without_drives(plan: Outputs, targets: Sequence[str]) -> list[str]:
 
 def _what_there_is(config: Config, scene: str) -> str:
     """The results of a drive that is cut into blocks and the names of its blocks, as the end of a sentence."""
-    films = ", ".join(f"{name}.mp4" for name in _films(config, scene))
+    edited = [f"{EDITS}/NAME.mp4"] if scene in config.datasets[config.dataset_of(scene)].edits else []
+    films = ", ".join([*(f"{name}.mp4" for name in _films(config, scene)), *edited])
     try:
         count = len(json.loads(Path(config.results_dir, scene, BLOCKS).read_text(encoding="utf-8"))["blocks"])
         blocks = f"{block_scene_name(scene, 0)} to {block_scene_name(scene, count - 1)}"

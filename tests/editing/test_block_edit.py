@@ -181,6 +181,16 @@ def test_objects_that_a_block_has_not_learned_are_absent_in_it(street):
     assert of_block[GONE].path is own[GONE].path and of_block[GONE].color_matrix is not None
 
 
+def test_objects_that_no_block_has_learned_are_named(scene, street, tmp_path, caplog):
+    parked = next(track.id for track in scene.tracks if track.id not in DRIVERS)
+    street.edited(tmp_path, {"remove": {"track": parked}}, {"remove": {"track": TURNING}})
+    said = [record.message for record in caplog.records if "has learned" in record.message]
+    assert said == [
+        f"scene {scene.name}, edit 'it': no block has learned {parked} as an object of its own, so that the edit does "
+        "not change it"
+    ]
+
+
 def test_an_edit_that_does_not_fit_the_drive_is_refused(street, tmp_path):
     with pytest.raises(ConfigError, match=rf"scene {street.scene.name}, edit 'it', step 1 .*: no editable track"):
         street.edited(tmp_path, {"remove": {"track": "nobody"}})

@@ -45,6 +45,14 @@ def test_what_was_not_measured_is_not_mentioned_or_said_to_be_missing():
     assert nothing not in static and not any("beyond" in line for line in static)
 
 
+def test_blocks_that_are_left_out_are_named():
+    protocol = {"cameras": ["CAM_FRONT"], "left_out": ["way.003", "way.007"]}
+    said = "Blocks are left out of the drive, and of all figures: way.003, way.007"
+    assert said in sentences({"protocol": protocol, "methods": {"vanilla": method()}}, "m.json")
+    none = {"protocol": {**protocol, "left_out": []}, "methods": {"vanilla": method()}}
+    assert not any("left out" in line for line in sentences(none, "m.json"))
+
+
 def test_figures_against_ground_truth_are_reported():
     lateral = {"2.0": {"all": {"psnr": 21.5}, "static": {"psnr": 22.7}}}
     before = {"box": {"psnr": 14.3}, "outside": {"psnr": 25.9}}
