@@ -62,23 +62,11 @@ class LongDrives:
         def of_blocks(wildcards: Any) -> list[str]:
             drive = wildcards.scene
             self._blocks_file(drive)
+            numbers = _kept(self._plan.config, drive, len(self._blocks(drive)))
             folder, own = self._plan.config.results_dir, name.format(method=getattr(wildcards, "method", ""))
-            return [f"{folder}/{block_scene_name(drive, number)}/{own}" for number in self._numbers(drive)]
+            return [f"{folder}/{block_scene_name(drive, number)}/{own}" for number in numbers]
 
         return of_blocks
-
-    def _numbers(self, drive: str) -> list[int]:
-        """The numbers of the blocks of a drive that are not left out."""
-        config, count = self._plan.config, len(self._blocks(drive))
-        left_out = config.datasets[config.dataset_of(drive)].left_out(drive)
-        for number in left_out:
-            if number >= count:
-                raise ConfigError(
-                    f"blocks.leave_out names block {number} of scene {drive}, which has {count}, counted from 0"
-                )
-        if len(left_out) == count:
-            raise ConfigError(f"blocks.leave_out leaves no block of scene {drive}, which has {count}; keep one")
-        return [number for number in range(count) if number not in left_out]
 
     def _block(self, scene: str) -> dict[str, Any]:
         drive, number = drive_of(scene), int(scene.rpartition(".")[2])
@@ -94,6 +82,34 @@ class LongDrives:
         if drive not in self._read:
             self._read[drive] = json.loads(Path(self._blocks_file(drive)).read_text(encoding="utf-8"))["blocks"]
         return self._read[drive]
+
+
+def require_left_out(config: Config, scene: str) -> None:
+    """Raises ConfigError for a drive whose blocks are known and that leaves out others than these, or all."""
+    count = _known_count(config, scene) if config.is_cut(scene) else None
+    if count is not None:
+        _kept(config, scene, count)
+
+
+def _kept(config: Config, drive: str, count: int) -> list[int]:
+    """The numbers of the blocks of a drive, which has so many, that are not left out."""
+    left_out = config.datasets[config.dataset_of(drive)].left_out(drive)
+    for number in left_out:
+        if number >= count:
+            raise ConfigError(
+                f"blocks.leave_out names block {number} of scene {drive}, which has {count}, counted from 0"
+            )
+    if len(left_out) == count:
+        raise ConfigError(f"blocks.leave_out leaves no block of scene {drive}, which has {count}; keep one")
+    return [number for number in range(count) if number not in left_out]
+
+
+def _known_count(config: Config, drive: str) -> int | None:
+    """The number of the blocks of a drive; None before it is cut."""
+    try:
+        return len(json.loads(Path(config.results_dir, drive, BLOCKS).read_text(encoding="utf-8"))["blocks"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def require_cameras(config: Config, scene: str) -> None:
@@ -160,11 +176,9 @@ def _what_there_is(config: Config, scene: str) -> str:
     """The results of a drive that is cut into blocks and the names of its blocks, as the end of a sentence."""
     edited = [f"{EDITS}/NAME.mp4"] if scene in config.datasets[config.dataset_of(scene)].edits else []
     films = ", ".join([*(f"{name}.mp4" for name in _films(config, scene)), *edited])
-    try:
-        count = len(json.loads(Path(config.results_dir, scene, BLOCKS).read_text(encoding="utf-8"))["blocks"])
-        blocks = f"{block_scene_name(scene, 0)} to {block_scene_name(scene, count - 1)}"
-    except (OSError, ValueError, KeyError, TypeError):  # not cut yet
-        blocks = f"{block_scene_name(scene, 0)}, {block_scene_name(scene, 1)} and so on"
+    count = _known_count(config, scene)
+    last = f"to {block_scene_name(scene, count - 1)}" if count else "and so on"
+    blocks = f"{block_scene_name(scene, 0)} {last}"
     return (
         f"its blocks are {blocks}, and of the whole drive there are metrics.json, index.html and, of each method, "
         f"{films} and {SPLATS} (docs/long_drives.md)"

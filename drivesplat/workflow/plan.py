@@ -34,7 +34,7 @@ from drivesplat.workflow.film_names import (
 from drivesplat.workflow.film_pages import FilmPages
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
-from drivesplat.workflow.long_drives import refuse_results_of_blocks, require_cameras
+from drivesplat.workflow.long_drives import refuse_results_of_blocks, require_cameras, require_left_out
 from drivesplat.workflow.named_tracks import edits_whole, refuse_other_tracks, refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.recordings import Recordings
@@ -264,6 +264,7 @@ class Plan(JobResources):
             name = self.config.dataset_of(scene)
             require_methods(self.config, scene)
             require_cameras(self.config, drive_of(scene))
+            require_left_out(self.config, drive_of(scene))
             self.refuse_unknown_cameras(name, for_scene(self.config, scene).cameras)
             # Snakemake names a points file that is absent; a job would wait for a pipe
             for path in self.points_file(of_scene):

@@ -13,6 +13,7 @@ from drivesplat.workflow.long_drives import (
     LongDrives,
     refuse_results_of_blocks,
     require_cameras,
+    require_left_out,
     targets_without_drives,
 )
 from drivesplat.workflow.named_tracks import track_references
@@ -122,7 +123,7 @@ def test_targets_that_make_nothing_of_a_drive_say_what_there_is(target, little, 
     made = Plan({"datasets": {"cut": CUT}, "methods": methods, "results_dir": "there"}, str(REPOSITORY))
     (sentence,) = targets_without_drives(made, [target, "metrics"])
     assert f"scene way is cut into blocks: {target} makes {little} of it; ask for files of blocks, " in sentence
-    assert f" as there/way.000/{example}; its blocks are way.000, way.001 and so on, and of the whole" in sentence
+    assert f" as there/way.000/{example}; its blocks are way.000 and so on, and of the whole" in sentence
     assert "metrics.json, index.html and, of each method, original.mp4" in sentence
     assert sentence.endswith("splats/splats.json (docs/long_drives.md)")
 
@@ -217,6 +218,19 @@ def test_blocks_are_left_out_of_the_results_of_the_drive_alone(drives, tmp_path)
         != other.stage_settings(stage, "way", "vanilla", films.get(stage))
     ]
     assert changed == ["evaluate_blocks", "export_blocks", "film_blocks"]
+
+
+def test_blocks_that_are_known_to_be_absent_are_refused_before_anything_runs(tmp_path):
+    (tmp_path / "way").mkdir()
+    cut = {**CUT, "blocks": {**BLOCKS, "leave_out": [0, 4]}}
+    config = Plan({"datasets": {"cut": cut}, "results_dir": str(tmp_path)}, str(REPOSITORY)).config
+    require_left_out(config, "way")
+    blocks = tmp_path / "way/blocks.json"
+    blocks.write_text(json.dumps({"blocks": [{}] * 5}))
+    require_left_out(config, "way")
+    blocks.write_text(json.dumps({"blocks": [{}] * 4}))
+    with pytest.raises(ConfigError, match=r"blocks.leave_out names block 4 of scene way, which has 4"):
+        require_left_out(config, "way")
 
 
 @pytest.mark.parametrize(

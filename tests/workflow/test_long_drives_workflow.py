@@ -128,6 +128,10 @@ def test_a_block_that_fails_is_named_and_the_drive_goes_on_without_it(copy):
     index = copy.read(INDEX)
     assert index["left_out"] == ["0001.001"] and [own["scene"] for own in index["blocks"]] == ["0001.000", "0001.002"]
     assert not (copy.folder / INDEX).with_name("0001.001.ply").exists()
+    absent = {**cut, "blocks": {**cut["blocks"], "leave_out": [7]}}
+    with copy.set_to(datasets={"nuscenes": absent}):
+        refused = copy.run("metrics", flags=("-n",))
+    assert "drivesplat: blocks.leave_out names block 7 of scene 0001, which has 3, counted from 0" in refused.stdout
     drive = drivesplat.LongDrive(copy.folder / "results/0001/vanilla", device="cpu")
     assert drive.left_out == [1]
     frames = frames_of(copy.folder / TARGETS[1])
