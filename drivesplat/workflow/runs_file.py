@@ -44,13 +44,17 @@ def read_runs(path: str | Path) -> dict[str, RunSettings]:
     return found
 
 
+def config_runs(config: Config) -> dict[str, RunSettings]:
+    """The runs of the config by name; none without a runs file."""
+    return {} if config.runs is None else read_runs(of_the_workflow(config.runs))
+
+
 def runs_of(config: Config, scene: str, method: str) -> dict[str, RunSettings]:
     """The runs of a method on a scene by name; those of `street` are also runs of the method in its place, without
     edits if it knows no objects. Raises ConfigError where one names a scene, a method or an edit that is not there."""
     found = {}
     replaces, has_objects = in_place_of_street(config, scene) == method, config.all_methods[method].object_parts
-    runs = {} if config.runs is None else read_runs(of_the_workflow(config.runs))
-    for name, run in runs.items():
+    for name, run in config_runs(config).items():
         for other in run.scenes or ():
             config.dataset_of(other)
             if config.is_cut(other):

@@ -224,6 +224,7 @@ NO_RESULTS = {
     "recordings.py": "files of a drive folder, whose drive.json is written last",
     "features.py": "pairs of images in a temporary folder",
     "compile.py": "gsplat's build, with its own log",
+    "starts.py": "a script to time, in a temporary folder",
     "runs.py": "what Snakemake says, as it says it",
     "nuscenes_mini.py": "a lock",
     "file_lock.py": "a lock",
