@@ -13,8 +13,8 @@ from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.drive.world_state import AnyCamera
 from drivesplat.errors import RequestError
 from drivesplat.io.storage import read_record
-from drivesplat.scene.blocks import BLOCKS, read_blocks
-from drivesplat.scene.scene import Scene, read_scene
+from drivesplat.scene.blocks import BLOCKS, Blocks, read_blocks
+from drivesplat.scene.scene import REFINED, Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 
 POSES = {"ego_to_world", "camera_to_world", "sensor_to_world"}
@@ -22,6 +22,21 @@ POSES = {"ego_to_world", "camera_to_world", "sensor_to_world"}
 CHECKPOINT = "checkpoint.npz"
 MAX_OPEN = 2
 """The blocks that are in memory."""
+
+
+def drive_scene(results: Path, blocks: Blocks) -> Scene:
+    """The record of a whole drive with the folder results/{scene}: that from which its `blocks` were cut, with refined
+    poses where these were."""
+    return read_scene(results / (REFINED if "refine_poses" in blocks.provenance.get("stages", ()) else "scene.json"))
+
+
+def blocks_left_out(folder: Path) -> list[str]:
+    """The names of the blocks that the figures of a drive leave out (`datasets.*.blocks.leave_out`), by the method's
+    result folder of the drive; none before it is measured."""
+    measured = folder / "eval.json"
+    if not measured.is_file():
+        return []
+    return list(read_record(measured, "evaluate_blocks", "protocol")["protocol"].get("left_out", []))
 
 
 class LongDrive:
@@ -54,7 +69,7 @@ class LongDrive:
     @cached_property
     def scene(self) -> Scene:
         """The record of the whole drive."""
-        return read_scene(self.folder.parent / "scene.json")
+        return drive_scene(self.folder.parent, self.blocks)
 
     @cached_property
     def _first(self) -> int:
@@ -65,10 +80,7 @@ class LongDrive:
     def left_out(self) -> list[int]:
         """The numbers of the blocks that cannot be rendered: those without a trained model, and those that the figures
         of the drive leave out (`datasets.*.blocks.leave_out`)."""
-        measured = self.folder / "eval.json"
-        names: list[str] = []
-        if measured.is_file():
-            names = read_record(measured, "evaluate_blocks", "protocol")["protocol"].get("left_out", [])
+        names = blocks_left_out(self.folder)
         return [
             number
             for number, name in enumerate(self.blocks.names)
@@ -94,7 +106,8 @@ class LongDrive:
             if number in self.left_out:
                 raise RequestError(
                     f"block {number} of {self.folder} is left out or not trained: {self._folder_of(number)} cannot be "
-                    "rendered as part of the drive; LongDrive.left_out lists such blocks (docs/long_drives.md)"
+                    "rendered as part of the drive; LongDrive.left_out lists such blocks. Once it is trained, and no "
+                    "longer in leave_out, make metrics.json of the drive again (docs/long_drives.md)"
                 )
             while len(self._open) >= MAX_OPEN:
                 self._open.pop(next(iter(self._open)))

@@ -16,6 +16,7 @@ from drivesplat.serve.faults import ServiceError, invalid
 from drivesplat.serve.lidar_patterns import PATTERNS
 from drivesplat.serve.messages import wire
 from drivesplat.serve.poses import FrameTimes, ListedObjects, steady_poses
+from drivesplat.settings.blocks import drive_of
 
 QUALITY = 95.0
 """JPEG quality of a request that states none."""
@@ -28,10 +29,11 @@ MAX_REQUEST_SCANS = 16
 @dataclass(frozen=True)
 class WorldKey:
     """What the world of a request depends on: requests with equal keys are rendered together. `scene_id` is the id by
-    which a scene is offered, whichever of its ids a request has; `listed` are the dynamic objects as bytes of their
-    messages."""
+    which a scene is offered, whichever of its ids a request has; `origin` that of its world (`ScenePlace`); `listed`
+    are the dynamic objects as bytes of their messages."""
 
     scene_id: str
+    origin: tuple[float, ...]
     times: FrameTimes
     listed: tuple[bytes, ...]
 
@@ -127,7 +129,7 @@ class RequestReader:
 
     def _world(self, message: Any, place: ScenePlace, times: FrameTimes) -> tuple[WorldKey, ListedObjects]:
         listed = tuple(own.SerializeToString(deterministic=True) for own in message.dynamic_objects)
-        key = WorldKey(place.scene_id, times, listed)
+        key = WorldKey(place.scene_id, tuple(place.origin.tolist()), times, listed)
         if key not in self._objects:
             objects = ListedObjects.of(message.dynamic_objects, times)
             self._objects[key] = replace(objects, steady=objects.steady.seen_from(place.origin))
@@ -144,11 +146,17 @@ def _encoding(message: Any) -> Encoding:
     return Encoding(wire.ImageFormat(message.image_format), round(quality))
 
 
+def _drive_of(scene_id: str) -> tuple[str, str]:
+    """The drive and the method of a scene, `scene` or `scene/method`."""
+    scene, _, method = scene_id.partition("/")
+    return drive_of(scene), method
+
+
 def require_affordable(requests: Iterable[ImageRequest | ServiceError], max_scenes: int) -> None:
     """Raises ServiceError (RESOURCE_EXHAUSTED) for images of one call that are too large together, or of more scenes
-    than are loaded at a time."""
+    than are loaded at a time; blocks of one long drive count as one."""
     images = [one for one in requests if isinstance(one, ImageRequest)]
-    pixels, scenes = sum(one.pixels for one in images), len({one.world.scene_id for one in images})
+    pixels, scenes = sum(one.pixels for one in images), len({_drive_of(one.world.scene_id) for one in images})
     if pixels > MAX_REQUEST_PIXELS:
         raise ServiceError(
             "RESOURCE_EXHAUSTED", f"the request has {pixels} pixels in all; it may have {MAX_REQUEST_PIXELS}"

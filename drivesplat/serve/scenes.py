@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from drivesplat.drive.long_drive import blocks_left_out, drive_scene
 from drivesplat.drive.packed_drive import packed_scene_id, unpack_drive
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.editing.ego import MAX_LEAD
@@ -16,7 +17,7 @@ from drivesplat.errors import DeviceError, RequestError
 from drivesplat.model.checkpoint import model_file
 from drivesplat.scene.blocks import BLOCKS, Blocks, read_blocks
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
-from drivesplat.scene.scene import Scene, read_scene
+from drivesplat.scene.scene import Scene
 from drivesplat.serve.faults import ServiceError, as_service_errors
 from drivesplat.serve.poses import FrameTimes
 from drivesplat.serve.requests import ScenePlace
@@ -67,7 +68,7 @@ class DriveSource:
 @dataclass(frozen=True)
 class LongDriveSource:
     """A drive that was cut into blocks, of which all or some are served: `scene_ids` are the ids of these, by number.
-    `folder` is results/{scene}."""
+    `folder` is results/{scene}. A block that the figures of the drive leave out is a scene of its own alone."""
 
     folder: Path
     blocks: Blocks
@@ -81,14 +82,16 @@ class LongDriveSource:
     @cached_property
     def record(self) -> Scene:
         """The scene of the whole drive."""
-        return read_scene(self.folder / "scene.json")
+        return drive_scene(self.folder, self.blocks)
 
     def place(self, scene_id: str, times: FrameTimes) -> ScenePlace:
         """The block in which the vehicle is at the moment that a frame shows. Raises ServiceError (NOT_FOUND) for one
         that is not served."""
         number = self.blocks.at(times.shown_us[0])
         if number not in self.scene_ids:
-            raise ServiceError("NOT_FOUND", f"block {number} of {scene_id} is not served: {self.blocks.names[number]}")
+            raise ServiceError(
+                "NOT_FOUND", f"block {number} of {scene_id} is not served, or left out: {self.blocks.names[number]}"
+            )
         return ScenePlace(self.scene_ids[number], self.blocks.blocks[number].origin)
 
 
@@ -119,14 +122,17 @@ def find_long_drives(sources: Mapping[str, DriveSource]) -> dict[str, LongDriveS
     several methods of it are served. Raises ResultError for a damaged blocks.json."""
     found: dict[tuple[Path, str], dict[str, str]] = {}
     for name, source in sources.items():
-        folder = source.folder.resolve().parents[1] / drive_of(source.scene)
-        if folder.name != source.scene and (folder / BLOCKS).is_file():
+        folder = source.folder.resolve().parent.parent / drive_of(source.scene)
+        if drive_of(source.scene) != source.scene and (folder / BLOCKS).is_file():
             found.setdefault((folder, source.method), {})[source.scene] = name
     methods = Counter(folder for folder, _ in found)
     drives = {}
     for (folder, method), of_blocks in found.items():
         blocks = read_blocks(folder / BLOCKS)
-        own = {number: of_blocks[name] for number, name in enumerate(blocks.names) if name in of_blocks}
+        shown = of_blocks.keys() - blocks_left_out(folder / method)
+        own = {number: of_blocks[name] for number, name in enumerate(blocks.names) if name in shown}
+        if not own:
+            continue
         drives[folder.name if methods[folder] == 1 else f"{folder.name}/{method}"] = LongDriveSource(
             folder, blocks, own
         )
@@ -144,7 +150,8 @@ def _sources_of(path: Path) -> Iterator[DriveSource]:
     if path.is_file():
         yield DriveSource.packed(path)
         return
-    folders = [file.parent for depth in ("", "*/", "*/*/") for file in sorted(path.glob(f"{depth}{CHECKPOINT}"))]
+    trained = [file.parent for depth in ("", "*/", "*/*/") for file in sorted(path.glob(f"{depth}{CHECKPOINT}"))]
+    folders = [folder for folder in trained if not (folder.resolve().parent / BLOCKS).is_file()]  # of the drive, uncut
     archives = [] if folders else sorted(path.glob("*.usdz"))
     yield from map(DriveSource.packed, archives)
     if not folders and not archives:

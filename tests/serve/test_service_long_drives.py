@@ -11,9 +11,11 @@ from carla_driver_interface._proto import common_pb2, sensorsim_pb2
 from helpers.hand_made_street import AHEAD, street_model, street_scene
 from helpers.scanned_street import scanned_street
 from helpers.served_drives import image_request, object_of, pair_of, pose_of, served, write_mask, write_method
+from helpers.trainings import PROVENANCE
 
-from drivesplat.scene.blocks import Block, Blocks, write_blocks
-from drivesplat.scene.scene import write_scene
+from drivesplat.io.storage import write_json
+from drivesplat.scene.blocks import Block, Blocks, read_blocks, write_blocks
+from drivesplat.scene.scene import read_scene, write_scene
 
 EMPTY = common_pb2.Empty()
 SHIFT = np.array([100.0, -40.0, 0.0])
@@ -113,6 +115,53 @@ def test_a_rig_across_the_border_and_a_scan(client, path):
     np.testing.assert_allclose(of_drive.point_xyzs, of_block.point_xyzs, atol=1e-4)  # poses are in single precision
 
 
+def test_a_rig_across_the_border_needs_one_block_at_a_time(drive, path):
+    ends = [path[0], (path[-1][0], moved(path[-1][1], SHIFT))]
+    items = [
+        sensorsim_pb2.BatchRGBRenderRequestItem(request=image_request("way", (stamp, stamp), (pose, pose)))
+        for stamp, pose in ends
+    ]
+    with served(drive, max_loaded=1) as (_, client):
+        reply = client.batch_render_rgb(sensorsim_pb2.BatchRGBRenderRequest(items=items))
+    assert [item.success for item in reply.items] == [True, True]
+
+
+def test_a_batch_may_name_a_drive_and_its_block(client, path):
+    """With objects of equal numbers, which are at different places."""
+    stamp, camera = path[-1]
+    ahead = moved(np.eye(4), camera[:3, 3] + [8.0, 0.0, -0.5])
+    asked = [
+        image_request(name, (stamp, stamp), (seen, seen), [object_of(AHEAD, ahead, ahead)])
+        for name, seen in (("way.001", camera), ("way", moved(camera, SHIFT)))
+    ]
+    items = [sensorsim_pb2.BatchRGBRenderRequestItem(request=request) for request in asked]
+    reply = client.batch_render_rgb(sensorsim_pb2.BatchRGBRenderRequest(items=items))
+    alone = [client.render_rgb(request).image_bytes for request in asked]
+    assert [item.result.image_bytes for item in reply.items] == alone and alone[0] != alone[1]
+
+
+def test_refined_poses_blocks_left_out_and_a_model_of_the_uncut_drive(drive, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(drive, results)
+    scene = read_scene(results / "way/scene.json")
+    frames = tuple(
+        dataclasses.replace(frame, ego_to_world=moved(frame.ego_to_world, [0.0, 0.5, 0.0])) for frame in scene.frames
+    )
+    write_scene(results / "way/scene_refined.json", dataclasses.replace(scene, frames=frames))
+    blocks = read_blocks(results / "way/blocks.json")
+    write_blocks(results / "way/blocks.json", dataclasses.replace(blocks, provenance={"stages": {"refine_poses": {}}}))
+    shutil.copytree(results / "way.000/street", results / "way/street")
+    write_json(results / "way/street/eval.json", {"protocol": {"left_out": ["way.001"]}, "provenance": PROVENANCE})
+    request = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id="way")
+    with served(results) as (_, client):
+        assert [*client.get_available_scenes(EMPTY).scene_ids] == ["way", "way.000", "way.001"]
+        (found,) = client.get_available_trajectories(request).available_trajectories
+        stamp, pose = found.trajectory.poses[-1].timestamp_us, pose_of(found.trajectory.poses[-1].pose)
+        with pytest.raises(grpc.RpcError, match="block 1 of way is not served, or left out"):
+            client.render_rgb(image_request("way", (stamp, stamp), (pose, pose)))
+    assert pose[1, 3] == pytest.approx(scene.frames[-1].ego_to_world[1, 3] + 0.5, abs=1e-3)
+
+
 def test_a_block_that_is_not_served_says_so(drive, path):
     stamp, pose = path[-1]
     with served(drive / "way.000/street") as (_, client):
@@ -120,4 +169,4 @@ def test_a_block_that_is_not_served_says_so(drive, path):
         with pytest.raises(grpc.RpcError) as error:
             client.render_rgb(image_request("way", (stamp, stamp), (pose, pose)))
     assert error.value.code() == grpc.StatusCode.NOT_FOUND
-    assert error.value.details() == "block 1 of way is not served: way.001"
+    assert error.value.details() == "block 1 of way is not served, or left out: way.001"

@@ -13,6 +13,7 @@ from drivesplat.cli.check.fitness import OWN, verdicts
 from drivesplat.cli.check.needed_settings import as_yaml, lacking_settings, needed_settings
 from drivesplat.cli.check.reading import CheckedScene, read_recording
 from drivesplat.errors import DatasetError
+from drivesplat.io.this_copy import in_this_copy
 from drivesplat.preprocess.intrinsics import intrinsics_warnings
 from drivesplat.preprocess.undistort import distortion_fault, undistorted
 from drivesplat.readers.by_name import dataset_module, has_module
@@ -106,7 +107,7 @@ def _print_findings(chosen: ChosenScene, checked: CheckedScene) -> bool:
         fit = "settings: those of the config file fit"
         print(f"settings to add:\n\n{as_yaml(lacking)}".rstrip() if lacking else fit)
     else:
-        print(f"settings to copy:\n\n{as_yaml(needed)}\n{_next_step(config, chosen.name)}")
+        print(f"settings to copy:\n\n{as_yaml(needed)}\n{in_this_copy(_next_step(config, chosen.name))}")
     return True
 
 
@@ -114,8 +115,8 @@ def _next_step(config: Config, scene: str) -> str:
     """How to go on with the settings to copy."""
     films = " films" if config.cameras else ""
     return (
-        f"save them as mine.yaml, then: snakemake --cores {len(os.sched_getaffinity(0))} --configfile mine.yaml -- "
-        f"{config.results_dir}/{scene}/metrics.json{films}\n"
+        f"save them as mine.yaml, then run `snakemake --cores {len(os.sched_getaffinity(0))} --configfile mine.yaml -- "
+        f"{config.results_dir}/{scene}/metrics.json{films}`\n"
         "(add `train: {iterations: 300}` for a first try)"
     )
 

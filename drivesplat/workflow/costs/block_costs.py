@@ -19,6 +19,8 @@ from drivesplat.workflow.costs.measured import TRAIN, Cost, read_costs
 BLOCKS, EVALUATE = "blocks.json", "evaluate"
 STAGES_OF_DRIVES = ("extract", "refine_poses", "blocks")
 """Stages of a whole drive, which come before those of its blocks."""
+PICTURES = ("compare", "tracks", "film_page")
+"""Stages of scenes that metrics.json does not need."""
 RESULTS_OF_METHODS = ("train.json", "eval.json")
 """Files of which the folder of a method has one."""
 BYTES_PER_PIXEL = 3
@@ -138,7 +140,8 @@ def _measured(
         size=(width, height),
         train_seconds=fmean(trained[name].seconds for name in protocols),
         evaluate_seconds=fmean(evaluated[name].seconds for name in protocols),
-        other_seconds=sum(cost.seconds for cost in own if not cost.job.method) / len(protocols),
+        other_seconds=sum(cost.seconds for cost in own if not cost.job.method and cost.job.stage not in PICTURES)
+        / len(protocols),
         method_bytes=fmean(_bytes([results / name / method]) for name in protocols),
         scene_bytes=fmean(_bytes(_of_scene(results / name)) for name in protocols),
         model_gb=max(models, default=None),

@@ -127,14 +127,17 @@ class RunCosts:
                 _say(f"scene {total['scene']}: {finding(total)}; {self._results / FILES[0]} says where it went")
 
     def name_failed_blocks(self) -> None:
-        """Prints which blocks of drives failed in this run, with their logs, and which page says what to do."""
+        """Prints which blocks of drives failed in this run, or were interrupted, with logs and where to read on."""
         is_block = self._plan.config.is_block
         self._plan_jobs()
         of_blocks = [(job.scene, log) for job, log in self._logs.items() if is_block(job.scene)]
         failed = {scene: log for scene, log in reversed(of_blocks) if has_failed(log, self._began)}
         if failed:
             named = ", ".join(f"{scene} ({log})" for scene, log in failed.items())
-            _say(f"these blocks failed: {named}; docs/long_drives.md says how to go on without them")
+            _say(
+                f"these blocks failed or were interrupted: {named}; run again, or go on without them as "
+                "docs/long_drives.md says"
+            )
 
     def _plan_jobs(self) -> None:
         """Takes note of Snakemake's jobs that are to run, without those that only collect the results of others: more
