@@ -91,8 +91,8 @@ def _lines(
     yield f"  of which before the first block: {times(lambda one: one.first_seconds)}"
     yield f"  disk: {least.disk * 1e-9:,.1f} GB"
     yield (
-        "  for metrics.json, if processors keep up; on disk also what else the measured blocks have. Where images differ "
-        "from those measured, times are bounds (docs/costs.md)"
+        "  for metrics.json, if processors keep up; on disk also what else the measured blocks have. Where images "
+        "differ from those measured, times are bounds (docs/costs.md)"
     )
 
 

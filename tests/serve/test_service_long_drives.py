@@ -149,7 +149,10 @@ def test_refined_poses_blocks_left_out_and_a_model_of_the_uncut_drive(drive, tmp
     )
     write_scene(results / "way/scene_refined.json", dataclasses.replace(scene, frames=frames))
     blocks = read_blocks(results / "way/blocks.json")
-    write_blocks(results / "way/blocks.json", dataclasses.replace(blocks, provenance={"stages": {"refine_poses": {}}}))
+    write_blocks(
+        results / "way/blocks.json",
+        dataclasses.replace(blocks, provenance={**PROVENANCE, "stages": {"refine_poses": {}}}),
+    )
     shutil.copytree(results / "way.000/street", results / "way/street")
     write_json(results / "way/street/eval.json", {"protocol": {"left_out": ["way.001"]}, "provenance": PROVENANCE})
     request = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id="way")
