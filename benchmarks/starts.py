@@ -5,6 +5,7 @@ the seconds of it that Python spends in the modules of some packages, those of o
 import in turn. Other programs disturb the seconds of packages more than the first figure.
 """
 
+import argparse
 import os
 import re
 import resource
@@ -54,7 +55,10 @@ def used() -> float:
     return found.ru_utime + found.ru_stime
 
 
-def main(scripts: Sequence[str]) -> None:
+def main(arguments: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser("python -m benchmarks.starts", description=__doc__)
+    parser.add_argument("scripts", nargs="*", metavar="SCRIPT", help="names in workflow_scripts/ (all)")
+    scripts = parser.parse_args(arguments).scripts
     print(f"{'script':24}{'start':>7}{'torch?':>8}", *(f"{name:>11}" for name in PACKAGES))
     with tempfile.TemporaryDirectory() as folder:
         for script in scripts or sorted(path.stem for path in SCRIPTS.glob("*.py")):

@@ -12,9 +12,8 @@ from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.drive.world_state import AnyCamera
 from drivesplat.errors import RequestError
-from drivesplat.io.storage import read_record
-from drivesplat.scene.blocks import BLOCKS, Blocks, read_blocks
-from drivesplat.scene.scene import REFINED, Scene, read_scene
+from drivesplat.scene.blocks import BLOCKS, blocks_left_out, drive_scene, read_blocks
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 
 POSES = {"ego_to_world", "camera_to_world", "sensor_to_world"}
@@ -22,21 +21,6 @@ POSES = {"ego_to_world", "camera_to_world", "sensor_to_world"}
 CHECKPOINT = "checkpoint.npz"
 MAX_OPEN = 2
 """The blocks that are in memory."""
-
-
-def drive_scene(results: Path, blocks: Blocks) -> Scene:
-    """The record of a whole drive with the folder results/{scene}: that from which its `blocks` were cut, with refined
-    poses where these were."""
-    return read_scene(results / (REFINED if "refine_poses" in blocks.provenance.get("stages", ()) else "scene.json"))
-
-
-def blocks_left_out(folder: Path) -> list[str]:
-    """The names of the blocks that the figures of a drive leave out (`datasets.*.blocks.leave_out`), by the method's
-    result folder of the drive; none before it is measured."""
-    measured = folder / "eval.json"
-    if not measured.is_file():
-        return []
-    return list(read_record(measured, "evaluate_blocks", "protocol")["protocol"].get("left_out", []))
 
 
 class LongDrive:

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
 from drivesplat.io.json_record import read_typed_json, write_typed_json
-from drivesplat.io.storage import Provenance, no_provenance
+from drivesplat.io.storage import Provenance, no_provenance, read_record
+from drivesplat.scene.scene import REFINED, Scene, read_scene
 from drivesplat.settings.blocks import block_scene_name
 
 SCHEMA = 1
@@ -86,3 +87,18 @@ def read_blocks(path: str | Path) -> Blocks:
     (['commute.000', 'commute.001', 'commute.002'], 1)
     """
     return read_typed_json(path, RULE, Blocks, SCHEMA, "a record of blocks")
+
+
+def drive_scene(results: Path, blocks: Blocks) -> Scene:
+    """The record of a whole drive with the folder results/{scene}: that from which its `blocks` were cut, with refined
+    poses where these were."""
+    return read_scene(results / (REFINED if "refine_poses" in blocks.provenance.get("stages", ()) else "scene.json"))
+
+
+def blocks_left_out(folder: Path) -> list[str]:
+    """The names of the blocks that the figures of a drive leave out (`datasets.*.blocks.leave_out`), by the method's
+    result folder of the drive; none before it is measured."""
+    measured = folder / "eval.json"
+    if not measured.is_file():
+        return []
+    return list(read_record(measured, "evaluate_blocks", "protocol")["protocol"].get("left_out", []))

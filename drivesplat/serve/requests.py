@@ -98,11 +98,10 @@ class RequestReader:
         times = FrameTimes.checked(
             message.frame_start_us, message.frame_end_us, spec.shutter_type == wire.ShutterType.GLOBAL
         )
+        place = self._place(message.scene_id, times)
         length_us = message.frame_end_us - message.frame_start_us
         camera = camera_of(spec, message.resolution_w, message.resolution_h, length_us)
-        steady = steady_poses([message.sensor_pose], ["sensor_pose"], times)
-        place = self._place(message.scene_id, times)
-        steady = steady.seen_from(place.origin)
+        steady = steady_poses([message.sensor_pose], ["sensor_pose"], times).seen_from(place.origin)
         world, objects = self._world(message, place, times)
         mask = (message.ego_mask_id.camera_logical_id or spec.logical_id) if message.insert_ego_mask else None
         return ImageRequest(
@@ -112,7 +111,7 @@ class RequestReader:
     def scan(self, message: Any) -> ScanRequest:
         """A request for a scan, as `image`."""
         times = FrameTimes.checked(message.frame_start_us, message.frame_end_us, at_start=False)
-        lidar = None
+        place, lidar = self._place(message.scene_id, times), None
         if message.HasField("lidar_config"):
             kind = message.lidar_config.lidar_type
             if kind not in PATTERNS:
@@ -122,7 +121,6 @@ class RequestReader:
         steady = steady_poses([pair], ["sensor_pose"], times)
         reverse = wire.PosePair(start_pose=pair.end_pose, end_pose=pair.start_pose)
         end = steady_poses([reverse], ["sensor_pose"], at_start)
-        place = self._place(message.scene_id, times)
         steady, end = steady.seen_from(place.origin), end.seen_from(place.origin)
         world, objects = self._world(message, place, times)
         return ScanRequest(world, objects, lidar, steady.poses[0], steady.velocities[0], end.poses[0])

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import torch
 
-from drivesplat.drive.long_drive import blocks_left_out, drive_scene
 from drivesplat.drive.packed_drive import packed_scene_id, unpack_drive
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.editing.ego import MAX_LEAD
 from drivesplat.errors import DeviceError, RequestError
 from drivesplat.model.checkpoint import model_file
-from drivesplat.scene.blocks import BLOCKS, Blocks, read_blocks
+from drivesplat.scene.blocks import BLOCKS, Blocks, blocks_left_out, drive_scene, read_blocks
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.serve.faults import ServiceError, as_service_errors

@@ -61,7 +61,7 @@ for line in sys.stdin:
 
 USED = (
     "kernels/cache kernels/cache_folder kernels/numba_private provenance/code/code_digest "
-    "provenance/code/syntax_digest io/file_lock io/regular_file io/storage errors"
+    "io/file_lock io/regular_file io/storage errors"
 )
 """Modules that `drivesplat.kernels.cache` imports."""
 

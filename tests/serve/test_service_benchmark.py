@@ -14,6 +14,7 @@ from benchmarks import sensor_service
 from benchmarks.sensor_client import FORMATS, RenderClient, RigRequests, RunningServer
 from benchmarks.sensor_service import copies, memory, simulate, soak, speed
 from drivesplat.serve.faults import invalid
+from drivesplat.serve.requests import RequestReader
 from drivesplat.serve.scenes import find_sources
 from drivesplat.serve.service import SensorService
 
@@ -72,7 +73,7 @@ def test_rollouts_with_and_without_objects_interleave(server, rig, monkeypatch):
 def test_a_missing_image_and_a_missing_scene_end_rollouts(server, rig, monkeypatch):
     with pytest.raises(SystemExit, match="0003 is not served"):
         simulate(server, [dataclasses.replace(rig, scene_id="0003")], SMALL, frames=2, rollouts=1)
-    monkeypatch.setattr(SensorService, "_read", lambda *_: (_ for _ in ()).throw(invalid("no camera")))
+    monkeypatch.setattr(RequestReader, "image", lambda *_: (_ for _ in ()).throw(invalid("no camera")))
     with pytest.raises(SystemExit, match="INVALID_ARGUMENT: no camera"):
         simulate(server, [rig], SMALL, frames=2, rollouts=1)
 
