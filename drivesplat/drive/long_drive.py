@@ -12,13 +12,14 @@ from drivesplat.drive.lidars import PoseableLidar
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.drive.world_state import AnyCamera
 from drivesplat.errors import RequestError
-from drivesplat.scene.blocks import BLOCKS, blocks_left_out, drive_scene, read_blocks
+from drivesplat.model.checkpoint import CHECKPOINT
+from drivesplat.scene.blocks import blocks_left_out, drive_scene, read_blocks
 from drivesplat.scene.scene import Scene
+from drivesplat.settings.blocks import BLOCKS
 from drivesplat.settings.device import DeviceSettings
 
 POSES = {"ego_to_world", "camera_to_world", "sensor_to_world"}
 """The arguments of a rendering that are poses."""
-CHECKPOINT = "checkpoint.npz"
 MAX_OPEN = 2
 """The blocks that are in memory."""
 

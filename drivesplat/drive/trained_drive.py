@@ -38,11 +38,10 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
 from drivesplat.model.view import View
 from drivesplat.rendering.fixed_model import FixedModel
-from drivesplat.scene.blocks import BLOCKS
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.blocks import block_scene_name
+from drivesplat.settings.blocks import BLOCKS, block_scene_name
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.trajectories.camera_path import recorded_frames

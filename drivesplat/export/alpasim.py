@@ -26,6 +26,7 @@ from drivesplat.export.ground_mesh import ground_surface, surface_mesh
 from drivesplat.io.aligned_zip import write_aligned_zip
 from drivesplat.io.storage import Provenance, canonical_json, sha256_file
 from drivesplat.io.triangle_mesh import ply_bytes
+from drivesplat.model.checkpoint import CHECKPOINT
 from drivesplat.settings.export import AlpasimJob
 
 log = logging.getLogger(__name__)
@@ -75,7 +76,7 @@ def scene_id(drive: TrainedDrive) -> str:
     with one id. Raises RequestError where the training has not finished.
     """
     folder = drive.folder.absolute()
-    checkpoint = folder / "checkpoint.npz"
+    checkpoint = folder / CHECKPOINT
     if not checkpoint.is_file():
         raise RequestError(f"{drive.where}: the training has not finished: {checkpoint} is missing")
     named = [drive.scene.dataset, drive.scene.name, folder.name, sha256_file(checkpoint)]
@@ -86,4 +87,4 @@ def drive_files(drive: TrainedDrive) -> list[Path]:
     """The files that `drivesplat.open` reads; the scans of LiDARs where the drive renders them."""
     recording = drive.recording
     scans = [recording.scans_file] if drive.renders_lidar and recording.scans_file.is_file() else []
-    return [drive.folder / "checkpoint.npz", *recording.files, *scans]
+    return [drive.folder / CHECKPOINT, *recording.files, *scans]

@@ -20,7 +20,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 
-RULE = "train"
+RULE, CHECKPOINT = "train", "checkpoint.npz"
 UNFINISHED, STATE = "training.npz", "state.npz"
 """Files of an unfinished training: the record that all its states share, and the last state."""
 
@@ -126,7 +126,7 @@ def open_model(checkpoint: TrainedCheckpoint, device_settings: DeviceSettings) -
 def model_file(folder: Path) -> Path:
     """The file of a method's model: its checkpoint, or the last state of a training that runs or was interrupted.
     Raises RequestError where there is neither."""
-    for file in (folder / "checkpoint.npz", folder / "resume" / STATE):
+    for file in (folder / CHECKPOINT, folder / "resume" / STATE):
         if file.is_file():
             return file
     raise RequestError(

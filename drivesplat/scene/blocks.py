@@ -15,7 +15,6 @@ from drivesplat.settings.blocks import block_scene_name
 
 SCHEMA = 1
 RULE = "blocks"
-BLOCKS = "blocks.json"
 
 
 @dataclass(frozen=True)

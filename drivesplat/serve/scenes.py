@@ -13,17 +13,17 @@ from drivesplat.drive.packed_drive import packed_scene_id, unpack_drive
 from drivesplat.drive.trained_drive import TrainedDrive, open_drive
 from drivesplat.editing.ego import MAX_LEAD
 from drivesplat.errors import DeviceError, RequestError
-from drivesplat.model.checkpoint import model_file
-from drivesplat.scene.blocks import BLOCKS, Blocks, blocks_left_out, drive_scene, read_blocks
+from drivesplat.model.checkpoint import CHECKPOINT, model_file
+from drivesplat.scene.blocks import Blocks, blocks_left_out, drive_scene, read_blocks
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask, read_ego_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.serve.faults import ServiceError, as_service_errors
 from drivesplat.serve.poses import FrameTimes
 from drivesplat.serve.requests import ScenePlace
-from drivesplat.settings.blocks import drive_of
+from drivesplat.settings.blocks import BLOCKS, drive_of
 from drivesplat.trajectories.edited_actors import EditedActor
 
-CHECKPOINT, MASK_FILE, ARCHIVE = "checkpoint.npz", "own_car.json", "scene.alpasim.usdz"
+MASK_FILE, ARCHIVE = "own_car.json", "scene.alpasim.usdz"
 
 
 @dataclass(frozen=True)
@@ -138,12 +138,6 @@ def find_long_drives(sources: Mapping[str, DriveSource]) -> dict[str, LongDriveS
     return drives
 
 
-def scene_ids(sources: Mapping[str, DriveSource]) -> list[str]:
-    """The ids that a simulator may know scenes by: long drives, scenes, and then archives."""
-    archives = (source.archive_id for source in sources.values() if source.archive_id)
-    return [*find_long_drives(sources), *sources, *archives]
-
-
 def _sources_of(path: Path) -> Iterator[DriveSource]:
     """The trained drives of one argument."""
     if path.is_file():
@@ -201,6 +195,12 @@ class LoadedDrives:
         self._aliases = {source.full_name: name for name, source in offered.items()}
         self._aliases |= {source.archive_id: name for name, source in offered.items() if source.archive_id}
         self._loaded: dict[str, LoadedDrive] = {}  # the one used last is the last
+
+    @property
+    def scene_ids(self) -> list[str]:
+        """The ids that a simulator may know scenes by: long drives, scenes, and then archives."""
+        archives = (source.archive_id for source in self.offered.values() if source.archive_id)
+        return [*self.long_drives, *self.offered, *archives]
 
     def place(self, scene_id: str, times: FrameTimes) -> ScenePlace:
         """The scene that a request is about: of a long drive the block at its time. Raises ServiceError (NOT_FOUND) for

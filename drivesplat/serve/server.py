@@ -20,7 +20,7 @@ from drivesplat.errors import RequestError
 from drivesplat.machine.device import choose_device
 from drivesplat.serve.faults import ServiceError, invalid
 from drivesplat.serve.messages import METHODS, SERVICE
-from drivesplat.serve.scenes import find_sources, scene_ids
+from drivesplat.serve.scenes import find_sources
 from drivesplat.serve.service import MAX_MESSAGE_BYTES, JpegEncoder, SensorService, ServiceOptions, Unlisted
 from drivesplat.settings.device import DeviceSettings
 
@@ -88,8 +88,8 @@ class SensorServer:
         self.device = choose_device(DeviceSettings.model_validate(device), min_free_gb=0.0)
         options = ServiceOptions(_version(), self.device.type, max_loaded, unlisted, jpeg)
         _require_free(host, port)
-        self.scenes = scene_ids(sources)
         self.service = SensorService(sources, options)
+        self.scenes = self.service.scene_ids
         self._max_calls, self._places = max_calls, threading.Semaphore(max_calls)
         self._pool = ThreadPoolExecutor(max_calls + SPARE_THREADS, thread_name_prefix="drivesplat-serve")
         self._server = self._grpc.server(

@@ -32,7 +32,7 @@ from drivesplat.serve.requests import (
     WorldKey,
     require_affordable,
 )
-from drivesplat.serve.scenes import DriveSource, LoadedDrive, LoadedDrives, scene_ids
+from drivesplat.serve.scenes import DriveSource, LoadedDrive, LoadedDrives
 
 API_VERSION = 0, 54, 0
 """The version of AlpaSim's messages that the service speaks."""
@@ -74,6 +74,11 @@ class SensorService:
         self._lock = threading.Lock()
         self._encoders = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="drivesplat-encode")
 
+    @property
+    def scene_ids(self) -> list[str]:
+        """The ids that a simulator may know scenes by."""
+        return self._drives.scene_ids
+
     def close(self) -> None:
         """Ends the threads that encode images."""
         self._encoders.shutdown()
@@ -87,7 +92,7 @@ class SensorService:
         return wire.VersionId(version_id=f"drivesplat {self.options.version}", grpc_api_version=version)
 
     def get_available_scenes(self, request: Any, active: IsActive) -> Any:
-        return wire.AvailableScenesReturn(scene_ids=scene_ids(self._sources))
+        return wire.AvailableScenesReturn(scene_ids=self.scene_ids)
 
     def get_loaded_scenes(self, request: Any, active: IsActive) -> Any:
         """The scenes in memory, each of which serves any number of clients: once, by the id of its scene for AlpaSim

@@ -9,6 +9,8 @@ from pydantic import Field, field_validator, model_validator
 from drivesplat.settings import Settings
 from drivesplat.settings.images import HoldoutSettings
 
+BLOCKS = "blocks.json"
+"""The file of a drive with its blocks."""
 _BLOCK = re.compile(r"(.+)\.(\d{3,})")
 
 

@@ -7,19 +7,18 @@ from types import SimpleNamespace
 from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.settings.blocks import block_scene_name, drive_of
+from drivesplat.settings.blocks import BLOCKS, block_scene_name, drive_of
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.film_names import EDITS, scene_edits
 from drivesplat.workflow.outputs import SPLATS, Outputs
 from drivesplat.workflow.without_cameras import scene_methods
 
 OF_DRIVES = (
-    "scene.json", "scene_refined.json", "poses.json", "triangulated.npz", "blocks.json", "metrics.json", "index.html",
+    "scene.json", "scene_refined.json", "poses.json", "triangulated.npz", BLOCKS, "metrics.json", "index.html",
 )  # fmt: skip
 """The results of a drive that is cut into blocks; others are those of blocks."""
-OF_DRIVES_ALONE = ("scene_refined.json", "poses.json", "triangulated.npz", "blocks.json")
+OF_DRIVES_ALONE = ("scene_refined.json", "poses.json", "triangulated.npz", BLOCKS)
 """Those of them that blocks do not have."""
-BLOCKS = "blocks.json"
 FILES_OF_TARGETS = {
     "edits": "{method}/edits/NAME.mp4",
     "drives": "{method}/edits/NAME/drive/drive.json",

@@ -13,10 +13,10 @@ from typing import Any
 
 from drivesplat.errors import RequestError
 from drivesplat.io.storage import read_record, unreadable
-from drivesplat.settings.blocks import block_scene_name
+from drivesplat.settings.blocks import BLOCKS, block_scene_name
 from drivesplat.workflow.costs.measured import TRAIN, Cost, read_costs
 
-BLOCKS, EVALUATE = "blocks.json", "evaluate"
+EVALUATE = "evaluate"
 STAGES_OF_DRIVES = ("extract", "refine_poses", "blocks")
 """Stages of a whole drive, which come before those of its blocks."""
 PICTURES = ("compare", "tracks", "film_page")
