@@ -100,7 +100,7 @@ def _group_metrics(
     record = recording.record
     several_cameras = len(record.camera_names) > 1
     more = (*(OVERLAP_REGIONS if several_cameras else ()), *(SURFACES if surfaces else ()))
-    metrics = RegionMetrics(lpips_map, (*REGIONS, *more))
+    metrics = RegionMetrics(lpips_map, (*REGIONS, *more), device)
     depth_errors: list[np.ndarray] = []
 
     def renderings() -> Iterator[tuple[int, np.ndarray]]:

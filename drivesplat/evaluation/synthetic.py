@@ -188,7 +188,7 @@ def _lateral_view_metrics(
 ) -> dict[str, Any] | None:
     """The metrics of a lateral view over all its key frames by region, and `depth`, over static pixels; None without
     key frames. Moving objects are known from boxes, whatever masks the user supplies for recorded images."""
-    metrics, recording = RegionMetrics(lpips_map, LATERAL_REGIONS), known.recording
+    metrics, recording = RegionMetrics(lpips_map, LATERAL_REGIONS, device), known.recording
     frames, depth_errors = list(known.lateral_frames(view)), []
     Rendering = tuple[int, Frame, TruthFrame, np.ndarray, np.ndarray]
 
@@ -222,7 +222,7 @@ def removal_metrics(
     if empty is None:
         return None
     fixed = FixedModel(model)
-    removed, untouched = RegionMetrics(lpips_map, REMOVAL_REGIONS), RegionMetrics(lpips_map, REMOVAL_REGIONS)
+    removed, untouched = (RegionMetrics(lpips_map, REMOVAL_REGIONS, device) for _ in range(2))
 
     Rendering = tuple[int, str, np.ndarray, np.ndarray, np.ndarray]
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -32,8 +33,11 @@ def removal_of(model: SplatModel, gaussians: Gaussians, box: Box, margin: float)
     own = model.of_track(box.track_id)
     if own is not None:
         return Removal(own, "actor")
-    centres = gaussians.means.detach().cpu().double().numpy()
-    inside = torch.from_numpy(box.contains(centres, margin)).to(gaussians.means.device)
+    means = gaussians.means.detach()
+    reach = float(np.linalg.norm(box.size)) + 2.0 * margin + 1.0  # more than to any corner
+    near = (means - means.new_tensor(box.object_to_world[:3, 3])).norm(dim=1) < reach
+    inside = near.clone()
+    inside[near] = torch.from_numpy(box.contains(means[near].cpu().double().numpy(), margin)).to(means.device)
     known = [name for part in model.parts if part.has_objects for name in part.rigid_groups(0.0)]
     objects = (model.of_track(name) for name in known)
     there = [rows for rows in objects if rows is not None and rows.any() and inside[rows].float().mean() > MOSTLY]

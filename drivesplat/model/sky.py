@@ -67,7 +67,7 @@ class CubemapSky(Sky):
         with torch.enable_grad():  # the gradient of an interpolation is its transpose
             texels = values.new_zeros(len(self.params["texels"]), values.shape[-1], requires_grad=True)
             interpolated = sampled(texels, self.index, rays)
-            return torch.autograd.grad(interpolated, texels, values)[0]
+            return torch.autograd.grad((interpolated * values).sum(), texels)[0]
 
     @property
     def _cube_map(self) -> CubeMap:
