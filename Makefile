@@ -22,7 +22,7 @@ CORES ?= all
 
 demo: setup
 	$(BIN)/snakemake --cores $(CORES) --configfile presets/demo.yaml -- all
-	@$(BIN)/python -m drivesplat.evaluation.summary results/demo/metrics.json
+	@$(BIN)/drivesplat show results/demo
 
 help:
 	@sed -n 's/^# make/make/p' $(firstword $(MAKEFILE_LIST))

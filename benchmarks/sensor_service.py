@@ -8,7 +8,8 @@
 A rig has three cameras, which look ahead and to both sides with the intrinsics of the scene's first camera. A call asks
 for the images of all of them at one time, with rolling shutters of 17 ms and all tracks of the scene as moving objects.
 Each rollout has one call in progress. The share inside of the model is the part of the time in which the device was in
-use.
+use. Memory is that of the server: before the first counted call, the range while they run, and at the end. No two calls
+ask for the same time.
 
 With --simulate, each rollout first asks for version, scenes, cameras and ego masks, and then goes round the recording,
 from a time of its own on: the first one with all objects, the second one with every second object, the third one
@@ -16,7 +17,7 @@ without any, and so on. Every image must come, and every tenth frame that is ask
 bytes. Meanwhile get_version is called all the time.
 
 With --soak, requests of all served scenes come in random order; equal requests must get equal bytes. Memory and open
-files of the server are those after every request was answered once, and later; --log writes them into a table.
+files of the server are those after every request was answered once, and later. --log writes them into a table.
 
 With --offered, servers offer the first drive under two and under so many names, and load two of them at a time. Memory
 is that at the start, after frames of two scenes, and after two rounds of all scenes.
@@ -55,9 +56,34 @@ from drivesplat.serve.messages import wire
 from drivesplat.serve.scenes import DriveSource, find_sources
 
 WATCH_S = 5.0
-"""Seconds between two looks at a server's memory."""
+"""Seconds between two samples of a server's memory."""
 LOGGED = ("seconds", "memory_mb", "open_files")
 """The columns of a log of a server's memory."""
+
+
+class Watch:
+    """Samples of a server's memory and open files, with the seconds since it was made. `log` gets them as a table."""
+
+    def __init__(self, server: RunningServer, log: Path | None = None):
+        self._server, self._log, self._began = server, log, perf_counter()
+        self.samples: list[tuple[float, float, int]] = []
+        self.look()
+
+    def look(self) -> None:
+        """Adds a sample."""
+        seconds = perf_counter() - self._began
+        self.samples.append((seconds, self._server.memory_mb(), self._server.open_files()))
+        if self._log is not None:
+            write_csv(self._log, LOGGED, [dict(zip(LOGGED, sample, strict=True)) for sample in self.samples])
+
+    def __str__(self) -> str:
+        _, memory, files = np.array(self.samples).T
+        return (
+            f"memory {memory[0]:.0f} MB, then {memory.min():.0f} to {memory.max():.0f}, {memory[-1]:.0f} MB at the end; "
+            f"open files {files[0]:.0f}, then {files.min():.0f} to {files.max():.0f}"
+        )
+
+
 BLACK = 10
 """The largest value of an image that AlpaSim counts as black."""
 VERSION_S = 0.1
@@ -66,8 +92,11 @@ CHECK_EVERY = 10
 """Of so many frames of rollouts one is rendered again."""
 
 
-def speed(server: RunningServer, batches: Sequence[Any], rollouts: int, warm_up: int) -> str:
-    """Sends batches, `rollouts` at a time, after some that are not counted; returns the figures."""
+def speed(
+    server: RunningServer, batches: Sequence[Any], rollouts: int, warm_up: int, log: Path | None = None
+) -> str:  # fmt: skip
+    """Sends batches, `rollouts` at a time, after some that are not counted; returns the figures. `log` gets a table of
+    memory and open files."""
     clients = [RenderClient(server.address) for _ in range(rollouts)]
     for batch in batches[:warm_up]:
         images_of(clients[0], batch)
@@ -80,17 +109,18 @@ def speed(server: RunningServer, batches: Sequence[Any], rollouts: int, warm_up:
             found.append((perf_counter() - began, size))
         return found
 
-    before, began = server.model_seconds(), perf_counter()
-    with ThreadPoolExecutor(rollouts) as threads:
+    watch, before, began = Watch(server, log), server.model_seconds(), perf_counter()
+    with repeated(watch.look, WATCH_S), ThreadPoolExecutor(rollouts) as threads:
         calls = [call for own in threads.map(roll_out, range(rollouts)) for call in own]
-    seconds, inside = perf_counter() - began, server.model_seconds() - before
+        seconds, inside = perf_counter() - began, server.model_seconds() - before
+    watch.look()
     latencies = np.array([latency for latency, _ in calls])
     images = len(calls) * len(YAWS)
     return (
         f"{len(calls)} rigs, {rollouts} at a time: {len(calls) / seconds:.2f} rigs/s, {images / seconds:.2f} images/s; "
         f"latency {1e3 * np.median(latencies):.0f} ms (median), {1e3 * np.quantile(latencies, 0.95):.0f} ms (95 %); "
         f"inside of the model {100 * inside / seconds:.0f} % of the time; "
-        f"{np.mean([size for _, size in calls]) / 1000:.0f} kB a rig"
+        f"{np.mean([size for _, size in calls]) / 1000:.0f} kB a rig; {watch}"
     )
 
 
@@ -209,27 +239,18 @@ def soak(
         return hashlib.sha256(client("render_rgb", requests[number]).image_bytes).hexdigest()
 
     known = [digest(clients[0], number) for number in range(len(requests))]
-    order, samples = np.random.default_rng(seed).integers(0, len(requests), count), []
-    began = perf_counter()
-
-    def look() -> None:
-        samples.append((perf_counter() - began, server.memory_mb(), server.open_files()))
-        if log is not None:
-            write_csv(log, LOGGED, [dict(zip(LOGGED, sample, strict=True)) for sample in samples])
+    order = np.random.default_rng(seed).integers(0, len(requests), count)
 
     def roll_out(number: int) -> int:
         return sum(digest(clients[number], i) != known[i] for i in order[number::rollouts].tolist())
 
-    look()
-    with repeated(look, WATCH_S), ThreadPoolExecutor(rollouts) as threads:
+    watch = Watch(server, log)
+    with repeated(watch.look, WATCH_S), ThreadPoolExecutor(rollouts) as threads:
         wrong = sum(threads.map(roll_out, range(rollouts)))
-    look()
-    seconds, memory, files = np.array(samples).T
+    watch.look()
     text = (
         f"{count} requests of {len(requests)} kinds in random order, {rollouts} at a time: "
-        f"{count / seconds[-1]:.1f} a second, {wrong} wrong images; memory {memory[0]:.0f} MB, then {memory.min():.0f} "
-        f"to {memory.max():.0f}, {memory[-1]:.0f} MB at the end; open files {files[0]:.0f}, then {files.min():.0f} to "
-        f"{files.max():.0f}"
+        f"{count / watch.samples[-1][0]:.1f} a second, {wrong} wrong images; {watch}"
     )
     if wrong:
         raise SystemExit(text)
@@ -293,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kinds.add_argument("--soak", type=int, metavar="N", help="send N requests in random order instead")
     kinds.add_argument("--offered", type=int, metavar="N", help="memory of servers that offer 2 and N scenes instead")
     parser.add_argument("--kinds", type=int, default=60, metavar="N", help="with --soak: different requests (60)")
-    parser.add_argument("--log", type=Path, metavar="CSV", help="with --soak: memory and open files over time")
+    parser.add_argument("--log", type=Path, metavar="CSV", help="table of memory and open files over time, not with --simulate and --offered")
     parsed = parser.parse_args(arguments)
     sources = find_sources(parsed.paths)
     batch = partial(RigRequests.batch, size=parsed.size, image_format=FORMATS[parsed.format])
@@ -315,7 +336,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(simulate(server, rigs, batch, parsed.frames, parsed.rollouts))
         else:
             batches = [batch(rigs[i % len(rigs)], i / parsed.frames) for i in range(parsed.frames)]
-            print(speed(server, batches, parsed.rollouts, warm_up=min(5, len(batches))))
+            print(speed(server, batches, parsed.rollouts, min(5, len(batches)), parsed.log))
     return 0
 
 

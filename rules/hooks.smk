@@ -1,5 +1,5 @@
-# Hooks of a run: the check of its jobs (in a dry run, too), the estimate and the lock at its start, costs and partial
-# report at its end.
+# Hooks of a run: the check of its jobs (in a dry run, too), the estimate and the lock at its start, costs and
+# figures at its end, where jobs failed a partial report.
 #
 # REQUIRED INPUTS: none.
 # OUTPUTS: <results>/costs.csv and costs.json, of all jobs that have run; where jobs failed, the partial report. No rule
@@ -39,7 +39,11 @@ onstart:
 
 onsuccess:
     if workflow.is_main_process:
+        from drivesplat.report.run_figures import print_run_figures
+
         run_costs.end()
+        outputs = (str(file) for job in workflow.dag.jobs for file in job.output)
+        print_run_figures(outputs, Path(plan.config.results_dir))
 
 
 onerror:

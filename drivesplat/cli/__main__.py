@@ -61,6 +61,9 @@ def _parser(program: str) -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="run the whole workflow on a synthetic drive, in the current folder")
     demo.add_argument("--cores", default="all", help="number of processors to use (all)")
 
+    show = commands.add_parser("show", help="print the figures of a measured scene as a table and in sentences")
+    show.add_argument("scene", type=Path, help="folder of its results, such as results/demo")
+
     viewer = commands.add_parser("open", help="open a scene's viewer.html in the browser")
     viewer.add_argument("scene", nargs="?", help="by default the scene exported last")
     viewer.add_argument("method", nargs="?", help="by default one with moving objects")
@@ -123,8 +126,13 @@ def run_command(parsed: argparse.Namespace) -> int:
         if status == 0:
             from drivesplat.evaluation.summary import print_summary
 
-            print_summary(results_folder() / "demo" / "metrics.json")
+            print_summary(results_folder() / "demo")
         return status
+    if parsed.command == "show":
+        from drivesplat.evaluation.summary import print_summary
+
+        print_summary(parsed.scene)
+        return 0
     if parsed.command == check.COMMAND:
         from drivesplat.cli.check.command import run_check
 

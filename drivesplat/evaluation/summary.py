@@ -1,15 +1,12 @@
-"""A metrics.json in sentences: `python -m drivesplat.evaluation.summary results/demo/metrics.json`."""
+"""A metrics.json as a table and in sentences: `drivesplat show results/demo`."""
 
-import argparse
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation.comparison import GROUP_PLACES
+from drivesplat.evaluation.figures_table import figures_table, read_metrics
 from drivesplat.evaluation.views_aside import LATERAL, place_of_view, views_aside
-from drivesplat.io.storage import read_json
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.scene.scene_warnings import DARK
 
@@ -17,7 +14,7 @@ OUTPUTS = (
     "original.mp4", "lateral_2m.mp4", "parts.mp4", "lidar.mp4", "lidar.png", "ghost_panel.png", "removal.png",
     "viewer.html",
 )  # fmt: skip
-COMPARE_FILM = "compare.mp4"
+COMPARE_FILM, FILM_PAGE = "compare.mp4", "index.html"
 MIN_NOVEL_DISTANCE = 0.1
 """Metres. At nuScenes' focal length a smaller step moves a point 10 m away by less than a dozen pixels."""
 
@@ -49,6 +46,8 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
         lines += [f"{name}{text}" for text in _of_method(method, metrics.get("lidar_baselines", {}))]
     folder = Path(path).parent
     lines.append(f"All figures: {path}; training curves and pictures: tensorboard --logdir {folder}")
+    if (folder / FILM_PAGE).is_file():
+        lines.append(f"Page with the films: {folder / FILM_PAGE}")
     if (folder / COMPARE_FILM).is_file():
         lines.append(f"All methods beside the recording: {folder / COMPARE_FILM}")
     for name in metrics["methods"]:
@@ -115,16 +114,9 @@ def _scan_figures(regions: dict[str, Any], forms: Iterable[str]) -> str:
 
 
 def print_summary(path: str | Path) -> None:
-    """Prints the sentences of a metrics.json. Raises ResultError where it is absent or damaged."""
-    metrics = read_json(path, rule="scene_metrics")
-    checked_digest(path, warn=False)
-    print("\n".join(sentences(metrics, path)))
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser("python -m drivesplat.evaluation.summary", description=__doc__)
-    parser.add_argument("metrics", help="a scene's metrics.json")
-    try:
-        print_summary(parser.parse_args().metrics)
-    except DriveSplatError as error:
-        sys.exit(f"drivesplat: {error}")
+    """Prints the table and the sentences of a scene's metrics, given its folder or metrics.json. Raises ResultError
+    where the file is absent or damaged."""
+    file, metrics = read_metrics(path)
+    checked_digest(file, warn=False)
+    table = figures_table([metrics])
+    print("\n".join([*table, *[""][: len(table)], *sentences(metrics, file)]))

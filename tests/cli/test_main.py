@@ -68,7 +68,7 @@ def test_demo_runs_everything_and_prints_the_figures(called, folder, monkeypatch
     assert main(["demo", "--cores", "3"]) == 0
     demo = str(REPOSITORY / "presets/demo.yaml")
     assert called == [["--cores", "3", "--configfile", demo, "--", "all"]]
-    assert printed == [Path("mine/demo/metrics.json")]
+    assert printed == [Path("mine/demo")]
     monkeypatch.setattr(command_line, "run_workflow", lambda _: 3)
     assert main(["demo"]) == 3 and len(printed) == 1, "no figures of a demo that has failed"
 

@@ -1,13 +1,9 @@
 """The summary of a metrics.json in sentences."""
 
 import json
-import re
-import runpy
-import sys
 
-import pytest
-
-from drivesplat.evaluation import summary
+from drivesplat.cli.__main__ import main
+from drivesplat.evaluation.figures_table import figures_table
 from drivesplat.evaluation.summary import sentences
 
 
@@ -64,14 +60,44 @@ def test_figures_against_ground_truth_are_reported():
     assert expected in lines
 
 
-def test_the_command_prints_the_summary_and_names_a_missing_file(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_table_and_summary_and_names_a_missing_or_foreign_file(tmp_path, capsys):
     file = tmp_path / "metrics.json"
-    monkeypatch.setattr(sys, "argv", ["summary", str(file)])
-    with pytest.raises(SystemExit, match=re.escape(str(file))):
-        runpy.run_path(summary.__file__, run_name="__main__")
-    file.write_text(json.dumps({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}))
-    runpy.run_path(summary.__file__, run_name="__main__")
-    assert "a gap of 11.1 dB" in capsys.readouterr().out
+    assert main(["show", str(tmp_path)]) == 1
+    assert str(file) in capsys.readouterr().err
+    file.write_text(json.dumps({"frames": []}))
+    assert main(["show", str(tmp_path)]) == 1
+    assert f"{file}: not the metrics of a scene" in capsys.readouterr().err
+    file.write_text(json.dumps(measured("one", vanilla=method(interpolation=group(27.1, 16.0)))))
+    shown = []
+    for given in (tmp_path, file):
+        assert main(["show", str(given)]) == 0
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1]
+    assert shown[0].splitlines()[3].split() == ["one", "vanilla", "27.1", "16.0", "11.1"]
+    assert "a gap of 11.1 dB" in shown[0]
+
+
+def measured(scene: str, **methods) -> dict:
+    return {"scene": scene, "methods": methods}
+
+
+def test_the_table_has_the_groups_and_figures_that_any_method_has():
+    scans = {**group(26.0, None), "lidar": {"all": {"range_error_median_m": 0.0312}}}
+    parked = {**group(25.0, None), "gap_db": 3.0}
+    records = [
+        measured("a", vanilla=method(interpolation=group(27.1, 16.0)), street=method(interpolation=parked)),
+        measured("long_name", lidar=method(interpolation=scans)),
+    ]
+    legend, groups, headings, *rows = figures_table(records)
+    assert "range" in legend and groups.split() == ["between", "training", "frames"]
+    assert headings.split() == ["scene", "method", "static", "moving", "gap", "range"]
+    cells = [row.split() for row in rows]
+    assert cells[0] == ["a", "vanilla", "27.1", "16.0", "11.1", "-"]
+    assert cells[1] == ["a", "street", "25.0", "-", "-", "-"], "the gap of parked vehicles is none to close"
+    assert cells[2] == ["long_name", "lidar", "26.0", "-", "-", "3.1"]
+    assert len({len(line) for line in (groups, headings, *rows)}) == 1, "columns are aligned"
+    assert "range" not in figures_table(records[:1])[0]
+    assert figures_table([measured("a", vanilla=method())]) == []
 
 
 def test_rendered_scans_are_compared_with_the_baselines():

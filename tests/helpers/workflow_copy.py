@@ -29,12 +29,15 @@ TINY_TRAINING = {
     "iterations": 60, "log_every": 10, "checkpoint_every": 20, "min_checkpoint_interval_s": 0.0, "image_every": 30,
     "gaussians": {"sh_degree": 1}, "sky_resolution": 8,
 }  # fmt: skip
-_COSTS = re.compile(r"drivesplat: (\d+ jobs?, |(\d+ % of the work, )?\d+ of \d+ jobs, |report of finished )")
+_COSTS = re.compile(
+    r"drivesplat: (\d+ jobs?, |(\d+ % of the work, )?\d+ of \d+ jobs, |report of finished |PSNR of held-out images |"
+    r"results of this run)"
+)
 
 
 def complaints(output: str) -> set[str]:
-    """The workflow's own lines in a run's output, but for those that say what it costs, how far it is, and where the
-    report of the finished scenes is."""
+    """The workflow's own lines in a run's output, but for those that say what it costs, how far it is, and where its
+    figures and pages are."""
     return {line for line in output.splitlines() if line.startswith("drivesplat: ") and not _COSTS.match(line)}
 
 
