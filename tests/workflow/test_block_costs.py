@@ -155,6 +155,17 @@ def test_without_measured_blocks_nothing_is_invented(results, capsys, tmp_path, 
         measured_drives(results)
 
 
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"frames": []}', '{"protocol": null}', '{"protocol": {"width": 800, "height": "tall"}}']
+)
+def test_a_damaged_evaluation_of_a_block_is_named_itself(results, content):
+    file = results / "way.001/street/eval.json"
+    file.write_text(content)
+    with pytest.raises(ResultError) as raised:
+        measured_drives(results)
+    assert str(raised.value).startswith(f"{file}: ") and "the rule 'evaluate' rebuilds it" in str(raised.value)
+
+
 def config() -> object:
     defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
     cut = {"reader": "drive", "scenes": ["way", "back"], "blocks": {"length_m": 100.0}}

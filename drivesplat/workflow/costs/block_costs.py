@@ -111,13 +111,11 @@ def _measured(
     trained = {cost.job.scene: cost for cost in costs if (cost.job.stage, cost.job.method) == (TRAIN, method)}
     evaluated = {cost.job.scene: cost for cost in costs if (cost.job.stage, cost.job.method) == (EVALUATE, method)}
     files = {name: results / name / method / "eval.json" for name in blocks if name in trained and name in evaluated}
-    protocols = {
-        name: read_record(file, EVALUATE, "protocol")["protocol"] for name, file in files.items() if file.is_file()
-    }
+    protocols = {name: _protocol(file) for name, file in files.items() if file.is_file()}
     if not protocols:
         return None
-    images = {name: float(protocol["train_images"]) for name, protocol in protocols.items()}
-    width, height = next((int(protocol["width"]), int(protocol["height"])) for protocol in protocols.values())
+    images = {name: protocol.images for name, protocol in protocols.items()}
+    width, height = next(protocol.size for protocol in protocols.values())
     models = [
         memory - images[name] * width * height * BYTES_PER_PIXEL * 1e-9
         for name in protocols
@@ -135,7 +133,7 @@ def _measured(
         overlap_m=cut["overlap_m"],
         devices=tuple(sorted({device for name in protocols if (device := trained[name].device)})),
         iterations=tuple(sorted({steps for name in protocols if (steps := trained[name].iterations)})),
-        cameras=max(len(protocol["cameras"]) for protocol in protocols.values()),
+        cameras=max(protocol.cameras for protocol in protocols.values()),
         images=fmean(images.values()),
         size=(width, height),
         train_seconds=fmean(trained[name].seconds for name in protocols),
@@ -151,6 +149,25 @@ def _measured(
         / of_drive,
         drive_bytes_per_image=_bytes(_of_scene(results / drive)) / of_drive,
     )
+
+
+@dataclass(frozen=True)
+class _Protocol:
+    """The training images of a block, their width and height in pixels, and the number of cameras."""
+
+    images: float
+    size: tuple[int, int]
+    cameras: int
+
+
+def _protocol(file: Path) -> _Protocol:
+    """The protocol of an eval.json. Raises ResultError, which names the file, where it is damaged."""
+    found = read_record(file, EVALUATE, "protocol")["protocol"]
+    try:
+        size = int(found["width"]), int(found["height"])
+        return _Protocol(float(found["train_images"]), size, len(found["cameras"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise unreadable(file, EVALUATE, f"its protocol is damaged ({type(error).__name__}: {error})") from error
 
 
 def _length(intervals: Iterable[Sequence[int]]) -> int:
