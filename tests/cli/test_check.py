@@ -211,7 +211,7 @@ def test_costs_are_those_measured_here(recordings, checked, tmp_path):
     dataset = {"reader": "drive", "dataroot": str(recordings / "drive"), "scenes": ["monday", "tuesday"]}
     config = {"datasets": {"own": dataset}, "methods": {"vanilla": None}, "cameras": ["CAM_FRONT"]}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(config))
-    assert "time not measured yet" in section(checked(tmp_path / "mine.yaml"), "costs:")[0]
+    assert "by other machines: no such job has run here before" in section(checked(tmp_path / "mine.yaml"), "costs:")[0]
     for job in ("extract", "street/evaluate"):
         path = tmp_path / "results" / BENCHMARKS / "tuesday" / f"{job}.tsv"
         path.parent.mkdir(parents=True, exist_ok=True)

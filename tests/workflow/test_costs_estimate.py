@@ -51,17 +51,20 @@ def test_scenes_and_methods_share_cores_and_gpus():
     assert wall_seconds([], Machine(1, 1)) == 0.0
 
 
-def test_an_estimate_says_how_it_knows_and_what_is_not_measured_yet(tmp_path):
+def test_an_estimate_says_how_it_knows_and_what_is_not_known_yet(tmp_path):
     planned = [PlannedJob(JobId("train", "0103", "vanilla"), 8, True), PlannedJob(JobId("masks", "0103"), 1, False)]
     unknown = estimate(planned, expectations(), Machine(4, 2), tmp_path)
-    rough = "time not measured yet, by other machines very roughly 62 s on 4 cores and 2 GPUs, disk not measured yet ("
+    rough = (
+        "2 jobs, very roughly 62 s on 4 cores and 2 GPUs (by other machines: no such job has run here before), disk use "
+        "not known yet ("
+    )
     assert rough in in_one_line(unknown), "7,000 iterations of 6 ms on a GPU after masks, 10 s of each job beside them"
-    assert in_full(unknown).count("1 x not measured yet") == 2
+    assert in_full(unknown).count("1 x not known yet") == 2
     on_cpu = estimate([PlannedJob(planned[0].job, 1, False)], expectations(), Machine(1, 1), tmp_path)
     assert on_cpu.rough_seconds == 10.0 + 7000 * 0.15
     half = estimate(planned, expectations(training("0061", "vanilla", 600.0)), Machine(1, 1), tmp_path)
-    assert half.seconds == 600.0 and "about 10 min on 1 core (from 1 measured job; 1 not" in in_one_line(half)
-    assert "; 1 not measured yet, by other machines very roughly 10 min in all)" in in_one_line(half)
+    assert half.seconds == 600.0 and "about 10 min on 1 core (from 1 measured job)" in in_one_line(half)
+    assert " without 1 job whose time is not known yet, very roughly 10 min in all, " in in_one_line(half)
     measured = [training("0061", "vanilla", 600.0), Cost(JobId("masks", "0061"), 60.0, "")]
     line = in_one_line(estimate(planned, expectations(*measured), Machine(1, 1), tmp_path))
     assert line.startswith("2 jobs, about 11 min on 1 core (from 2 measured jobs), ") and "GB free" in line
@@ -93,12 +96,12 @@ def test_a_run_is_estimated_before_and_accounted_for_after_it(tmp_path):
     copy = WorkflowCopy.make(tmp_path / "workflow", methods={"vanilla": {}})
     seed, costs = "results/0001/seed.ply", copy.folder / "results/costs.csv"
     asked = copy.run("estimate", seed)
-    assert asked.returncode == 0 and "drivesplat: 3 jobs, time not measured yet" in asked.stdout, asked.stdout
-    assert "x not measured yet" in asked.stdout and not (copy.folder / seed).exists()
+    assert asked.returncode == 0 and "drivesplat: 3 jobs, very roughly " in asked.stdout, asked.stdout
+    assert "x not known yet" in asked.stdout and not (copy.folder / seed).exists()
     everything = copy.run("estimate").stdout
     assert " train " in everything and " film " in everything and not (copy.folder / "results/0001").exists()
     done = copy.run(seed)
-    assert done.returncode == 0 and "drivesplat: 3 jobs, time not measured yet" in done.stdout, done.stdout
+    assert done.returncode == 0 and "drivesplat: 3 jobs, very roughly " in done.stdout, done.stdout
     rows = [line.split(",")[:3] for line in costs.read_text().splitlines()[1:]]
     assert rows == [["0001", "", stage] for stage in ("extract", "lidar_seed", "own_car")]
     assert copy.planned(seed) == {}, "costs rerun nothing"

@@ -51,13 +51,15 @@ def test_a_running_training_reports_its_progress_from_its_first_iteration_on(tmp
     assert line == f"50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train {AT_HALF}"
 
 
-def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
+def test_jobs_that_were_never_measured_are_counted_and_not_guessed(tmp_path):
     """A running training says how long it still takes."""
     alone = progress(tmp_path, {MASKS}, costs=COSTS[:1])
-    assert alone.line(0.0) == "1 of 3 jobs, 2 jobs not measured yet left"
+    assert alone.line(0.0) == "1 of 3 jobs done"
     (tmp_path / "train.log").write_text(BEGINS + at(3500, "18.8 it/s, 400 s left"))
     line = alone.line(0.0)
-    assert line == f"1 of 3 jobs, about 7 min and 1 job not measured yet left; at work: 0103 street train {AT_HALF}"
+    assert line == (
+        f"1 of 3 jobs, about 7 min left without 1 job whose time is not known yet; at work: 0103 street train {AT_HALF}"
+    )
 
 
 def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):

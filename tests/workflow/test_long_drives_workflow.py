@@ -89,7 +89,7 @@ def test_the_costs_of_the_blocks_tell_those_of_a_longer_drive(copy, capsys):
     with copy.set_to(train={**copy.config["train"], "iterations": 21}):
         estimated = copy.run("estimate", TARGETS[0]).stdout
     assert re.search(r"train +3 x ", estimated) and re.search(r"evaluate +3 x ", estimated), estimated
-    assert "not measured yet" not in estimated, estimated
+    assert "not known yet" not in estimated, estimated
 
 
 def test_every_static_gaussian_of_the_drive_is_in_the_file_of_the_nearest_block(copy):

@@ -12,7 +12,7 @@ from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.costs.measured import TRAIN, WORLD, Cost, JobId
 
-NOT_MEASURED = "not measured yet"
+NOT_KNOWN = "not known yet"
 ROUGH_SECONDS, ROUGH_ITERATION = 10.0, {True: 0.006, False: 0.15}
 """Seconds of a job of any stage, and of a training's iteration with and without a GPU, on other machines. They are used
 for what is not measured yet: a job may take a third or three times as long."""
@@ -197,31 +197,39 @@ def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine:
 
 
 def in_one_line(found: Estimate) -> str:
-    """'27 jobs, about 12 min on 4 cores (from 22 measured jobs; 3 not measured yet), about 0.4 GB of disk (…)'."""
+    """'27 jobs, about 12 min on 4 cores (from 22 measured jobs), about 0.4 GB of disk (…)'. The jobs whose time is not
+    known are counted beside it, with a rough time of all; without any measured job it stands alone."""
     if not found.jobs:
         return "nothing is to be run"
     cores, gpus = found.machine.cores, found.machine.gpus
     where = f"{cores} core{'s' * (cores > 1)}" + (f" and {gpus} GPUs" if gpus > 1 else "")
-    rest = found.jobs - found.known
-    rough = f"{NOT_MEASURED}, by other machines very roughly {spelled(found.rough_seconds)}"
-    basis = f"from {found.measured} measured job{'s' * (found.measured > 1)}"
-    basis += f"; {rest} {rough} in all" if rest else ""
-    time = f"about {spelled(found.seconds)} on {where} ({basis})" if found.known else f"time {rough} on {where}"
+    rough, rest = f"very roughly {spelled(found.rough_seconds)}", found.jobs - found.known
+    time = f"{rough} on {where} (by other machines: no such job has run here before)"
+    if found.known:
+        time = f"about {spelled(found.seconds)} on {where} (from {found.measured} measured "
+        time += f"job{'s' * (found.measured > 1)})"
+    if found.known and rest:
+        time += f" without {counted(rest)} whose time is {NOT_KNOWN}, {rough} in all"
     free = f"{found.free_disk / 1e9:.1f} GB free"
-    missing = f"; {found.unknown_disk} jobs {NOT_MEASURED}" if found.unknown_disk else ""
+    missing = f"; without {counted(found.unknown_disk)} whose size is {NOT_KNOWN}" if found.unknown_disk else ""
     warning = "; that is more than there is" if found.disk > found.free_disk else ""
     size = f"{found.disk / 1e9:.1f} GB" if found.disk >= 1e9 else f"{found.disk / 1e6:.0f} MB"
     disk = f"about {size} of disk ({free}{missing}){warning}"
     if found.unknown_disk == found.jobs:
-        disk = f"disk {NOT_MEASURED} ({free})"
-    return f"{found.jobs} job{'s' * (found.jobs > 1)}, {time}, {disk}"
+        disk = f"disk use {NOT_KNOWN} ({free})"
+    return f"{counted(found.jobs)}, {time}, {disk}"
+
+
+def counted(count: int) -> str:
+    """'1 job', '3 jobs'."""
+    return f"{count} job{'s' * (count != 1)}"
 
 
 def in_full(found: Estimate) -> str:
     """The line, and a table of stages."""
     lines = [f"drivesplat: {in_one_line(found)}"]
     for stage, (jobs, seconds) in found.by_stage.items():
-        lines.append(f"  {stage:<16}{jobs:>5} x {NOT_MEASURED if seconds is None else f'{seconds:>8.1f} s'}")
+        lines.append(f"  {stage:<16}{jobs:>5} x {NOT_KNOWN if seconds is None else f'{seconds:>8.1f} s'}")
     return "\n".join(lines)
 
 

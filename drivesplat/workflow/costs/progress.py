@@ -8,7 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from drivesplat.workflow.costs.estimate import NOT_MEASURED, Expectations, Machine, PlannedJob, spelled, wall_seconds
+from drivesplat.workflow.costs.estimate import (
+    NOT_KNOWN,
+    Expectations,
+    Machine,
+    PlannedJob,
+    counted,
+    spelled,
+    wall_seconds,
+)
 from drivesplat.workflow.costs.measured import TRAIN, JobId
 from drivesplat.workflow.job_logs import has_begun, is_cut_short
 
@@ -37,7 +45,8 @@ class RunProgress:
 
     def line(self, now: float) -> str:
         """'37 % of the work, 12 of 40 jobs, about 9 min left; at work: 0103 street masks'; without a share of the work
-        while the costs of some jobs are unknown. A training is named with its iteration, loss and remaining time."""
+        while the costs of some jobs are unknown, and without a time before any is known. A training is named with its
+        iteration, loss and remaining time."""
         planned, expectations, finished = self.planned(), self.expectations(), self.finished()
         done, unknown, left, at_work = 0.0, 0, [], []
         for one in planned:
@@ -59,9 +68,12 @@ class RunProgress:
         time_left = spelled(wall_seconds(left, self.machine))
         more = f" and {len(at_work) - MAX_NAMED} more" if len(at_work) > MAX_NAMED else ""
         named = f"; at work: {', '.join(at_work[:MAX_NAMED])}{more}" if at_work else ""
-        known = [f"about {time_left}"] if whole > done or not unknown else []
-        missing = [f"{unknown} job{'s' * (unknown > 1)} {NOT_MEASURED}"] if unknown else []
-        return f"{share}{len(finished)} of {len(planned)} jobs, {' and '.join([*known, *missing])} left{named}"
+        jobs = f"{share}{len(finished)} of {len(planned)} jobs"
+        if not unknown:
+            return f"{jobs}, about {time_left} left{named}"
+        if whole <= done:
+            return f"{jobs} done{named}"
+        return f"{jobs}, about {time_left} left without {counted(unknown)} whose time is {NOT_KNOWN}{named}"
 
     def _is_at_work(self, job: JobId) -> bool | None:
         """Whether a job is running, by its log of this run, since Snakemake counts a finished job seconds later; None
