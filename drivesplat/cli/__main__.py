@@ -72,10 +72,11 @@ def _parser(program: str) -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="render a trained drive from the poses of a file (docs/python.md)")
     render.add_argument("folder", type=Path, help="of the method, such as results/demo/street")
     render.add_argument("--poses", type=Path, required=True, help=".csv, .json (nerfstudio) or TUM's text format")
-    render.add_argument("--camera", required=True, help="a recorded camera")
+    render.add_argument("--camera", help="a recorded camera; by default the one that looks ahead the most")
     render.add_argument("--ego", action="store_true", help="the poses are those of the vehicle, not of the camera")
     render.add_argument("--outputs", default="rgb", help="rgb,depth,instance (rgb)")
     render.add_argument("--out", type=Path, required=True, help="folder to write images into")
+    render.add_argument("--film", type=Path, help="also write a film of the images rgb, such as out.mp4")
     render.add_argument("--device", default="any", choices=["any", "cuda", "cpu"], help="any: a GPU where there is one")
 
     live = commands.add_parser(
@@ -148,8 +149,10 @@ def run_command(parsed: argparse.Namespace) -> int:
         return (0 if setup.is_for_gpus_alone(parsed) else _compile_for_processors()) or setup.run_setup(parsed)
     if parsed.command == "render":
         drive, outputs = drivesplat.open(parsed.folder, parsed.device), parsed.outputs.split(",")
-        count = drivesplat.render_poses(drive, parsed.poses, parsed.camera, outputs, parsed.out, parsed.ego)
-        print(f"{parsed.out}: {count} images each of {', '.join(outputs)}, and render.json")
+        own = (parsed.camera, outputs, parsed.out, parsed.ego, parsed.film)
+        count = drivesplat.render_poses(drive, parsed.poses, *own)
+        film = f"; film: {parsed.film}" if parsed.film else ""
+        print(f"{parsed.out}: {count} images each of {', '.join(outputs)}, and render.json{film}")
         return 0
     if parsed.command == assets.COMMAND:
         return assets.run_assets(parsed)

@@ -73,6 +73,14 @@ class RecordedDrive:
         return list(dict.fromkeys(frame.camera for frame in self.scene.frames))
 
     @cached_property
+    def front_camera(self) -> str:
+        """The camera that looks ahead the most, the first of equal ones. Raises RequestError without cameras."""
+        ahead = {name: round(float(self.first_image(name)[1].camera_to_ego[0, 2]), 1) for name in self.cameras}
+        if not ahead:
+            raise RequestError(f"{self.where} has no camera")
+        return max(ahead, key=ahead.__getitem__)
+
+    @cached_property
     def lidars(self) -> list[str]:
         """The names of the recorded LiDARs."""
         return list(dict.fromkeys(sweep.lidar for sweep in self.scene.sweeps))

@@ -18,12 +18,15 @@ from drivesplat.drive.drive_view import DriveView
 from drivesplat.drive.trained_drive import TrainedDrive
 from drivesplat.errors import RequestError
 from drivesplat.io.storage import write_json
+from drivesplat.io.video import write_video
 from drivesplat.readers.truth import depth_units, numbered
-from drivesplat.scene.images import write_png
+from drivesplat.scene.images import read_image, write_png
 from drivesplat.scene.rigid import rigid
 
 WRITTEN = ("rgb", "depth", "instance")
 """The outputs that can be written as images."""
+FILM_CRF, MIN_FPS = 18, 0.1
+"""The quality of a film, from 0 (no loss) to 51, and its least frames per second."""
 COLUMNS = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 """Those of a table: seconds since the first image, metres, and a quaternion."""
 TUM = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -34,26 +37,31 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 def render_poses(
     drive: TrainedDrive,
     poses: str | Path,
-    camera: str,
+    camera: str | None,
     outputs: Sequence[str],
     folder: str | Path,
     of_ego: bool = False,
+    film: str | Path | None = None,
 ) -> int:
     """Writes what a recorded camera sees at the times and poses of a file; returns the number of images of each output.
 
     Args:
         drive: What is rendered.
         poses: A file of `drivesplat.drive.render_files.read_poses`: those of the camera, or `of_ego`, of the vehicle.
-        camera: The name of a recorded camera.
+        camera: The name of a recorded camera; None: the one that looks ahead the most.
         outputs: Names from WRITTEN.
         folder: Where `{output}/{number}.png` and `render.json` are written. Depth has 16 bits, 256 units a metre, 0
             where there is no surface; instances have 16 bits, 0 for none, else the number in `objects` of render.json.
+        film: An MP4 file of the images `rgb`, at the mean rate of the poses; the last odd row and column are cut off.
 
-    Raises RequestError as `TrainedDrive.render` and `read_poses` do.
+    Raises RequestError as `TrainedDrive.render` and `read_poses` do, and for a film of poses that are not in the order
+    of time or without `rgb`; ResultError where the film cannot be written.
     """
     if unknown := [name for name in outputs if name not in WRITTEN]:
         raise RequestError(f"output {unknown[0]!r} cannot be written; there are: {', '.join(WRITTEN)}")
     folder, known = Path(folder), read_poses(poses)
+    camera = drive.recording.front_camera if camera is None else camera
+    fps = None if film is None else _film_rate(known.times, outputs, poses)
     for time in known.times.tolist():
         drive.recording.checked(time)
     try:
@@ -78,7 +86,21 @@ def render_poses(
     intrinsics = drive.camera(camera).K.tolist()
     record: dict[str, Any] = {"camera": camera, "K": intrinsics, "objects": numbers, "frames": frames}
     write_json(folder / "render.json", record)
+    if film is not None and fps is not None:
+        seen = drive.camera(camera)
+        width, height = seen.width // 2 * 2, seen.height // 2 * 2
+        shown = (read_image(folder / frame["images"]["rgb"])[:height, :width] for frame in frames)
+        write_video(Path(film), shown, (width, height), fps, FILM_CRF)
     return len(frames)
+
+
+def _film_rate(times: Float64[np.ndarray, " n"], outputs: Sequence[str], poses: str | Path) -> float:
+    """Frames per second of a film of poses at `times`. Raises RequestError where there can be none."""
+    if "rgb" not in outputs:
+        raise RequestError("a film shows the images rgb: add rgb to the outputs")
+    if len(times) < 2 or (np.diff(times) <= 0.0).any():
+        raise RequestError(f"{poses}: a film needs two or more poses in the order of their times")
+    return max(MIN_FPS, round((len(times) - 1) / float(times[-1] - times[0]), 2))
 
 
 def _pixels(view: DriveView, name: str, numbers: dict[str, int]) -> np.ndarray:

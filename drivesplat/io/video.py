@@ -39,7 +39,7 @@ class Footage:
 
 
 def write_video(
-    path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: int, crf: int, threads: int = 0
+    path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: int | float, crf: int, threads: int = 0
 ) -> None:
     """Writes `frames` (h, w, 3) uint8 RGB, consumed one at a time, to an MP4 file. `size` is width and height, both
     even; `threads` is the number of encoder threads, 0 for ffmpeg's default.

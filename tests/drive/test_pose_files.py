@@ -1,6 +1,7 @@
 """Poses of files, and the renderings along them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import drivesplat
 from drivesplat.cli.__main__ import main
 from drivesplat.drive.render_files import read_poses
 from drivesplat.errors import RequestError
+from drivesplat.io.video import Footage, read_footage
 from drivesplat.readers.truth import DEPTH_UNITS_PER_METRE
 from drivesplat.scene.rigid import rigid
 
@@ -88,6 +90,36 @@ def test_the_command_writes_what_the_drive_renders(finished_run, tmp_path, capsy
     np.testing.assert_allclose(images["depth"] / DEPTH_UNITS_PER_METRE, view.depth.numpy().clip(max=255.9), atol=3e-3)
     np.testing.assert_array_equal(images["instance"] == record["objects"][CAR], view.instance.numpy() == 0)
     assert record["objects"] == {CAR: 1} and record["frames"][0]["time"] == 0.5
+
+
+@pytest.mark.workflow
+def test_the_camera_is_by_default_the_one_that_looks_ahead_and_a_film_has_the_rate_of_the_poses(
+    finished_run, tmp_path, capsys
+):
+    street, times = finished_run.folder / "results/0001/street", np.array([0.5, 0.6, 0.72])
+    drive = drivesplat.open(street, "cpu")
+    ahead = np.stack([drive.camera_to_world(CAMERA, time) for time in times])
+    file, film = written(tmp_path / "a.csv", times, ahead), tmp_path / "out.mp4"
+    own = ["render", str(street), "--poses", str(file), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert main([*own, "--film", str(film)]) == 0
+    assert f"film: {film}" in capsys.readouterr().out
+    assert json.loads((tmp_path / "out/render.json").read_text())["camera"] == CAMERA
+    seen = drive.camera(CAMERA)
+    assert read_footage(film) == Footage(3, seen.width // 2 * 2, seen.height // 2 * 2, round(2 / 0.22, 2))
+    for changes, words in (
+        ({"--outputs": "depth"}, "add rgb to the outputs"),
+        ({"--poses": str(written(tmp_path / "b.csv", times[::-1], ahead))}, "b.csv: a film needs two or more poses"),
+        ({"--poses": str(written(tmp_path / "c.csv", times[:1], ahead[:1]))}, "c.csv: a film needs two or more poses"),
+    ):
+        refused = [*own, *(word for pair in changes.items() for word in pair)]
+        assert main([*refused, "--film", str(tmp_path / "no.mp4")]) == 1
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "no.mp4").exists()
+    front, left = drive.recording.first_image(CAMERA)[1], Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    turned = front.ego_to_world @ rigid(left, np.zeros(3)) @ front.camera_to_ego
+    aside = replace(front, camera="CAM_LEFT", camera_to_world=turned)
+    rig = replace(drive.recording, scene=replace(drive.scene, frames=(aside, front)))
+    assert (rig.cameras, rig.front_camera) == (["CAM_LEFT", CAMERA], CAMERA)
 
 
 @pytest.mark.workflow
