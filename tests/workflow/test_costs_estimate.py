@@ -55,8 +55,8 @@ def test_an_estimate_says_how_it_knows_and_what_is_not_known_yet(tmp_path):
     planned = [PlannedJob(JobId("train", "0103", "vanilla"), 8, True), PlannedJob(JobId("masks", "0103"), 1, False)]
     unknown = estimate(planned, expectations(), Machine(4, 2), tmp_path)
     rough = (
-        "2 jobs, very roughly 62 s on 4 cores and 2 GPUs (by other machines: no such job has run here before), disk use "
-        "not known yet ("
+        "2 jobs, very roughly 62 s on 4 cores and 2 GPUs (by other machines: no such job has run here before), disk "
+        "use not known yet ("
     )
     assert rough in in_one_line(unknown), "7,000 iterations of 6 ms on a GPU after masks, 10 s of each job beside them"
     assert in_full(unknown).count("1 x not known yet") == 2
