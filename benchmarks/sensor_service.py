@@ -79,8 +79,8 @@ class Watch:
     def __str__(self) -> str:
         _, memory, files = np.array(self.samples).T
         return (
-            f"memory {memory[0]:.0f} MB, then {memory.min():.0f} to {memory.max():.0f}, {memory[-1]:.0f} MB at the end; "
-            f"open files {files[0]:.0f}, then {files.min():.0f} to {files.max():.0f}"
+            f"memory {memory[0]:.0f} MB, then {memory.min():.0f} to {memory.max():.0f}, {memory[-1]:.0f} MB at the end"
+            f"; open files {files[0]:.0f}, then {files.min():.0f} to {files.max():.0f}"
         )
 
 
@@ -314,7 +314,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kinds.add_argument("--soak", type=int, metavar="N", help="send N requests in random order instead")
     kinds.add_argument("--offered", type=int, metavar="N", help="memory of servers that offer 2 and N scenes instead")
     parser.add_argument("--kinds", type=int, default=60, metavar="N", help="with --soak: different requests (60)")
-    parser.add_argument("--log", type=Path, metavar="CSV", help="table of memory and open files over time, not with --simulate and --offered")
+    parser.add_argument(
+        "--log",
+        type=Path,
+        metavar="CSV",
+        help="table of memory and open files over time, not with --simulate and --offered",
+    )
     parsed = parser.parse_args(arguments)
     sources = find_sources(parsed.paths)
     batch = partial(RigRequests.batch, size=parsed.size, image_format=FORMATS[parsed.format])
