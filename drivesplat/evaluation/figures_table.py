@@ -31,7 +31,7 @@ GAP = Column("gap", ("gap_db",))
 RANGE = Column("range", ("lidar", "all", "range_error_median_m"), scale=100.0)
 
 
-def read_metrics(path: str | Path) -> tuple[Path, dict[str, Any]]:
+def metrics_of(path: str | Path) -> tuple[Path, dict[str, Any]]:
     """The metrics of a scene, by its folder or the file itself, and the file. Raises ResultError where it is missing,
     damaged or something else."""
     given = Path(path)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.evaluation.comparison import GROUP_PLACES
-from drivesplat.evaluation.figures_table import figures_table, read_metrics
+from drivesplat.evaluation.figures_table import figures_table, metrics_of
 from drivesplat.evaluation.views_aside import LATERAL, place_of_view, views_aside
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.scene.scene_warnings import DARK
@@ -116,7 +116,7 @@ def _scan_figures(regions: dict[str, Any], forms: Iterable[str]) -> str:
 def print_summary(path: str | Path) -> None:
     """Prints the table and the sentences of a scene's metrics, given its folder or metrics.json. Raises ResultError
     where the file is absent or damaged."""
-    file, metrics = read_metrics(path)
+    file, metrics = metrics_of(path)
     checked_digest(file, warn=False)
     table = figures_table([metrics])
     print("\n".join([*table, *[""][: len(table)], *sentences(metrics, file)]))

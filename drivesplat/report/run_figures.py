@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.evaluation.figures_table import METRICS_FILE, figures_table, read_metrics
+from drivesplat.evaluation.figures_table import METRICS_FILE, figures_table, metrics_of
 from drivesplat.workflow.film_names import FILM_PAGE
 from drivesplat.workflow.report_plan import REPORT_FILES
 
@@ -20,7 +20,7 @@ def print_run_figures(outputs: Iterable[str], results: Path) -> None:
     of_scenes = [file for file in files if file.parent.parent == results and file.is_file()]
     measured = [file for file in of_scenes if file.name == METRICS_FILE]
     try:
-        table = figures_table([read_metrics(file)[1] for file in measured[:MAX_SCENES]])
+        table = figures_table([metrics_of(file)[1] for file in measured[:MAX_SCENES]])
     except DriveSplatError as error:
         table = [f"the figures of this run cannot be shown: {error}"]
     if len(measured) > MAX_SCENES:
