@@ -25,13 +25,6 @@ def test_a_target_after_configfile_without_dashes_is_refused_with_the_right_line
     assert "--configfile mine.yaml -- all" in only_complaint(copy.run(flags=flags))
 
 
-def test_an_unusable_config_file_is_named_with_its_line(copy):
-    """tests/workflow/test_config_files.py has more of them."""
-    (copy.folder / "bad.yaml").write_text("train: {\n")
-    line = only_complaint(copy.run(flags=("-n", "--configfile", "mine.yaml", "bad.yaml")))
-    assert "bad.yaml, line 2: not YAML" in line, line
-
-
 @pytest.mark.slow
 def test_the_workflow_runs_from_elsewhere_into_a_folder_of_its_own(copy, tmp_path):
     """Which has no config.yaml: the workflow's own holds. The demo's edits are found, too."""

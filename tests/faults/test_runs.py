@@ -7,16 +7,13 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, chdir, contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 from helpers.drives import World
-from helpers.killed_runs import only_complaint
+from helpers.killed_runs import only_complaint, refusal_by_plan
 from helpers.shared_runs import EDITS, TWO_METHODS, VANILLA
 from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
-
-from drivesplat.errors import DriveSplatError
-from drivesplat.workflow.plan import Plan
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
 
@@ -39,17 +36,6 @@ def with_edits(copy: WorkflowCopy, text: str) -> WorkflowCopy:
     copy.write_config()
     (copy.folder / "edits.yaml").write_text(text)
     return copy
-
-
-def planning(copy: WorkflowCopy, *targets: str) -> str:
-    """The sentence with which the plan refuses a run, asked as the Snakefile asks it, in the folder of the copy."""
-    with chdir(copy.folder), pytest.raises(DriveSplatError) as refused:
-        plan = Plan(copy.config, str(REPOSITORY))
-        plan.edits()
-        plan.refuse_unknown([*targets])
-        plan.refuse_absent_data([*targets])
-    assert "\n" not in str(refused.value)
-    return str(refused.value)
 
 
 MISTYPED = {
@@ -87,7 +73,7 @@ def test_an_unknown_scene_stops_before_any_job_and_lists_those_there_are(copy):
     ],
 )
 def test_an_unknown_target_is_refused_with_those_there_are(copy, target, words):
-    line = planning(with_edits(copy, EDITS), f"results/0001/{target}")
+    line = refusal_by_plan(with_edits(copy, EDITS), f"results/0001/{target}")
     assert all(word in line for word in words), line
 
 
@@ -105,7 +91,7 @@ def test_a_broken_edits_file_stops_before_any_job(copy, broken, words):
     with_edits(copy, broken or "")
     if broken is None:
         (copy.folder / "edits.yaml").unlink()
-    line = planning(copy)
+    line = refusal_by_plan(copy)
     assert all(word in line for word in ["edits.yaml", *words]), line
 
 
@@ -120,57 +106,13 @@ def test_a_broken_edits_file_stops_before_any_job(copy, broken, words):
 def test_a_missing_dataset_is_reported_in_one_message(copy, dataset, words):
     (copy.folder / "empty").mkdir()
     copy.config["datasets"] = {"nuscenes": {"scenes": ["0001"], **dataset}}
-    line = planning(copy, "results/0001/metrics.json")
+    line = refusal_by_plan(copy, "results/0001/metrics.json")
     assert all(word in line for word in words), line
 
 
 def test_missing_tables_are_named(copy):
     (copy.folder / "data/v1.0-mini/ego_pose.json").unlink()
     assert "ego_pose.json" in only_complaint(copy.run("results/0001/scene.json"))
-
-
-GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
-
-
-@pytest.mark.parametrize(
-    ("edits", "subject", "target", "words", "extracted"),
-    [
-        pytest.param(
-            GONE.format("0001 instance 1"), None, "edits/gone.mp4",
-            ["edit 'gone'", "no editable track", "editable tracks: 0001", "people need presets/people.yaml"], True,
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            EDITS, "0001", "removal.png", ["subjects.0001", "no track '0001'", "that move: 0001 instance 0"], False,
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["an edit of a parked car", "a subject"],
-)  # fmt: skip
-def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, target, words, extracted):
-    copy.config["subjects"] = {"0001": {"track": subject}}
-    line = only_complaint(with_edits(copy, edits).run(f"results/0001/street/{target}"))
-    assert all(word in line for word in words), line
-    assert (copy.folder / "results/0001/scene.json").exists() == extracted
-    assert not (copy.folder / "results/0001/street").exists()
-
-
-@pytest.mark.slow
-def test_a_bad_image_is_named_with_its_sample(copy):
-    path = copy.folder / "data/samples/CAM_FRONT/0001__0004.jpg"
-    path.write_bytes(path.read_bytes()[:700])
-    line = only_complaint(copy.run("results/0001/scene.json"))
-    assert "0001__0004.jpg" in line and "0001 CAM_FRONT 4" in line
-    assert not (copy.folder / "results/0001/scene.json").exists()
-
-
-@pytest.mark.slow
-def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
-    copy.config["device"] = "auto"
-    copy.write_config()
-    line = only_complaint(copy.run("results/0001/vanilla/train.json"))
-    assert "no usable GPU" in line and "device: cpu" in line
-    assert not (copy.folder / "results/0001/vanilla/checkpoint.npz").exists()
 
 
 LOOKS = ("parts.mp4", "ghost_panel.png", "with_car.png", "splat.ply", "parts/parts.json", "scene.usdz", "viewer.html")
@@ -198,9 +140,6 @@ def test_a_scene_without_vehicles_gets_nulls(tmp_path):
         assert (folder / "with_car.png").read_bytes() == (folder / "without_car.png").read_bytes()
 
 
-FFMPEG_THAT_DIES = "#!/bin/sh\nhead -c 10000 > /dev/null\necho 'x264: no space for a reference frame' >&2\nexit 3\n"
-
-
 @pytest.fixture(scope="module")
 def trained(finished_run, tmp_path_factory) -> WorkflowCopy:
     """Two finished trainings without what is made from them, to be looked at."""
@@ -215,24 +154,6 @@ def trained(finished_run, tmp_path_factory) -> WorkflowCopy:
     trained = [f"results/0001/{method}/train.json" for method in TWO_METHODS]
     assert copy.planned(*trained) == {}, "and the plan has written its tables for the copied data"
     return copy
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ffmpeg", "words"),
-    [(None, ["cannot be started"]), (FFMPEG_THAT_DIES, ["exit status 3", "x264: no space for a reference frame"])],
-    ids=["absent", "dying"],
-)
-def test_an_ffmpeg_that_is_absent_or_dies_is_named_and_leaves_no_half_film(trained, monkeypatch, ffmpeg, words):
-    program = trained.folder / "ffmpeg"
-    program.unlink(missing_ok=True)
-    if ffmpeg:
-        program.write_text(ffmpeg)
-        program.chmod(0o755)
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
-    line = only_complaint(trained.run("results/0001/vanilla/original.mp4"))
-    assert all(word in line for word in ["results/0001/vanilla/original.mp4", "ffmpeg", *words]), line
-    assert not list(trained.folder.glob("results/0001/vanilla/*original*"))
 
 
 @contextmanager

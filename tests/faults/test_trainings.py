@@ -9,7 +9,6 @@ import shutil
 import signal
 import threading
 import time
-import zipfile
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -42,37 +41,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 CPU = DeviceSettings(kind="cpu")
 RESUMABLE = job_of(iterations=20, checkpoint_every=10)
-FEW = settings_of(iterations=24, checkpoint_every=10)
-
-
-def write_until_killed(folder: str) -> None:
-    """For a subprocess: a training that dies, as by `kill -9`, halfway through its second checkpoint."""
-    torch.set_num_threads(1)
-    whole, saves = zipfile.ZipFile.close, []
-
-    def close(archive: zipfile.ZipFile) -> None:
-        if archive.fp is None:  # closed before
-            return
-        saves.append(archive)
-        if len(saves) == 2:
-            archive.fp.flush()
-            os.truncate(archive.fp.fileno(), archive.fp.tell() // 2)
-            os.kill(os.getpid(), signal.SIGKILL)
-        whole(archive)
-
-    zipfile.ZipFile.close = close
-    trained(Path(folder), FEW)
-
-
-def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(tmp_path):
-    process = in_subprocess(write_until_killed, str(tmp_path))
-    _, errors = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == -signal.SIGKILL, errors
-    (half,) = (tmp_path / "resume").glob(".state.*.partial.npz")
-    assert half.stat().st_size > 0
-    assert checkpoint_file.load(tmp_path / "resume/state.npz", "train")["step"] == 10
-    _, summary = trained(tmp_path, FEW)
-    assert summary.resumed_at == [10] and summary.iterations == 24
 
 
 @pytest.fixture(scope="module")
@@ -153,12 +121,11 @@ def test_a_training_whose_end_snakemake_missed_resumes_from_its_last_checkpoint(
     assert files.summary.is_file() and not files.resume.exists()
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_gradient_that_is_no_number_stops_a_training_whose_losses_are_numbers(tmp_path, value):
+def test_a_gradient_that_is_no_number_stops_a_training_whose_losses_are_numbers(tmp_path):
     settings = settings_of(checkpoint_every=2, log_every=1, refine_start=1.0)
     model = untrained(settings)
     calls = iter(range(1, 1000))
-    model.parts[0].params["quats"].register_hook(lambda g: g * value if next(calls) == 4 else g)
+    model.parts[0].params["quats"].register_hook(lambda g: g * math.nan if next(calls) == 4 else g)
     with pytest.raises(TrainingError) as error:
         trained(tmp_path, settings, model=model)
     message = str(error.value)

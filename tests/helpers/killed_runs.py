@@ -1,8 +1,14 @@
 """Runs of Snakemake that are killed or fail."""
 
 import subprocess
+from contextlib import chdir
 from pathlib import Path
 
+import pytest
+
+from drivesplat.errors import DriveSplatError
+from drivesplat.workflow.plan import Plan
+from helpers import REPOSITORY
 from helpers.workflow_copy import WorkflowCopy, complaints
 
 
@@ -13,6 +19,18 @@ def only_complaint(done: subprocess.CompletedProcess) -> str:
     lines = complaints(done.stdout)
     assert len(lines) == 1, done.stdout
     return lines.pop()
+
+
+def refusal_by_plan(copy: WorkflowCopy, *targets: str) -> str:
+    """The sentence with which the plan refuses a run, asked as the Snakefile asks it, in the folder of the copy."""
+    with chdir(copy.folder), pytest.raises(DriveSplatError) as refused:
+        plan = Plan(copy.config, str(REPOSITORY))
+        plan.edits()
+        plan.runs()
+        plan.refuse_unknown([*targets])
+        plan.refuse_absent_data([*targets])
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
 
 
 def training_process(copy: WorkflowCopy) -> int | None:

@@ -178,24 +178,6 @@ def test_a_black_color_has_a_gradient():
     assert (gradient > 0).any()
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_are_those_of_finite_differences(antialiased):
-    scene = random_scene(8, n=5, width=8, height=6)
-    scene.scales = 2.0 * scene.scales + 0.5
-    scene = with_harmonics(scene, 9, degree=1)
-    inputs = [getattr(scene, name).clone().requires_grad_() for name in INPUTS]
-
-    def seen(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        rendering = render(
-            replace(scene, **dict(zip(INPUTS, values, strict=True))),
-            sh_degree=1, antialiased=antialiased, with_depth=True,
-        )  # fmt: skip
-        return rendering.image, rendering.alpha, rendering.depth
-
-    assert float(seen(*inputs)[1].detach().mean()) > 0.1
-    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
-
-
 def test_too_few_coefficients_for_the_degree_are_an_error():
     scene = with_harmonics(random_scene(38, n=5, width=8, height=8), 0, degree=1)
     with pytest.raises(ValueError, match=r"degree 2 from 4 coefficients"):

@@ -278,17 +278,6 @@ def test_ratios_are_between_0_and_1_and_the_summary_is_plain_data(speed, yaw_rat
     assert (scores.columns["ttc_s"][loop_from:] >= 0.0).all()
 
 
-def test_a_long_run_with_many_objects():
-    """3,000 steps and 40 objects as arrays: no object is scored by steps, and all columns are whole."""
-    seconds = times(299.9)
-    angle = 10.0 * seconds / 60.0
-    own = poses(60.0 * np.sin(angle), 60.0 * (1.0 - np.cos(angle)), angle)
-    others = [car(seconds, 80.0 + 6.0 * k, 0.0, id=str(k)) for k in range(40)]
-    scores = run_scores(driven(seconds, own, 10.0, others))
-    assert scores.summary["progress_m"] == pytest.approx(2999.0, rel=0.01) and not scores.contacts
-    assert all(column is None or column.shape == (3000,) for column in scores.columns.values())
-
-
 def documented() -> dict[str, set[str]]:
     """The names in the tables of docs/closed_loop.md, by the heading above."""
     page = (REPOSITORY / "docs/closed_loop.md").read_text(encoding="utf-8")

@@ -33,7 +33,7 @@ from drivesplat.training.graphs import captured_steps
 from drivesplat.training.graphs.captured_steps import GaussianCount, IterationGraphs, Recording, can_capture
 from drivesplat.training.graphs.inputs import ScanInputs, SharedImageInputs, SharedScanInputs, can_share
 from drivesplat.training.loop import Trainer
-from drivesplat.training.losses import depth_loss, loss_terms
+from drivesplat.training.losses import loss_terms
 from drivesplat.training.scans import TrainingScan, load_scans, scan_terms
 from drivesplat.training.schedule import Schedule
 from drivesplat.training.views import LidarDepth, TrainingView
@@ -241,23 +241,6 @@ def test_images_of_other_shapes_have_inputs_of_their_own_and_those_of_other_came
     ]
     shared = inputs_for(views, by_camera)
     assert [shared.load(view, states).number for view in (*others, *others)] == [0, 1, 2, 3, 4, 5 * by_camera] * 2
-
-
-@pytest.mark.parametrize(("count", "room"), [(1, 1), (1, 40), (19, 40), (20, 20), (21, 300), (200, 300)])
-def test_the_depth_loss_ignores_unused_entries(count, room):
-    rng = np.random.default_rng(room)
-    depth = torch.from_numpy(rng.uniform(1.0, 9.0, (20, 30))).float().requires_grad_()
-    given = LidarDepth(
-        torch.from_numpy(rng.permutation(600)[:count]), torch.from_numpy(rng.uniform(1, 9, count)).float()
-    )
-    own = LidarDepth(
-        torch.cat([given.pixels, torch.full((room - count,), 7)]),
-        torch.cat([given.depth, torch.full((room - count,), torch.nan)]),
-        torch.tensor(count),
-    )
-    expected, found = depth_loss(depth, given), depth_loss(depth, own)
-    torch.testing.assert_close(found, expected)
-    torch.testing.assert_close(*(torch.autograd.grad(loss, depth)[0] for loss in (expected, found)))
 
 
 def test_images_whose_graph_serves_no_other_are_not_shared():

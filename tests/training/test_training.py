@@ -391,19 +391,14 @@ def test_slow_iterations_are_saved_by_time_and_resume_to_the_same_result(uninter
     assert summary.resumed_at == [20] and same_parameters(again, uninterrupted)
 
 
-@pytest.mark.parametrize("written_by", [None, "another training"])
-def test_without_a_resume_state_of_its_own_a_training_starts_at_0(written_by, uninterrupted, tmp_path, caplog):
-    """Only a state of another training is worth a warning."""
-    looks, other = (18, {"seed": 9, "fingerprint": written_by}) if written_by else (11, {})
+def test_without_a_resume_state_of_its_own_a_training_starts_at_0(uninterrupted, tmp_path, caplog):
+    """A state of another training, which is worth a warning, changes nothing."""
     with pytest.raises(EndedError):
-        trained(tmp_path, SHORT, EndingViews(recorded_views(), looks), **other)
-    assert (tmp_path / "resume/state.npz").exists() == bool(written_by)
+        trained(tmp_path, SHORT, EndingViews(recorded_views(), 18), seed=9, fingerprint="another training")
+    assert (tmp_path / "resume/state.npz").exists()
     with caplog.at_level(logging.WARNING):
         model, summary = trained(tmp_path, SHORT)
-    if written_by:
-        assert "other settings, code or inputs" in caplog.text and "starts at 0" in caplog.text
-    else:
-        assert caplog.text == ""
+    assert "other settings, code or inputs" in caplog.text and "starts at 0" in caplog.text
     assert (summary.resumed_at, summary.iterations) == ([], 30) and same_parameters(model, uninterrupted)
 
 
@@ -440,21 +435,6 @@ def test_each_of_30_flipped_bits_of_a_resume_state_is_refused_or_without_effect(
             checkpoint_file.save(tmp_path / "again.npz", content)
             assert (tmp_path / "again.npz").read_bytes() == whole, f"byte {place} was read otherwise than written"
     assert FLIPS / 2 <= refused < FLIPS, "flips of both kinds"
-
-
-def test_a_training_whose_resume_state_was_altered_starts_at_0_and_is_the_same(uninterrupted, tmp_path, caplog):
-    with pytest.raises(EndedError):
-        trained(tmp_path, SHORT, EndingViews(recorded_views(), 20))
-    state = tmp_path / "resume/state.npz"
-    content, values = bytearray(state.read_bytes()), checkpoint_file.load(state, "train")
-    means = values["state"]["model"]["parts.0.params.means"].numpy().tobytes()
-    content[content.index(means) + len(means) // 2] ^= 1
-    state.write_bytes(content)
-    with caplog.at_level(logging.WARNING):
-        model, summary = trained(tmp_path, SHORT)
-    assert "parts.0.params.means.npy" in caplog.text and "training starts at 0" in caplog.text
-    assert (values["step"], summary.resumed_at, summary.iterations) == (12, [], 30)
-    assert same_parameters(model, uninterrupted)
 
 
 def test_a_missing_checkpoint_is_named_with_its_rule(tmp_path):
@@ -530,7 +510,7 @@ def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoi
     assert {path.name for path in folder.iterdir()} == {"resume", "tensorboard"}
 
 
-@pytest.mark.parametrize(("strategy", "log_every"), [("mcmc", 25), ("default", 25), ("default", 1)])
+@pytest.mark.parametrize(("strategy", "log_every"), [("mcmc", 25), ("default", 25)])
 def test_a_loss_that_is_not_finite_is_a_training_error_however_rarely_it_is_checked(tmp_path, strategy, log_every):
     """Densification comes between the loss that is no number and the check."""
     settings = settings_of(strategy, checkpoint_every=1000, log_every=log_every, refine_start=0.0, gaussians=BREAKING)
@@ -538,7 +518,7 @@ def test_a_loss_that_is_not_finite_is_a_training_error_however_rarely_it_is_chec
         trained(tmp_path, settings)
 
 
-@pytest.mark.parametrize(("strategy", "log_every"), [("mcmc", 25), ("default", 25), ("mcmc", 1)])
+@pytest.mark.parametrize(("strategy", "log_every"), [("mcmc", 25), ("default", 1)])
 def test_a_training_without_gaussians_left_says_so(tmp_path, strategy, log_every):
     settings = settings_of(strategy, log_every=log_every, refine_start=0.0, checkpoint_every=1000)
     model = untrained(settings)

@@ -10,7 +10,6 @@ from helpers.shared_runs import TWO_METHODS, VANILLA
 from helpers.workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.point_cloud import read_ply
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.scene.scene import read_scene
 
@@ -30,20 +29,6 @@ def copy(finished_run, tmp_path_factory) -> WorkflowCopy:
     with chdir(made.folder):
         write_drive(read_scene("results/0001/scene.json"), Path("drives/monday"))
     return made
-
-
-@pytest.mark.slow
-def test_a_drive_folder_gives_the_seed_and_the_metrics_of_its_tables(copy):
-    done = copy.run("results/monday/metrics.json")
-    assert done.returncode == 0, done.stdout
-    seeds = [read_ply(copy.folder / f"results/{scene}/seed.ply", "lidar_seed") for scene in ("0001", "monday")]
-    np.testing.assert_array_equal(seeds[0].positions, seeds[1].positions)
-    np.testing.assert_array_equal(seeds[0].colors, seeds[1].colors)
-    tables, folder = (copy.read(f"results/{scene}/metrics.json") for scene in ("0001", "monday"))
-    assert folder["protocol"]["poses"] == "drive"
-    for group in ("interpolation", "extrapolation"):
-        assert folder["methods"]["vanilla"][group] == tables["methods"]["vanilla"][group]
-    assert copy.planned("results/monday/metrics.json") == {}
 
 
 def test_a_scene_without_its_images_is_not_written(copy, tmp_path, monkeypatch):

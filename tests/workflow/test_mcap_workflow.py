@@ -47,18 +47,6 @@ def test_files_are_made_where_they_are_asked_for(copy):
     assert not {"drive_mcap", "run_folder"} & set(copy.planned(*FILES))
 
 
-@pytest.mark.parametrize(
-    ("target", "message"),
-    [
-        (f"{STREET}/runs/fast/drive.mcap", "no run called 'fast'"),
-        (f"{STREET}/runs/fast/drive/drive.json", "no run called 'fast'"),
-    ],
-)
-def test_unknown_runs_are_refused_before_anything_starts(copy, target, message):
-    done = copy.run(target, flags=("-n",))
-    assert done.returncode and message in done.stdout
-
-
 def test_without_a_trajectory_of_the_recorded_path_there_is_no_file(copy):
     with copy.set_to(render={"trajectories": {"original": {"lateral": 1.0}}}):
         done = copy.run(f"{STREET}/drive.mcap", flags=("-n",))

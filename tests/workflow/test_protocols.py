@@ -99,40 +99,6 @@ def figures(name: str, *keys: str) -> list[tuple[Any, ...]]:
     return [tuple(getattr(item, key) for key in keys) for item in plan(name).config.published]
 
 
-def test_the_article_of_amd_is_repeated():
-    """PSNR, SSIM, LPIPS and time of its table, each segment whole and cut."""
-    times = ("17:50.67", "19:31.57", "34:47.04", "25:12.93", "17:16.39", "16:03.89", "20:28.26", "20:25.74")
-    minutes = [int(time[:2]) + float(time[3:]) / 60.0 for time in times]
-    found = figures("amd_street_gaussians", "scene", "psnr", "ssim", "lpips", "train_minutes")
-    assert [item[0] for item in found] == plan("amd_street_gaussians").config.batch_scenes
-    assert [item[1:4] for item in found] == [
-        (32.59, 0.93, 0.26), (37.25, 0.95, 0.19), (32.96, 0.93, 0.21), (34.12, 0.93, 0.21),
-        (32.56, 0.90, 0.26), (34.41, 0.93, 0.20), (27.39, 0.85, 0.27), (25.76, 0.82, 0.38),
-    ]  # fmt: skip
-    assert [item[4] for item in found] == pytest.approx(minutes, abs=0.005)
-    assert set(figures("amd_street_gaussians", "method", "gpu")) == {("Street Gaussians", "AMD Instinct MI300X")}
-
-
-def test_the_table_of_vad_gs_is_repeated():
-    found = {
-        (scene, method, region): psnr
-        for scene, method, region, psnr in figures("vad_gs_nuscenes", "scene", "method", "region", "psnr")
-    }
-    methods = ("Street Gaussians", "OmniRe", "PVG", "VAD-GS")
-    table = {
-        "0061": (22.87, 22.71, 22.77, 25.54),
-        "0103": (22.12, 22.27, 22.91, 23.69),
-        "mean": (22.9, 22.8, 23.0, 24.5),
-    }
-    expected = {
-        (scene, method, "all"): psnr for scene, row in table.items() for method, psnr in zip(methods, row, strict=True)
-    }
-    assert found == expected | {("mean", "VAD-GS", "moving_vehicle"): 23.2}
-    perceptual = figures("vad_gs_nuscenes", "ssim", "lpips")
-    assert perceptual[:5] == [(0.65, 0.13), (0.63, 0.16), (0.63, 0.22), (0.81, 0.16), (0.66, 0.23)]
-    assert perceptual[7] == (0.76, 0.24) and {*perceptual[5:7], *perceptual[8:]} == {(None, None)}
-
-
 def test_a_preset_has_no_key_twice():
     """Of which YAML silently keeps the last."""
     check_config_files([str(path) for path in FILES.values()])
