@@ -7,7 +7,7 @@ import shutil
 import pytest
 import yaml
 from helpers.drives import Thing, World, write_world
-from helpers.small_runs import BASE, run
+from helpers.small_runs import BASE, Finished, run
 from helpers.workflow_copy import REPOSITORY
 
 from drivesplat.settings.config import load
@@ -17,10 +17,18 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 GROUPS = ("interpolation", "extrapolation")
 
 
-def test_a_track_with_one_box_is_static_and_present_only_at_that_time(tmp_path):
-    """A van ahead, annotated in key frame 2 alone, which is held out for interpolation."""
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Finished:
+    """A van ahead, annotated in key frame 2 alone, which is held out for interpolation; all LiDAR files are gone, where
+    `lidar_seed.on_missing` says to go on. Where not, tests/readers/test_nuscenes.py holds that it stops."""
+    folder = tmp_path_factory.mktemp("lacking")
     van = Thing("vehicle.truck", (4.0, 4.0, 3.0), (9.0, 0.0, 1.5), seen=range(2, 3))
-    made = run(write_world(tmp_path / "data", World(things=[van], key_frames=8, speed=1.0)), tmp_path)
+    root = write_world(folder / "data", World(things=[van], key_frames=8, speed=1.0))
+    shutil.rmtree(root / "samples/LIDAR_TOP")
+    return run(root, folder, lidar_seed={**BASE["lidar_seed"], "on_missing": "warn"})
+
+
+def test_a_track_with_one_box_is_static_and_present_only_at_that_time(made):
     json.dumps(made.metrics, allow_nan=False)
     for method in made.metrics["methods"].values():
         seen, gone = (method[group] for group in GROUPS)
@@ -29,12 +37,7 @@ def test_a_track_with_one_box_is_static_and_present_only_at_that_time(tmp_path):
         assert seen["gap_db"] == pytest.approx(seen["static"]["psnr"] - seen["vehicle"]["psnr"])
 
 
-def test_a_drive_whose_lidar_is_gone_is_measured_with_the_count_beside_it(tmp_path):
-    """Where `lidar_seed.on_missing` says to go on; where not, tests/readers/test_nuscenes.py holds that it stops."""
-    root = write_world(tmp_path / "data", World(key_frames=8))
-    shutil.rmtree(root / "samples/LIDAR_TOP")
-    made = run(root, tmp_path, lidar_seed={**BASE["lidar_seed"], "on_missing": "warn"})
-    json.dumps(made.metrics, allow_nan=False)
+def test_a_drive_whose_lidar_is_gone_is_measured_with_the_count_beside_it(made):
     assert made.metrics["protocol"]["lidar_missing"] == 8
     for method in made.metrics["methods"].values():
         assert all(method[group]["static"]["psnr"] > 0 and not method[group].get("depth") for group in GROUPS)

@@ -325,7 +325,7 @@ def test_undamaged_clips_are_read(roots, tmp_path):
         assert not sound_or_refused(root, tmp_path / store, "nothing")
 
 
-@damages(100, 300)
+@damages(35, 300)
 def test_damaged_bytes(roots, tmp_path, random: Random):
     with fresh(tmp_path) as folder:
         root = Path(shutil.copytree(roots["itar"], folder / "clip"))
@@ -341,7 +341,7 @@ def test_damaged_bytes(roots, tmp_path, random: Random):
         sound_or_refused(root, folder / "out", done)
 
 
-@damages(60, 600)
+@damages(25, 600)
 def test_damaged_metadata(roots, tmp_path, random: Random):
     with fresh(tmp_path) as folder:
         root = folder / "clip"
@@ -370,7 +370,7 @@ def relinked(store: Path, metadata: dict) -> None:
     write_metadata(store / METADATA, metadata)
 
 
-@damages(40, 150)
+@damages(20, 150)
 def test_damaged_manifests(roots, tmp_path, random: Random):
     with fresh(tmp_path) as folder:
         root = Path(shutil.copytree(roots["itar"], folder / "clip"))

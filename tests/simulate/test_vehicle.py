@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers.hand_made import about_z
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivesplat.errors import RequestError
@@ -63,6 +63,7 @@ def test_inputs_beyond_its_limits_are_clipped_and_wheels_turn_at_their_rate():
     assert driven(VehicleState(0.0, 0.0, 0.0, 5.0), 0.0, 9.0, 20, fast)[-1].speed == 5.5
 
 
+@settings(max_examples=25)
 @given(st.floats(1.0, 15.0), st.floats(-0.05, 0.05), st.floats(-1.0, 1.0))
 def test_the_controller_follows_poses_that_the_vehicle_can_drive(speed, angle, push):
     """It begins 0.5 m beside the targets, and ends on them."""

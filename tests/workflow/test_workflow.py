@@ -244,8 +244,6 @@ NO_STAGE = {"refine_poses": {"rounds": 2, "enabled": False}, "device": {"kind": 
         pytest.param({"actors": {"humans": True}}, {"actors": 1, "tracks": 1, **STREETS_TRAINING_AND_AFTER},
                      marks=SLOW),
         ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
-        ({"render": {"compare": False, "trajectories": {"above": {"vertical": 3.0}}}},
-         {"film": 2, "gap_report": 1, "film_page": 1}),
         pytest.param({"render": {"end": "trained"}}, {"film": 4, "compare": 1, **OF_ACTORS}, marks=SLOW),
         pytest.param({"export": {"sh_degree": 3, "formats": ["ply", "spz"]}}, {"export": 2, "export_spz": 2},
                      marks=SLOW),
