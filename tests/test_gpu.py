@@ -2,7 +2,6 @@
 
 import math
 import re
-import signal
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -263,21 +262,6 @@ def test_a_training_of_actors_learns_and_resumes(strategy, tmp_path):
     assert summary.resumed_at == [80] and resumed.parts[1].shared["translation"].any()
     found, expected = (mean_psnr(model, guided_views(GPU)) for model in (resumed, whole))
     assert expected > before + 3.0 and found == pytest.approx(expected, abs=0.5)
-
-
-def train_until_killed(folder: str) -> None:
-    """For a subprocess: a training on the GPU that kills itself with SIGKILL."""
-    trained(Path(folder), gpu_settings("mcmc"), EndingViews(gpu_views(), 120, kill=True), device=GPU)
-
-
-def test_a_killed_training_ends_as_an_uninterrupted_one(tmp_path):
-    whole, _ = trained(tmp_path / "whole", gpu_settings("mcmc"), gpu_views(), device=GPU)
-    process = in_subprocess(train_until_killed, str(tmp_path))
-    _, errors = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == -signal.SIGKILL, errors
-    model, summary = trained(tmp_path, gpu_settings("mcmc"), gpu_views(), device=GPU)
-    assert summary.resumed_at == [80] and summary.iterations == 200
-    assert mean_psnr(model, gpu_views()) == pytest.approx(mean_psnr(whole, gpu_views()), abs=0.3)
 
 
 def print_what_stops(folder: str, strategy: str, fault: str) -> None:
