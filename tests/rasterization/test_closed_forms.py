@@ -103,6 +103,22 @@ def _projected(scene: Scene, g: int, view: np.ndarray, k: np.ndarray, at: np.nda
     return jacobian @ covariance @ jacobian.T, focal * slopes + principal
 
 
+@pytest.mark.parametrize(
+    ("opacities", "seen"),
+    [
+        pytest.param([0.999 / 255.0], [0.0], id="contributions below one grey level are dropped"),
+        pytest.param([1.001 / 255.0], [1.001 / 255.0], id="those above are not"),
+        pytest.param([1.0, 0.5], [0.999, 0.0005], id="the alpha of a Gaussian is at most 0.999"),
+        pytest.param([0.97, 0.97, 0.97], [0.97, 0.03 * 0.97, 0.0], id="a ray ends before 1e-4 passes"),
+        pytest.param([0.98, 0.999, 0.01], [0.98, 0.0, 0.0], id="nothing behind its end has an effect"),
+    ],
+)
+def test_cut_offs_of_alpha(opacities, seen):
+    rendering = render(on_axis([3.0, 4.0, 5.0][: len(opacities)], opacities))
+    assert middle(rendering.image)[: len(seen)].tolist() == pytest.approx(seen)
+    assert float(middle(rendering.alpha)) == pytest.approx(sum(seen))
+
+
 def test_spherical_harmonics_of_degree_1_follow_the_viewing_direction():
     scene = on_axis([4.0], [0.7])
     rng = np.random.default_rng(3)
