@@ -19,6 +19,7 @@ rule edit:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         inserts=plan.inserts,
+        frames=plan.recorded_frames,
     output:
         film=report(
             "<results>/{scene}/{method}/edits/{edit}.mp4",
@@ -66,6 +67,7 @@ rule quad:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         inserts=plan.inserts,
+        frames=plan.recorded_frames,
     output:
         film=report(
             "<results>/{scene}/{method}/quad/{edit}.mp4",

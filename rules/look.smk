@@ -4,7 +4,7 @@
 # actors, scans.npz if it renders LiDAR.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png, compare.mp4 and compare.json;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
-# of synthetic worlds truth.mp4 and truth.json; ghost_panel.png and .json;
+# recorded_frames.npy, where films share it; of synthetic worlds truth.mp4 and truth.json; ghost_panel.png and .json;
 # with_car.png, without_car.png, removal.png and removal.json; of methods that render LiDAR lidar.png, lidar.mp4 and
 # lidar.json.
 
@@ -44,6 +44,36 @@ rule tracks:
         "../workflow_scripts/tracks.py"
 
 
+rule recorded_frames:
+    """
+    Renders the frames along the recorded path once for the films that show them beside others.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+    output:
+        frames="<results>/{scene}/{method}/recorded_frames.npy",
+    log:
+        "<logs>/{scene}/{method}/recorded_frames.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/recorded_frames.tsv"
+    wildcard_constraints:
+        scene=plan.trained(),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("recorded_frames"),
+        code=plan.code("recorded_frames"),
+    script:
+        "../workflow_scripts/recorded_frames.py"
+
+
 rule film:
     """
     Renders a film along the recorded path or one beside it, at the speed of the drive.
@@ -51,6 +81,7 @@ rule film:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
+        frames=plan.recorded_frames,
     output:
         film=report(
             "<results>/{scene}/{method}/{trajectory}.mp4",
@@ -88,6 +119,7 @@ rule film_parts:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
+        frames=plan.recorded_frames,
     output:
         film=report(
             "<results>/{scene}/{method}/parts.mp4",

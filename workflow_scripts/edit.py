@@ -17,5 +17,6 @@ with job(snakemake) as current:
     inserts = read_inserts(settings.edit, Path(current.input.checkpoint).parent)
     provenance = current.provenance(scene.provenance, checkpoint.provenance, inputs=digests_of(inserts))
     files = EditFiles(Path(current.output.film), Path(current.output.still))
-    record = render_edit(scene, checkpoint, settings, current.device(), files, inserts)
+    frames = next(map(Path, current.input.frames), None)
+    record = render_edit(scene, checkpoint, settings, current.device(), files, inserts, frames)
     write_json(current.output.labels, {**record, "provenance": provenance})

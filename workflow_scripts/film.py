@@ -13,5 +13,7 @@ with job(snakemake) as current:
     scene = read_scene(current.input.scene)
     checkpoint = read_checkpoint(current.input.checkpoint)
     provenance = current.provenance(scene.provenance, checkpoint.provenance)
-    record = render_film(scene, checkpoint, current.settings(FilmJob), current.device(), Path(current.output.film))
+    frames = next(map(Path, current.input.frames), None)
+    film = Path(current.output.film)
+    record = render_film(scene, checkpoint, current.settings(FilmJob), current.device(), film, frames)
     write_json(current.output.cameras, {**record, "provenance": provenance})

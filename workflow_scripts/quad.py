@@ -16,5 +16,7 @@ with job(snakemake, dataset=("images",)) as current:
     settings = current.settings(EditJob)
     inserts = read_inserts(settings.edit, Path(current.input.checkpoint).parent)
     provenance = current.provenance(scene.provenance, checkpoint.provenance, inputs=digests_of(inserts))
-    record = render_quad(scene, checkpoint, settings, current.device(), Path(current.output.film), inserts)
+    film = Path(current.output.film)
+    frames = next(map(Path, current.input.frames), None)
+    record = render_quad(scene, checkpoint, settings, current.device(), film, inserts, frames)
     write_json(current.output.labels, {**record, "provenance": provenance})

@@ -63,9 +63,11 @@ def render_edit(
     device_settings: DeviceSettings,
     files: EditFiles,
     inserts: Inserts = NO_INSERTS,
+    frames_file: Path | None = None,
 ) -> dict[str, Any]:
     """Writes the film and the still, both with the recorded and the edited drive in panels, and, if `job.frames`, the
-    frames of the edited one. `inserts` is what the edit inserts.
+    frames of the edited one. `inserts` is what the edit inserts; `frames_file` is the file of
+    `write_recorded_frames`; without it these frames are rendered.
 
     Returns the content of the edit's JSON without provenance: the cameras of the edited drive at the size of a frame,
     which is that of a panel, the places of the panels in the `film`, and the poses of all objects. Raises ConfigError
@@ -79,7 +81,7 @@ def render_edit(
     colliding = warn_of_collisions(drive.actors, after.cameras.camera_to_world, seconds, where)
     panels = Panels(("recorded", files.film.stem), after.size)
     still = Still(panels, avoided=colliding | (seconds > after.trained_until))
-    shown = recorded_shot(model, drive.before, device)
+    shown = recorded_shot(model, drive.before, device, frames_file)
     changed = edited_frames(drive.model, after.views(device), drive.actors, seconds)
     for file in files.frames.glob("[0-9]" * 6 + ".png"):  # of an earlier run
         file.unlink()

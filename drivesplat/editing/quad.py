@@ -13,7 +13,7 @@ from drivesplat.editing.assets.asset import NO_INSERTS, Inserts
 from drivesplat.editing.film import edited_frames, edited_shots
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.view import View
-from drivesplat.rendering.film import Shot, write_film
+from drivesplat.rendering.film import Shot, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.images import continuous_intrinsics, read_image
@@ -32,9 +32,10 @@ def render_quad(
     device_settings: DeviceSettings,
     path: Path,
     inserts: Inserts = NO_INSERTS,
+    frames_file: Path | None = None,
 ) -> dict[str, Any]:
     """Writes the MP4 `path`, named like the edit, which inserts `inserts`; returns the content of its JSON
-    without provenance.
+    without provenance. `frames_file` is as in `render_edit`.
 
     The first two panels show the last image of the camera until the next: as recorded, and rendered from its pose at
     its time. Raises what `render_edit` raises.
@@ -56,7 +57,7 @@ def render_quad(
     columns = (
         repeated(last, (recorded_picture(frame, smooth) for frame in taken)),
         repeated(last, film_frames(model, ((view, None) for view in views))),
-        film_frames(model, ((view, None) for view in smooth.views(device))),
+        recorded_shot(model, smooth, device, frames_file),
         edited_frames(drive.model, after.views(device), drive.actors, np.array(after.seconds)),
     )
     rate = f"{1e6 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0:.2g} Hz"

@@ -1,5 +1,6 @@
 """The stages `film` and `film_parts`: films of a trained model along a trajectory, with a record of their cameras; and
-films of its static and dynamic parts side by side."""
+films of its static and dynamic parts side by side. And the stage `recorded_frames`: the frames along the recorded path,
+for films that show them beside others."""
 
 import logging
 import sys
@@ -15,6 +16,7 @@ import torch
 from tqdm import tqdm
 
 from drivesplat.io.prefetch import prefetch_items
+from drivesplat.io.storage import atomic_path, unreadable
 from drivesplat.io.video import write_video
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
@@ -116,10 +118,17 @@ def film_size(scene: Scene, job: FilmFormat) -> tuple[int, int]:
 
 
 def render_film(
-    scene: Scene, checkpoint: TrainedCheckpoint, job: FilmJob, device_settings: DeviceSettings, path: Path
+    scene: Scene,
+    checkpoint: TrainedCheckpoint,
+    job: FilmJob,
+    device_settings: DeviceSettings,
+    path: Path,
+    frames_file: Path | None = None,
 ) -> dict[str, Any]:
     """Writes the MP4 `path`; returns the content of the record of its cameras without provenance: that of the shot, the
     `offset` from the recorded path in metres and degrees, the `parts` shown, `render_seconds` and `bytes`.
+    `frames_file` is the file of `write_recorded_frames` for a film along the recorded path; without it, frames are
+    rendered.
 
     Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or a rendering contains NaN or Inf.
@@ -129,7 +138,7 @@ def render_film(
     panels = Panels((f"{path.parent.name}: {job.trajectory.in_words}",), shot.size)
     parts = job.trajectory.parts
     if parts == "all":
-        pictures = recorded_shot(model, shot, device)
+        pictures = recorded_shot(model, shot, device, frames_file)
     else:
         model.precompute(shot.seconds)
         fixed = FixedModel(model)
@@ -139,20 +148,29 @@ def render_film(
 
 
 def render_parts(
-    scene: Scene, checkpoint: TrainedCheckpoint, job: FilmFormat, device_settings: DeviceSettings, path: Path
+    scene: Scene,
+    checkpoint: TrainedCheckpoint,
+    job: FilmFormat,
+    device_settings: DeviceSettings,
+    path: Path,
+    frames_file: Path | None = None,
 ) -> dict[str, Any]:
     """Writes the MP4 `path` of three panels along the recorded path: the scene, its static parts, and its dynamic parts
     on plain grey. Returns the record of its cameras as `render_film` does, for one panel, with the `film` of all.
-    Raises what `render_film` raises.
+    `frames_file` is as in `render_film`. Raises what `render_film` raises.
     """
     shot = shot_of(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job)
     model, device = open_model(checkpoint, device_settings)
     panels = Panels(("everything", "static", "moving"), shot.size)
     model.precompute(shot.seconds)
     fixed = FixedModel(model)
-    of_all = (frames_of_parts(fixed, view, PARTS_SHOWN) for view in shot.views(device))
+    shown = PARTS_SHOWN if frames_file is None else PARTS_SHOWN[1:]
+    apart = (frames_of_parts(fixed, view, shown) for view in shot.views(device))
+    if frames_file is not None:
+        whole = recorded_shot(model, shot, device, frames_file)
+        apart = ([frame, *others] for frame, others in zip(whole, apart, strict=True))
     captions = [PARTS_IN_WORDS[parts] for parts in PARTS_SHOWN]
-    figures = write_film(path, map(panels.assembled, of_all), shot, model, panels, labels=captions)
+    figures = write_film(path, map(panels.assembled, apart), shot, model, panels, labels=captions)
     return {**shot.record(), "shows": ["all", "still", "moving"], "film": panels.record(), **figures}
 
 
@@ -198,10 +216,45 @@ def encode_film(
     return {"render_seconds": seconds, "bytes": path.stat().st_size}
 
 
-def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterator[np.ndarray]:
-    """The frames of a shot of a model without edits, (h, w, 3) uint8 RGB."""
+def recorded_shot(
+    model: SplatModel, shot: Shot, device: torch.device, frames_file: Path | None = None
+) -> Iterator[np.ndarray]:
+    """The frames of a shot of a model without edits, (h, w, 3) uint8 RGB. For a shot along the recorded path, or its
+    beginning, `frames_file` is the file of `write_recorded_frames`; without it, frames are rendered.
+
+    Raises ResultError where the file is damaged, or lacks frames of that number and size.
+    """
     model.precompute(shot.seconds)
-    return film_frames(model, ((view, None) for view in shot.views(device)))
+    if frames_file is None:
+        return film_frames(model, ((view, None) for view in shot.views(device)))
+    try:
+        frames = np.load(frames_file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise unreadable(frames_file, "recorded_frames", f"no file of frames ({error})") from error
+    count, (width, height) = len(shot.cameras), shot.size
+    if frames.dtype != np.uint8 or frames.shape[1:] != (height, width, 3) or len(frames) < count:
+        found = f"{frames.dtype} {frames.shape}"
+        why = f"contains {found} in place of {count} frames of {width}x{height}"
+        raise unreadable(frames_file, "recorded_frames", why)
+    return iter(frames[:count])
+
+
+def write_recorded_frames(
+    scene: Scene, checkpoint: TrainedCheckpoint, form: FilmFormat, device_settings: DeviceSettings, path: Path
+) -> None:
+    """Writes the frames of a film along the recorded path, without captions, as an NPY file (n, h, w, 3) uint8 RGB.
+
+    Films of other formats with the same camera, size, rate and end have the same frames. Raises what `render_film`
+    raises.
+    """
+    shot = shot_of(scene, film_path(scene, form.camera, form.fps, TrajectorySettings()), form)
+    model, device = open_model(checkpoint, device_settings)
+    size = (len(shot.cameras), *reversed(shot.size), 3)
+    with atomic_path(path) as aside, explain_out_of_memory(lambda: len(model)):
+        frames = np.lib.format.open_memmap(aside, "w+", np.uint8, size)
+        for number, frame in enumerate(recorded_shot(model, shot, device)):
+            frames[number] = frame
+        frames.flush()
 
 
 @torch.no_grad()

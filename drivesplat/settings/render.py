@@ -78,6 +78,10 @@ class RenderSettings(Settings):
     lidar: bool = True
     """:printed: Make lidar.mp4 with the films of methods that render LiDAR: recorded scans beside rendered ones. It can
     always be asked for by its name."""
+    recorded_once: bool = False
+    """Render the frames along the recorded path once for all films of a method that show them: those of edits, of four
+    panels, of parts, and of the recorded path. Saves time where there is no GPU, and takes three bytes a pixel on disk
+    (recorded_frames.npy). The films are the same. For methods that can be edited."""
     edited_frames: bool = False
     """:printed: Also write the frames of edited drives as PNG, at full size, with labels in the JSON file."""
     trajectories: dict[str, TrajectorySettings] = Field(

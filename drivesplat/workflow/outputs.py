@@ -57,6 +57,8 @@ TRUTH_FILM = "truth"
 """The film of a method beside the truth of a synthetic world. It is made on request."""
 MCAP = "drive.mcap"
 """The file of a drive for ROS 2. It is made on request."""
+RECORDED_FRAMES = "recorded_frames.npy"
+"""The frames of the recorded drive, for the films of a method that show it."""
 COMPARE_FILM = "compare.mp4"
 """The film of all methods of a scene."""
 
@@ -242,6 +244,15 @@ class Outputs(Inputs):
         light = [results / wildcards.scene / LIGHT] if any(step.insert for step in edit.steps) else []
         assets = [file for one in names for file in files_of_asset(one, results, wildcards.method)]
         return [str(file) for file in (*assets, *light)]
+
+    def recorded_frames(self, wildcards: Any) -> list[str]:
+        """The file of the frames along the recorded path for a film that shows them; none where `render.recorded_once`
+        is false, or the method cannot be edited."""
+        render, trajectory = for_scene(self.config, wildcards.scene).render, getattr(wildcards, "trajectory", None)
+        shows = trajectory is None or render.trajectories.get(trajectory) == TrajectorySettings()
+        if not (render.recorded_once and shows and wildcards.method in self.methods_with_actors):
+            return []
+        return [f"{self.config.results_dir}/{wildcards.scene}/{wildcards.method}/{RECORDED_FRAMES}"]
 
     def looks(self, _: Any = None) -> list[str]:
         """The pictures of the batch's scenes and methods, and of the tracks of any method."""

@@ -370,7 +370,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
     "tracks": (TracksJob, _nothing),
     "film": (FilmJob, _film),
     "film_blocks": (BlockFilmJob, lambda at: {**_film(at), "left_out": at.dataset.left_out(at.scene)}),
-    "film_parts": (FilmFormat, _film_format),
+    **dict.fromkeys(("film_parts", "recorded_frames"), (FilmFormat, _film_format)),
     "compare": (CompareJob, lambda at: {**_encoding(at), "end": at.config.render.end}),
     "truth_film": (TruthFilmJob, _encoding),
     "edit": (EditJob, lambda at: {**_quad(at), "frames": at.config.render.edited_frames}),

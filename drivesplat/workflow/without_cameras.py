@@ -13,9 +13,9 @@ LIDAR_METHOD_STAGES = ("train", "evaluate_scans")
 """The stages behind the metrics.json of a scene without cameras, of the scene and of each of its methods."""
 CAMERA_STAGES = (
     "own_car", "lidar_seed", "segment", "masks", "regions", "lidar_depth", "evaluate", "ablation", "tracks",
-    "film", "film_parts", "truth_film", "compare", "edit", "quad", "drive_folder", "ghost_panel", "remove_actor",
-    "far_gaussians", "export", "export_usd", "export_viewer", "export_colmap", "export_spz", "export_sog",
-    "export_alpasim",
+    "film", "film_parts", "truth_film", "compare", "edit", "quad", "recorded_frames", "drive_folder", "ghost_panel",
+    "remove_actor", "far_gaussians", "export", "export_usd", "export_viewer", "export_colmap", "export_spz",
+    "export_sog", "export_alpasim",
 )  # fmt: skip
 """Stages that need images."""
 IMAGE_RESULTS = (
@@ -27,6 +27,7 @@ IMAGE_RESULTS_OF_METHODS = (
     *HELD_OUT_PAIR.values(), *LOOKS.values(), "removal.png", "ghost_panel.json", "removal.json", "quad", "far.npz",
     "splat.ply", "cameras.json", "transforms.json", "parts", "scene.usdz", "viewer.html", "colmap", "splat.spz",
     "splat.sog", "scene.alpasim.usdz", "truth.mp4", "truth.json", "eval_objects.json",
+    "recorded_frames.npy",
 )  # fmt: skip
 """Those of a method, without films, edits and drive folders."""
 HOW = "docs/lidar.md says what there is without cameras"
