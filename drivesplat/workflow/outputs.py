@@ -13,6 +13,7 @@ from drivesplat.settings.asset_references import FOLDER, INDEX, LIGHT, asset_nam
 from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
+from drivesplat.settings.method import MethodSettings, merged
 from drivesplat.settings.render import TrajectorySettings
 from drivesplat.settings.tracks import TRACK_FOLDERS
 from drivesplat.workflow.film_names import EDITS, QUAD, TRAJECTORIES, no_such_edit, scene_edits
@@ -116,8 +117,14 @@ class Outputs(Inputs):
 
     @property
     def methods_with_lidar_in_any_scene(self) -> list[str]:
-        methods = self.config.all_methods
-        return [name for name in methods if any(self.renders_lidar(scene, name) for scene in self._first_scenes)]
+        """The methods that render LiDAR of any scene. Needs no config of each method and scene: most are never run."""
+        given = {for_scene(self.config, scene).train.scans.per_image for scene in self._first_scenes}
+
+        def renders(method: MethodSettings) -> bool:
+            settings = (merged({"train": {"scans": {"per_image": own}}}, method.overrides) for own in given)
+            return any(float(one["train"]["scans"]["per_image"]) > 0 for one in settings)
+
+        return [name for name, method in self.config.all_methods.items() if renders(method)]
 
     def metrics(self, _: Any = None) -> list[str]:
         """The metrics.json of the batch's scenes."""
