@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from drivesplat.io.prefetch import prefetch_items
-from drivesplat.io.storage import atomic_path, unreadable
+from drivesplat.io.storage import atomic_write, unreadable
 from drivesplat.io.video import write_video
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
@@ -250,11 +250,11 @@ def write_recorded_frames(
     shot = shot_of(scene, film_path(scene, form.camera, form.fps, TrajectorySettings()), form)
     model, device = open_model(checkpoint, device_settings)
     size = (len(shot.cameras), *reversed(shot.size), 3)
-    with atomic_path(path) as aside, explain_out_of_memory(lambda: len(model)):
-        frames = np.lib.format.open_memmap(aside, "w+", np.uint8, size)
-        for number, frame in enumerate(recorded_shot(model, shot, device)):
-            frames[number] = frame
-        frames.flush()
+    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.uint8)), "fortran_order": False, "shape": size}
+    with atomic_write(path) as file, explain_out_of_memory(lambda: len(model)):
+        np.lib.format.write_array_header_1_0(file, header)
+        for frame in recorded_shot(model, shot, device):
+            file.write(np.ascontiguousarray(frame).data)
 
 
 @torch.no_grad()

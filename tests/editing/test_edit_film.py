@@ -27,7 +27,7 @@ from drivesplat.editing.film import EditFiles, Still, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
-from drivesplat.rendering.film import render_film
+from drivesplat.rendering.film import render_film, write_recorded_frames
 from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.object_class import ObjectClass
@@ -103,6 +103,19 @@ def test_the_left_half_equals_the_film_of_the_recorded_drive(scene, model, busy,
     job = FilmJob(**a_format(width=64, height=36).model_dump(), trajectory=TrajectorySettings())
     render_film(scene, checkpoint_of(model), job, CPU, tmp_path / "original.mp4")
     np.testing.assert_array_equal(busy.halves[0], reels["original"])
+
+
+def test_the_left_half_may_come_from_a_file(scene, model, busy, tmp_path, monkeypatch):
+    reels, file = Reels(), tmp_path / "recorded_frames.npy"
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", reels)
+    job, checkpoint = a_job(*BUSY), checkpoint_of(model)
+    write_recorded_frames(scene, checkpoint, job, CPU, file)
+    record = render_edit(scene, checkpoint, job, CPU, files_in(tmp_path), frames_file=file)
+    np.testing.assert_array_equal(reels["it"], busy.reels["it"])
+    assert record["tracks"] == busy.record["tracks"] and record["still_frame"] == busy.record["still_frame"]
+    np.save(file, 255 - np.load(file))
+    render_edit(scene, checkpoint, job, CPU, files_in(tmp_path), frames_file=file)
+    assert (reels["it"] != busy.reels["it"]).any()
 
 
 def test_the_right_half_equals_the_frames_of_the_edited_drive(busy):

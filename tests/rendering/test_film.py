@@ -24,7 +24,7 @@ from drivesplat.io.video import Footage, read_footage, write_video
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rendering.film import BACKDROP, film_size, render_film, render_parts
+from drivesplat.rendering.film import BACKDROP, film_size, render_film, render_parts, write_recorded_frames
 from drivesplat.rendering.frames import film_frame
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
@@ -385,6 +385,42 @@ def test_scene_static_and_dynamic_parts_are_side_by_side(scene, tmp_path, reels)
         some = render_film(scene, checkpoint, job, CPU, tmp_path / "some.mp4")
         np.testing.assert_array_equal(reels["some"], panel)
         assert some["parts"] == parts and "parts" not in some["offset"]
+
+
+@pytest.fixture(scope="module")
+def frames_file(scene, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("frames") / "recorded_frames.npy"
+    write_recorded_frames(scene, checkpoint_of(street_model()), a_format(), CPU, path)
+    return path
+
+
+def test_films_are_the_same_with_frames_rendered_before(scene, tmp_path, reels, frames_file):
+    checkpoint, job = checkpoint_of(street_model()), FilmJob(**a_format().model_dump(), trajectory=TrajectorySettings())
+    render_film(scene, checkpoint, job, CPU, tmp_path / "film.mp4")
+    render_film(scene, checkpoint, job, CPU, tmp_path / "film_of_file.mp4", frames_file)
+    parts_film(scene, tmp_path, checkpoint)
+    render_parts(scene, checkpoint, a_format(), CPU, tmp_path / "parts_of_file.mp4", frames_file)
+    np.testing.assert_array_equal(np.load(frames_file), reels["film"])
+    np.testing.assert_array_equal(reels["film_of_file"], reels["film"])
+    np.testing.assert_array_equal(reels["parts_of_file"], reels["parts"])
+
+
+def test_films_show_the_frames_of_the_file_and_refuse_those_of_another_film(scene, tmp_path, reels, frames_file):
+    frames, path = 255 - np.load(frames_file), tmp_path / "recorded_frames.npy"
+    job = FilmJob(**a_format().model_dump(), trajectory=TrajectorySettings())
+
+    def film_of(content: np.ndarray) -> None:
+        np.save(path, content)
+        render_film(scene, checkpoint_of(street_model()), job, CPU, tmp_path / "film.mp4", path)
+
+    film_of(np.concatenate([frames, frames]))  # of a longer film
+    np.testing.assert_array_equal(reels["film"], frames)
+    for content in (frames[:-1], frames[:, :-2], frames.astype(np.float32)):
+        with pytest.raises(ResultError, match=r"recorded_frames\.npy: contains .* delete it and rerun"):
+            film_of(content)
+    path.write_bytes(frames_file.read_bytes()[:100])
+    with pytest.raises(ResultError, match=r"recorded_frames\.npy: no file of frames"):
+        render_film(scene, checkpoint_of(street_model()), job, CPU, tmp_path / "film.mp4", path)
 
 
 def test_rendering_does_not_run_far_ahead_of_the_encoder(scene, tmp_path, monkeypatch):
