@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
-from scipy.spatial import cKDTree
 
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
@@ -89,6 +88,8 @@ class ScanPool:
             self.intensities += int(both.sum())
         if not self.chamfer:
             return
+        from scipy.spatial import cKDTree  # here: the report imports this module, and scipy takes long
+
         directions = scan.rays.directions().astype(np.float64)
         clouds = [
             directions[rays & there] * ranges[rays & there, None]
