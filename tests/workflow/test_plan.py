@@ -159,6 +159,29 @@ def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
     assert made.evaluation_stages("a1", ["mine"]).keys() == {*of_scene, "actors", "mine/train", "mine/evaluate"}
 
 
+def test_films_of_the_recorded_path_share_its_frames_where_the_settings_say_so():
+    """Those of methods that can be edited."""
+    trajectories = {"original": {}, "aside": {"lateral": 2.0}, "objects": {"parts": "moving"}}
+    render = {"recorded_once": True, "trajectories": trajectories}
+    made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}}, render=render)
+
+    def shared(method: str, **film: str) -> list[str]:
+        return made.recorded_frames(SimpleNamespace(scene="a1", method=method, **film))
+
+    expected = ["elsewhere/a1/mine/recorded_frames.npy"]
+    assert shared("mine") == shared("mine", edit="new") == shared("mine", trajectory="original") == expected
+    assert shared("mine", trajectory="aside") == shared("mine", trajectory="objects") == shared("vanilla") == []
+    made = plan(methods={"mine": {"parts": ACTORS}}, render={"trajectories": trajectories})
+    assert shared("mine") == shared("mine", trajectory="original") == []
+
+
+def test_methods_with_lidar_are_told_without_configs_of_methods_that_do_not_run():
+    made = plan(methods={f"scans{number}": {"overrides": LIDAR} for number in range(3)})
+    before = len(made.config.places)
+    assert {"scans0", "scans1", "scans2"} <= {*made.methods_with_lidar_in_any_scene}
+    assert all(method is None for _, method in [*made.config.places][before:])
+
+
 def test_pictures_and_films_of_scans_are_those_of_methods_that_render_lidar():
     """By the settings of the method, and of the dataset. Films that are left out can be asked for by name, too."""
     methods = {"vanilla": {}, "street": None, "scans": {"overrides": LIDAR}}
