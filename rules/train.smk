@@ -2,7 +2,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/parser.pkl with parser.npz and, of scenes with cameras, masks/masks.json; actors.npz,
 # lidar_depth.npz and scans.npz if the method has actors, is supervised with LiDAR depth, and renders LiDAR; in
-# discovered/ or unlabelled/ where the method has such tracks.
+# discovered/ or unlabelled/ where the method has such tracks; of a block that starts from the one before it
+# (`blocks.init`) parser.npz and checkpoint.npz of that one.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While a training
 # runs, resume/ holds its resume checkpoint; no rule declares it, so that Snakemake does not delete it.
 
@@ -18,6 +19,8 @@ rule train:
         actors=plan.training_input("actors"),
         lidar_depth=plan.training_input("lidar_depth"),
         scans=plan.training_input("scans"),
+        previous_parser=long_drives.previous_parser,
+        previous=long_drives.previous,
     output:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",

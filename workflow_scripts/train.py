@@ -8,7 +8,8 @@ from drivesplat.training.stage import TrainingFiles, read_inputs, run_training
 
 with job(snakemake, dataset=("images",)) as current:
     files = current.input
-    wanted = ([*paths] for paths in (files.masks, files.actors, files.lidar_depth, files.scans))
+    of_scene = files.masks, files.actors, files.lidar_depth, files.scans
+    wanted = ([*paths] for paths in (*of_scene, files.previous_parser, files.previous))
     inputs, upstream = read_inputs(files.parser, *wanted)
     made = TrainingFiles(Path(current.output.checkpoint), Path(current.output.summary))
     provenance = current.provenance(*upstream)

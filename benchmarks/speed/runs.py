@@ -37,8 +37,9 @@ from drivesplat.evaluation.image_metrics import evaluate_groups
 from drivesplat.io.checkpoint_file import load
 from drivesplat.io.storage import read_json
 from drivesplat.machine.device import choose_device, device_name
-from drivesplat.model.build import gaussian_cap, random_subset
+from drivesplat.model.build import gaussian_cap
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
+from drivesplat.model.parameters import random_subset
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View

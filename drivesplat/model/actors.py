@@ -29,6 +29,7 @@ from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import sums_of_squares
 from drivesplat.model.actor_placements import Posed, placement_sets, with_colors, with_placements
 from drivesplat.model.gaussians import Gaussians, concatenate, no_colors
+from drivesplat.model.handover import Handover, are_alike, is_visible, same_track
 from drivesplat.model.harmonics import rotation_of_harmonics_by
 from drivesplat.model.parameters import fade, init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part, PartDefinition, RigidGroup
@@ -220,6 +221,48 @@ class Actors(Part):
         axes = rotation_matrix(normalize(p["quats"], dim=1)) * torch.exp(p["scales"])[:, None]
         excess = (axes.norm(dim=2) / (MAX_SPREAD * reach)).amax(dim=1, keepdim=True)
         p["scales"].sub_(excess.clamp(min=1.0).log())
+
+    @torch.no_grad()
+    def take_over(self, other: Part, handover: Handover) -> None:
+        """Objects of both blocks start from their Gaussians there, in the colours that they had at the last annotation
+        that is in both, and from their corrections. Objects without a common annotation start from their seed."""
+        if not isinstance(other, Actors) or not are_alike(self.params, other.params):
+            return
+        sets = [{name: values.detach() for name, values in self.params.items()}]
+        for i, track in enumerate(self.timeline.tracks):
+            j = other.ids.index(track.id) if track.id in other.ids else None
+            common = [] if j is None else same_track(other.timeline.tracks[j].motion, track.motion, handover)
+            learned = {} if j is None or not common else other._constant_rows(j, common[-1][0])
+            if j is None or not learned or not len(learned["owner"]):
+                continue
+            sets[0] = {name: values[sets[0]["owner"] != i] for name, values in sets[0].items()}
+            sets.append(learned | {"owner": torch.full_like(learned["owner"], i)})
+            self._take_over_track(i, other, j, common)
+        rows = {name: torch.cat([own[name] for own in sets]) for name in sets[0]}
+        self.params = make_parameters(rows)
+        self.cap_max = max(self.cap_max or 0, len(rows["owner"]))
+
+    def _constant_rows(self, i: int, annotation: int) -> dict[str, Tensor]:
+        """The visible Gaussians of a track, in the colours at one of its annotations for all times."""
+        visible = (self.params["owner"] == i) & is_visible(self.params)
+        rows = {name: values.detach()[visible] for name, values in self.params.items()}
+        time = float(self.timeline.tracks[i].motion.times[annotation])
+        series = self.timeline.at(time, rows["sh0"].device).series[i]
+        for name in ("sh0", "shN"):
+            constant = (rows[name] * series[:, None, None]).sum(dim=1, keepdim=True)
+            rows[name] = torch.cat([constant, torch.zeros_like(rows[name][:, 1:])], dim=1)
+        return rows
+
+    def _take_over_track(self, i: int, other: "Actors", j: int, common: Sequence[tuple[int, int]]) -> None:
+        """Starts what `shared` has of track i from what that of another model has of its track j; `common` are the
+        annotations (there, here) of both."""
+        there, here = (torch.tensor(indices) for indices in zip(*common, strict=True))
+        start, other_start = self.timeline.owned[i].start, other.timeline.owned[j].start
+        for name in self._per_annotation:
+            self.shared[name][start + here] = other.shared[name][other_start + there]
+        for name in self._per_track:
+            if self.shared[name].shape[1:] == other.shared[name].shape[1:]:
+                self.shared[name][i] = other.shared[name][j]
 
     @torch.no_grad()
     def broken_tracks(self) -> list[str]:

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from drivesplat.model.gaussians import Gaussians, no_colors
+from drivesplat.model.handover import Handover, are_alike, joined
 from drivesplat.model.parameters import OFFSETS, init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part
 from drivesplat.model.states import IMAGE, State, Want
@@ -48,6 +49,12 @@ class Background(Part):
             *((p["sh0"], p["shN"]) if want.colors else no_colors(p["means"])),
             lidar_logits=p.get("lidar_logits") if want.lidar else None,
         )
+
+    def take_over(self, other: Part, handover: Handover) -> None:
+        if are_alike(self.params, other.params):
+            spacing = torch.exp(self.params["scales"].detach()[:, 0]).numpy() / self._settings.init_scale
+            rows = joined(self.params, handover.shifted(other.params), spacing, handover.cap_max)
+            self.params = make_parameters(rows)
 
     def learning_rates(self) -> dict[str, float]:
         return learning_rates(self._settings, self.extent)

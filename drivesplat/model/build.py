@@ -12,7 +12,7 @@ from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting, drifting_seed
 from drivesplat.model.exposure import Exposures, exposure_nodes
 from drivesplat.model.height_field import HeightField
-from drivesplat.model.parameters import require_rows
+from drivesplat.model.parameters import random_subset, require_rows
 from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.road import EDGE, RoadPart, RoadSeed
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -211,13 +211,6 @@ def split_cap(wanted: Sequence[int], cap: int) -> list[int]:
     left = max(0, cap - int(base.sum()))
     ends = np.cumsum([0, *rest]) * left // max(1, int(rest.sum()))
     return (base + np.diff(ends)).tolist()
-
-
-def random_subset(count: int, limit: int) -> np.ndarray:
-    """Indices of at most `limit` of `count`, in order."""
-    if count <= limit:
-        return np.arange(count)
-    return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
 
 
 def _initial_exposures(init: ModelInit, settings: TrainSettings) -> Exposures | None:

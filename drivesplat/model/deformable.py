@@ -177,6 +177,16 @@ class Deformable(Actors):
         basis = torch.stack([self.basis(state)[self.ids.index(placements[0].source)] for state in states])
         return torch.cat([torch.ones_like(basis[:, :1]), basis], dim=1)
 
+    def _take_over_track(self, i: int, other: Actors, j: int, common: Sequence[tuple[int, int]]) -> None:
+        """As of `Actors`. The gait goes on: what was walked before the first annotation here adds to the phase."""
+        super()._take_over_track(i, other, j, common)
+        assert isinstance(other, Deformable)
+        own, (there, here) = self.timeline.owned[i], common[0]
+        walked = other.timeline.tracks[j].motion.walked(other.timeline.tracks[j].motion.times[[there]])
+        walked = walked - self.timeline.tracks[i].motion.walked(self.timeline.tracks[i].motion.times[[here]])
+        cycles = float(walked[0]) / float(other.cycle_lengths[j])
+        self.shared["phase"][own] += cycles - round(cycles)
+
     def learning_rates(self) -> dict[str, float]:
         own = {"stride": self._gait.lr_stride, "phase": self._gait.lr_phase}
         return {**super().learning_rates(), **own, "lattice": self._lattice.settings.learning_rate}

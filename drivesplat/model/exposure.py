@@ -89,6 +89,18 @@ class Exposures(nn.Module):
         weights = 1.0 - (within - self.nodes).abs() / (self.nodes[1] - self.nodes[0])
         return weights.clamp(min=0.0) @ changing
 
+    @torch.no_grad()
+    def take_over(self, other: "Exposures", seconds: float) -> None:
+        """Starts from other exposures of the same cameras, to whose times `seconds` are added."""
+        for camera in self.params.keys() & other.params.keys():
+            (constants, changing), (others, others_changing) = self._rows(camera), other._rows(camera)
+            if len(constants) == len(others):
+                constants.copy_(others)
+                if camera in self.first:
+                    self.first[camera].copy_(other.first[camera])
+            for row, node in zip(changing, self.nodes - seconds, strict=True):
+                row.copy_(other._log_gains(others_changing, node))
+
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every camera's entry of `params`."""
         return dict.fromkeys(self.params, self._settings.learning_rate)

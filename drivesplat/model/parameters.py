@@ -26,6 +26,8 @@ OFFSETS = {
 """The parameters that a LiDAR adds to others, by the names of these."""
 FADED = 1e-4
 """Opacity of a faded Gaussian, below the threshold at which every strategy removes or relocates it."""
+MIN_VISIBLE = 0.005
+"""Opacity below which every strategy removes or relocates a Gaussian with its default settings."""
 _ROWS = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}
 """The shapes of rows of what all Gaussians have; `shN` for degree 0."""
 
@@ -59,6 +61,13 @@ def init_params(
         **({} if lidar_logits is None else {"lidar_logits": _isotropic(count, lidar_logits)}),
         **({name: torch.zeros_like(geometry[of]) for of, name in OFFSETS.items()} if offsets else {}),
     }
+
+
+def random_subset(count: int, limit: int) -> np.ndarray:
+    """Indices of at most `limit` of `count`, in order."""
+    if count <= limit:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
 
 
 def _isotropic(count: int, logits: tuple[float, float]) -> Tensor:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.handover import Handover
 from drivesplat.model.states import IMAGE, ActorPlacement, State, Want
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
@@ -133,6 +134,10 @@ class Part(nn.Module, ABC):
 
     def confine(self) -> None:
         """Fades Gaussians at places where this part must not have any; may move others back to where they belong."""
+
+    def take_over(self, other: "Part", handover: Handover) -> None:
+        """Starts, before a training, from what a part of this kind has learned in the block before. A part that can
+        start from nothing else than its seed, as this one, does nothing."""
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """The mask of a track's rows; None where this part does not know the track as an object."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from drivesplat.model.gaussians import Gaussians, no_colors
+from drivesplat.model.handover import Handover, are_alike, joined
 from drivesplat.model.height_field import HeightField, bilinear
 from drivesplat.model.parameters import fade, init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part
@@ -110,6 +111,15 @@ class RoadPart(Part):
             *((p["sh0"], p["shN"]) if want.colors else no_colors(p["means"])),
             lidar_logits=p.get("lidar_logits") if want.lidar else None,
         )
+
+    def take_over(self, other: Part, handover: Handover) -> None:
+        if are_alike(self.params, other.params):
+            spacing = torch.exp(self.params["scales"].detach()[:, 0]).numpy() / INIT_SCALE
+            learned = handover.shifted(other.params)
+            on_road = self.surface.covers(learned["means"][:, :2])
+            learned = {name: values[on_road] for name, values in learned.items()}
+            self.params = make_parameters(joined(self.params, learned, spacing, self.row_count))
+            self.confine()
 
     def learning_rates(self) -> dict[str, float]:
         return learning_rates(self._settings, self.extent)

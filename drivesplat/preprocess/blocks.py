@@ -52,8 +52,15 @@ def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
         blocks.append(Block(core, used, places[anchors[owners == number]]))
     whole, thinned = Blocks(scene.name, tuple(blocks)), _without_crowds(scene, job.holdout)
     digests = [_digest(_scene_of(thinned, whole, number, job.holdout)) for number in range(len(blocks))]
-    pairs = zip(blocks, digests, strict=True)
-    return replace(whole, blocks=tuple(replace(block, digest=digest) for block, digest in pairs))
+    previous = [_previous(whole, block) for block in blocks]
+    known = zip(blocks, digests, previous, strict=True)
+    return replace(whole, blocks=tuple(replace(own, digest=digest, previous=before) for own, digest, before in known))
+
+
+def _previous(blocks: Blocks, block: Block) -> int | None:
+    """See `Block.previous`."""
+    before = int(block.core[0, 0]) - 1
+    return blocks.at(before) if within(np.array([before]), block.used).any() else None
 
 
 def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSettings) -> Scene:

@@ -22,12 +22,15 @@ class Block:
     """A stretch of a drive's path. The vehicle is in it during the `core` intervals [first, end) of microseconds; its
     scene has the recordings of the `used` intervals, which reach into the blocks before and after. `path` (n, 2) are
     places of the vehicle about a metre apart, in metres of the drive's world, and `digest` is that of its recordings.
+    `previous` is the number of the block from which the vehicle comes into it for the first time, if the two share
+    recordings: None for the first one, behind a jump, and without an overlap.
     """
 
     core: Int64[np.ndarray, "c 2"]
     used: Int64[np.ndarray, "u 2"]
     path: Float64[np.ndarray, "n 2"]
     digest: str = ""
+    previous: int | None = None
 
     @property
     def origin(self) -> Float64[np.ndarray, "3"]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -33,6 +33,9 @@ class CutSettings(Settings):
 
 
 class BlockSettings(CutSettings):
+    init: Literal["alone", "previous"] = "alone"
+    """:printed: What the training of a block starts from: 'alone' from its seed points, 'previous' from the trained
+    Gaussians of the block before it. Blocks are then trained one after another (docs/long_drives.md)."""
     leave_out: tuple[int | str, ...] = ()
     """:printed: Blocks without which the results of the drive are made, such as those whose training fails, by number:
     [3]. Where the dataset has several scenes, by name: ["commute.003"]. docs/long_drives.md"""

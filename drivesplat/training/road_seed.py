@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from drivesplat.kernels.road_distance import Road
 from drivesplat.kernels.sparse_grid import dilated
-from drivesplat.model.build import random_subset
 from drivesplat.model.height_field import HeightField
+from drivesplat.model.parameters import random_subset
 from drivesplat.model.road import EDGE, RoadSeed, in_layer
 from drivesplat.scene.training_record import TrainingRecord
 

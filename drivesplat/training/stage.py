@@ -34,6 +34,7 @@ from drivesplat.training import resume_state
 from drivesplat.training.augmentation import choose_mirrored, dropout_share
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
+from drivesplat.training.previous_block import PreviousBlock, read_previous, start_from
 from drivesplat.training.probes import MAX_OF_GROUP, NO_PROBES, CurveImage, Probes, evenly_spaced
 from drivesplat.training.road import road_of
 from drivesplat.training.road_seed import in_layer_of, road_seed
@@ -48,7 +49,8 @@ class TrainingInputs:
     """The inputs of a training: the training record, the folder of masks (None: there are no images), the records of
     actors and of LiDAR depth (empty where the method does not use them), the number of semantic `classes` in the user's
     maps (0: none), the cameras that see the ego vehicle, `sky_known` (False where no sky was found, so that sky masks
-    say nothing), and the LiDAR scans of the training split (empty where the method does not render LiDAR)."""
+    say nothing), the LiDAR scans of the training split (empty where the method does not render LiDAR), and the
+    `previous` block of a long drive, from which the training starts (None: from seed points)."""
 
     record: TrainingRecord
     masks: Path | None
@@ -58,6 +60,7 @@ class TrainingInputs:
     cameras_with_ego: frozenset[str] = frozenset()
     sky_known: bool = True
     scans: list[RecordedScan] = dataclasses.field(default_factory=list)
+    previous: PreviousBlock | None = None
 
     def supervision(self, job: TrainJob) -> Supervision:
         """The supervision of the training images that `job` uses."""
@@ -117,14 +120,17 @@ def read_inputs(
     actors: Sequence[str],
     lidar_depth: Sequence[str],
     scans: Sequence[str] = (),
+    previous_parser: Sequence[str] = (),
+    previous: Sequence[str] = (),
 ) -> tuple[TrainingInputs, list[Provenance]]:
-    """Reads the inputs of a training from the files of the parser and, where given, of masks, actors, LiDAR depth and
-    scans; returns them with the provenances of these files."""
+    """Reads the inputs of a training from the files of the parser and, where given, of masks, actors, LiDAR depth,
+    scans, and the parser and the training of the block before; returns them with the provenances of these files."""
     record, folder = read_training_record(parser), next((Path(path).parent for path in masks), None)
     made = NO_MASKS if folder is None else read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
     revolutions = [read_scans(path) for path in scans]
+    before = read_previous(previous_parser, previous)
     inputs = TrainingInputs(
         record,
         folder,
@@ -134,8 +140,9 @@ def read_inputs(
         frozenset(made.own_car),
         made.sky_known,
         [scan for it in revolutions for scan in it.of_group("train")],
+        before,
     )
-    others = (*moving, *depths, *revolutions)
+    others = (*moving, *depths, *revolutions, *([] if before is None else [before.checkpoint]))
     upstream = [record.provenance, *([] if folder is None else [made.provenance]), *(it.provenance for it in others)]
     return inputs, upstream
 
@@ -205,6 +212,8 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     if job.train.scans.per_image and not scans:
         raise TrainingError("no LiDAR scan is there to train with; set train.scans.per_image to 0")
     model = build_model(init, job.parts, job.sky, settings)
+    if inputs.previous is not None:
+        start_from(model, inputs.record, inputs.previous, settings.cap_max)
     choose_mirrored(model, record, settings)
     return Prepared(model, views, settings, road, curves, scans)
 

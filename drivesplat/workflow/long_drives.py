@@ -67,6 +67,33 @@ class LongDrives:
 
         return of_blocks
 
+    def previous(self, wildcards: Any) -> list[str]:
+        """The checkpoint that the training of a job starts from, that of the same method in the block before: none
+        for a scene that is no block, for blocks that are trained alone, behind a block that is left out, and for a
+        block that has none before it (`Block.previous`)."""
+        before = self._scene_before(wildcards.scene)
+        if before is None:
+            return []
+        return [f"{self._plan.config.results_dir}/{before}/{wildcards.method}/checkpoint.npz"]
+
+    def previous_parser(self, wildcards: Any) -> list[str]:
+        """The training record of the block that `previous` names."""
+        before = self._scene_before(wildcards.scene)
+        if before is None:
+            return []
+        return [self._plan.of_tracks("parser.npz")(SimpleNamespace(scene=before, method=wildcards.method))]
+
+    def _scene_before(self, scene: str) -> str | None:
+        """The block whose model the training of a scene starts from."""
+        config, drive = self._plan.config, drive_of(scene)
+        settings = config.datasets[config.dataset_of(scene)].blocks if config.is_block(scene) else None
+        if settings is None or settings.init == "alone":
+            return None
+        self._blocks_file(drive)
+        number = self._block(scene).get("previous")
+        left_out = number is not None and number not in _kept(config, drive, len(self._blocks(drive)))
+        return None if number is None or left_out else block_scene_name(drive, number)
+
     def _block(self, scene: str) -> dict[str, Any]:
         drive, number = drive_of(scene), int(scene.rpartition(".")[2])
         blocks = self._blocks(drive)
