@@ -5,7 +5,6 @@ starts from the Gaussians that the stretch before it has learned, and only place
 points.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,13 +12,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
-from torch import Tensor
+from torch import Tensor, nn
 
 from drivesplat.model.parameters import MIN_VISIBLE, random_subset
 from drivesplat.trajectories.motion import Motion
 
 SAME_TIME = 1e-4
 """Seconds between annotations of the same time."""
+Rows = nn.ParameterDict | dict[str, Tensor]
+"""Parameters of Gaussians, a row each."""
 EQUALLY_NEAR = 0.01
 """Metres within which a place is equally near to both paths, which are the same where the blocks overlap."""
 SAME_POSE = 0.5
@@ -42,7 +43,7 @@ class Handover:
     def _paths(self) -> tuple[cKDTree, cKDTree]:
         return cKDTree(self.before), cKDTree(self.here)
 
-    def shifted(self, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def shifted(self, params: Rows) -> dict[str, Tensor]:
         """Static Gaussians of the block before, moved into this world: those that are visible and that lie at least as
         near to this block's path as to the path before."""
         rows = {name: values.detach() for name, values in params.items()}
@@ -53,20 +54,18 @@ class Handover:
         return {name: values[chosen] for name, values in rows.items()}
 
 
-def is_visible(params: Mapping[str, Tensor]) -> Bool[Tensor, " n"]:
+def is_visible(params: Rows) -> Bool[Tensor, " n"]:
     """Whether Gaussians are opaque enough to be kept by densification."""
     return torch.sigmoid(params["opacities"].detach()) > MIN_VISIBLE
 
 
-def are_alike(own: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
+def are_alike(own: Rows, other: Rows) -> bool:
     """Whether Gaussians have the same parameters, with rows of the same shape."""
     shapes = ({name: values.shape[1:] for name, values in params.items()} for params in (own, other))
     return next(shapes) == next(shapes)
 
 
-def joined(
-    seeds: Mapping[str, Tensor], learned: Mapping[str, Tensor], spacing: Float[np.ndarray, " n"], limit: int
-) -> dict[str, Tensor]:
+def joined(seeds: Rows, learned: dict[str, Tensor], spacing: Float[np.ndarray, " n"], limit: int) -> dict[str, Tensor]:
     """The rows of `learned` Gaussians, then those `seeds` that are farther from all of them than their `spacing`
     (metres) from other seeds, so that no place has both; at most `limit` in all, random ones of the seeds first."""
     kept = random_subset(len(learned["means"]), limit)

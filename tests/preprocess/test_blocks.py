@@ -1,6 +1,7 @@
 """Long drives cut into blocks: by length of path, at places passed again, at jumps; and the scenes of blocks."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -123,6 +124,26 @@ def test_a_jump_ends_a_block_and_nothing_overlaps_it():
     blocks = cut(scene)
     assert owners(blocks, scene) == [0, 1]
     assert [block.used.tolist() for block in blocks.blocks] == [block.core.tolist() for block in blocks.blocks]
+
+
+def previous(blocks: Blocks) -> list[int | None]:
+    return [block.previous for block in blocks.blocks]
+
+
+def test_the_previous_block_is_the_one_that_the_vehicle_comes_from_and_shares_recordings_with():
+    assert previous(cut(drive_along(straight(400)))) == [None, 0, 1, 2]
+    assert previous(cut(drive_along(straight(400)), overlap_m=0.0)) == [None] * 4, "they share nothing"
+    jumped = np.concatenate([straight(170), straight(5170, start=5000.0)])
+    assert previous(cut(drive_along(jumped))) == [None, 0, None, 2]
+    assert previous(cut(drive_along(square(1.98)))) == [None, 0, 1, 2], "what was driven before is no further block"
+
+
+def test_behind_a_street_that_was_driven_before_the_previous_block_is_that_of_the_street():
+    corners = np.array([[0, 0], [200, 0], [200, 100], [0, 100], [0, 0], [50, 0], [50, -200]])
+    legs = [np.linspace(a, b, int(np.abs(b - a).sum()), endpoint=False) for a, b in pairwise(corners)]
+    scene = drive_along(np.concatenate(legs))
+    blocks = cut(scene)
+    assert owners(blocks, scene) == [0, 1, 2, 3, 4, 5, 0, 6, 7] and previous(blocks) == [None, 0, 1, 2, 3, 4, 0, 6]
 
 
 def test_a_gap_in_the_path_leaves_out_no_number():

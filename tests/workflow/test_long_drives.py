@@ -73,6 +73,30 @@ def test_the_files_of_blocks_follow_from_the_record_of_the_drive(drives):
         drives.inputs_of_block(at("way.0001"))
 
 
+def starts(tmp_path, **blocks) -> list[list[str]]:
+    """What the trainings of five blocks start from: block 4 is reached from block 1, and block 3 behind a jump."""
+    path = tmp_path / "blocks.json"
+    before = [None, 0, 1, None, 1]
+    path.write_text(json.dumps({"blocks": [{"digest": str(i), "previous": own} for i, own in enumerate(before)]}))
+    made = plan(cut={**CUT, "blocks": {**BLOCKS, **blocks}})
+    drives = LongDrives(made, {"way": str(path)}.__getitem__)
+    assert drives.previous(at("0001")) == drives.previous_parser(at("0001")) == []
+    found = [(drives.previous(at(f"way.00{i}")), drives.previous_parser(at(f"way.00{i}"))) for i in range(5)]
+    assert all(len(checkpoint) == len(parser) for checkpoint, parser in found)
+    return [[*checkpoint, *parser] for checkpoint, parser in found]
+
+
+def test_blocks_start_from_the_block_that_the_vehicle_comes_from(tmp_path):
+    assert starts(tmp_path) == [[]] * 5, "by default each is trained alone"
+    of = {i: [f"there/way.00{i}/vanilla/checkpoint.npz", f"there/way.00{i}/parser.npz"] for i in range(5)}
+    assert starts(tmp_path, init="previous") == [[], of[0], of[1], [], of[1]]
+    assert starts(tmp_path, init="previous", leave_out=[1]) == [[], of[0], [], [], []]
+    settings = [plan(cut={**CUT, "blocks": {**BLOCKS, "init": init}}) for init in ("alone", "previous")]
+    for stage in ("blocks", "block", "evaluate_blocks", "train"):
+        before, after = (made.stage_settings(stage, "way.001", "vanilla") for made in settings)
+        assert before == after, "blocks without one before them keep their training"
+
+
 @pytest.mark.parametrize(
     "path", [["masks", "masks.json"], ["vanilla", "splat.ply"], ["vanilla", "edits", "gone.mp4"], ["seed.ply"]]
 )
