@@ -1,4 +1,4 @@
-"""What a block takes over from the block before: where its static Gaussians are, its objects, road, sky and exposures."""
+"""What a block takes over from the block before: static Gaussians by place, objects, the road, and exposures."""
 
 from dataclasses import replace
 
