@@ -67,15 +67,13 @@ def are_alike(own: Rows, other: Rows) -> bool:
 
 def joined(seeds: Rows, learned: dict[str, Tensor], spacing: Float[np.ndarray, " n"], limit: int) -> dict[str, Tensor]:
     """The rows of `learned` Gaussians, then those `seeds` that are farther from all of them than their `spacing`
-    (metres) from other seeds, so that no place has both; at most `limit` in all, random ones of the seeds first."""
-    kept = random_subset(len(learned["means"]), limit)
-    found = {name: values[torch.from_numpy(kept)] for name, values in learned.items()}
+    (metres) from other seeds, so that no place has both; random `limit` of them where there are more."""
     apart = np.full(len(spacing), np.inf)
-    if len(kept):
-        apart = cKDTree(found["means"].numpy()).query(seeds["means"].detach().numpy(), workers=-1)[0]
-    free = np.flatnonzero(apart > spacing)
-    free = torch.from_numpy(free[random_subset(len(free), limit - len(kept))])
-    return {name: torch.cat([values, seeds[name].detach()[free]]) for name, values in found.items()}
+    if len(learned["means"]):
+        apart = cKDTree(learned["means"].numpy()).query(seeds["means"].detach().numpy(), workers=-1)[0]
+    free = torch.from_numpy(np.flatnonzero(apart > spacing))
+    kept = torch.from_numpy(random_subset(len(learned["means"]) + len(free), limit))
+    return {name: torch.cat([values, seeds[name].detach()[free]])[kept] for name, values in learned.items()}
 
 
 def same_track(before: Motion, here: Motion, handover: Handover) -> list[tuple[int, int]]:

@@ -59,8 +59,8 @@ def test_no_place_has_a_seed_and_a_learned_gaussian():
     spacing = np.array([0.5, 0.5, 10.0])
     assert joined(seeds, learned, spacing, 9)["row"].tolist() == [10, 11, 1], "sparse seeds are far from each other"
     assert joined(seeds, learned, np.zeros(3), 9)["row"].tolist() == [10, 11, 0, 1, 2]
-    assert joined(seeds, learned, np.zeros(3), 3)["row"].tolist()[:2] == [10, 11]
-    assert len(joined(seeds, learned, np.zeros(3), 1)["row"]) == 1
+    fewer = joined(seeds, learned, np.zeros(3), 3)["row"].tolist()
+    assert len(fewer) == 3 and {*fewer} < {10, 11, 0, 1, 2}
     nothing = {name: values[:0] for name, values in learned.items()}
     assert joined(seeds, nothing, spacing, 9)["row"].tolist() == [0, 1, 2]
 
