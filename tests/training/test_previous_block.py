@@ -1,4 +1,4 @@
-"""A training that starts from the trained model of the block before: how both blocks are related, what it takes over."""
+"""A training that starts from the trained model of the block before: how both are related, and what it takes over."""
 
 import dataclasses
 import logging
