@@ -157,7 +157,7 @@ def test_blocks_that_start_from_the_one_before_are_trained_in_turn(copy):
     before, cut = trained(copy), copy.config["datasets"]["nuscenes"]
     blocks = {**cut["blocks"], "init": "previous"}
     with copy.set_to(datasets={"nuscenes": {**cut, "blocks": blocks}}):
-        assert copy.planned(TARGETS[0])["train"] == 3, "all but the first one"
+        assert copy.planned(TARGETS[0])["train"] == len(before) - 1, "all but the first one"
         done = copy.run(TARGETS[0])
         assert done.returncode == 0, done.stdout
         in_turn = trained(copy)
@@ -170,7 +170,7 @@ def test_blocks_that_start_from_the_one_before_are_trained_in_turn(copy):
             )
         assert copy.planned(TARGETS[0]) == {}
         (copy.folder / "results/0001.002/vanilla/checkpoint.npz").unlink()
-        assert copy.planned(TARGETS[0])["train"] == 2, "a block and the one behind it"
+        assert copy.planned(TARGETS[0])["train"] == len(before) - 2, "those behind it"
         write_world(copy.folder / "data", world(32))
         copy.run(TARGETS[0])
         after = trained(copy)
