@@ -153,29 +153,6 @@ def test_a_longer_drive_trains_its_last_block_and_new_ones_alone(copy):
     assert copy.read("results/0001/metrics.json")["protocol"]["held_out_frames"]["extrapolation"] == [23]
 
 
-def test_blocks_that_start_from_the_one_before_are_trained_in_turn(copy):
-    before, cut = trained(copy), copy.config["datasets"]["nuscenes"]
-    blocks = {**cut["blocks"], "init": "previous"}
-    with copy.set_to(datasets={"nuscenes": {**cut, "blocks": blocks}}):
-        assert copy.planned(TARGETS[0])["train"] == len(before) - 1, "all but the first one"
-        done = copy.run(TARGETS[0])
-        assert done.returncode == 0, done.stdout
-        in_turn = trained(copy)
-        assert in_turn["0001.000"] == before["0001.000"] and [*in_turn.values()] == sorted(in_turn.values())
-        log = (copy.folder / "results/logs/0001.001/vanilla/train.log").read_text()
-        assert "with those of the block before" in log
-        with copy.set_to(datasets={"nuscenes": {**cut, "blocks": {**blocks, "leave_out": [1]}}}):
-            assert copy.planned(TARGETS[0])["train"] == len(before) - 2, "those behind it"
-        assert copy.planned(TARGETS[0]) == {}
-        (copy.folder / "results/0001.002/vanilla/checkpoint.npz").unlink()
-        assert copy.planned(TARGETS[0])["train"] == len(before) - 2, "those behind it"
-        write_world(copy.folder / "data", world(32))
-        copy.run(TARGETS[0])
-        after = trained(copy)
-        assert [name for name in in_turn if after[name] == in_turn[name]] == ["0001.000", "0001.001"]
-        assert len(after) == 5
-
-
 def test_results_of_one_block_are_refused_for_the_drive_in_a_sentence(copy):
     result = copy.run("results/0001/vanilla/splat.ply")
     assert "ask for results/0001.000/vanilla/splat.ply; its blocks are 0001.000 to 0001.00" in result.stdout
@@ -215,3 +192,26 @@ def test_a_drive_that_is_extracted_by_other_code_keeps_its_blocks_and_its_figure
     assert copy.run("report").returncode == 0
     report = copy.read("results/gap_report.json")
     assert [row["scene"] for row in report["rows"]] == ["0001"]
+
+
+def test_blocks_that_start_from_the_one_before_are_trained_in_turn(copy):
+    before, cut = trained(copy), copy.config["datasets"]["nuscenes"]
+    blocks = {**cut["blocks"], "init": "previous"}
+    with copy.set_to(datasets={"nuscenes": {**cut, "blocks": blocks}}):
+        assert copy.planned(TARGETS[0])["train"] == len(before) - 1, "all but the first one"
+        done = copy.run(TARGETS[0])
+        assert done.returncode == 0, done.stdout
+        in_turn = trained(copy)
+        assert in_turn["0001.000"] == before["0001.000"] and [*in_turn.values()] == sorted(in_turn.values())
+        log = (copy.folder / "results/logs/0001.001/vanilla/train.log").read_text()
+        assert "with those of the block before" in log
+        with copy.set_to(datasets={"nuscenes": {**cut, "blocks": {**blocks, "leave_out": [1]}}}):
+            assert copy.planned(TARGETS[0])["train"] == len(before) - 2, "those behind it"
+        assert copy.planned(TARGETS[0]) == {}
+        (copy.folder / "results/0001.002/vanilla/checkpoint.npz").unlink()
+        assert copy.planned(TARGETS[0])["train"] == len(before) - 2, "those behind it"
+        write_world(copy.folder / "data", world(32))
+        copy.run(TARGETS[0])
+        after = trained(copy)
+        assert [name for name in in_turn if after[name] == in_turn[name]] == ["0001.000", "0001.001"]
+        assert len(after) == 5
