@@ -129,7 +129,11 @@ class RegionMetrics:
         regions: Iterable[str] = REGIONS,
         device: torch.device | None = None,
     ):
-        self._lpips_map, self._with_lpips, self._device = lpips_map, lpips_map is not None, device or torch.device("cpu")
+        self._lpips_map, self._with_lpips, self._device = (
+            lpips_map,
+            lpips_map is not None,
+            device or torch.device("cpu"),
+        )
         self._frames: dict[str, list[FrameErrors]] = {region: [] for region in regions}
 
     def measure(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> dict[str, FrameErrors]:
