@@ -4,8 +4,6 @@ drivesplat serve results/ --address 127.0.0.1:50051
 """
 
 import argparse
-import ctypes
-import os
 import signal
 import threading
 from pathlib import Path
@@ -15,12 +13,6 @@ import drivesplat
 from drivesplat.errors import RequestError
 
 COMMAND = "serve"
-M_MMAP_THRESHOLD = -3
-"""The parameter of `mallopt` (malloc.h of glibc)."""
-MAPPED_BYTES = 1 << 16
-"""Allocations of at least this size get pages of their own, which freeing gives back."""
-OF_USERS = ("MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
-"""Environment variables by which users set the allocator of glibc themselves."""
 
 
 def add_parser(commands: Any) -> None:
@@ -61,7 +53,6 @@ def run_serve(parsed: argparse.Namespace) -> int:
     """Serves until SIGINT or SIGTERM, and then ends when all calls have been answered. Returns the exit status."""
     if (parsed.tls_cert is None) != (parsed.tls_key is None):
         raise RequestError("--tls-cert and --tls-key belong together: give both, or neither")
-    limit_fragmentation()
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -79,14 +70,3 @@ def run_serve(parsed: argparse.Namespace) -> int:
     print("drivesplat serve: ending when all calls have been answered", flush=True)
     server.close()
     return 0
-
-
-def limit_fragmentation() -> bool:
-    """Has glibc map allocations of MAPPED_BYTES and more, unless the environment sets its allocator: on the heap,
-    requests that all differ leave gaps, and memory grows. Returns whether it does; False with other C libraries."""
-    if any(name in os.environ for name in OF_USERS):
-        return False
-    try:
-        return ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, MAPPED_BYTES) == 1
-    except (AttributeError, OSError, TypeError):
-        return False

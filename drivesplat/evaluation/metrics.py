@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from drivesplat.errors import ResultError
-from drivesplat.evaluation.gpu_metrics import gpu_error_sums
 from drivesplat.kernels.color_difference import C1, C2, window_taps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.scene.regions import REGIONS
@@ -98,6 +99,55 @@ def error_maps(image: np.ndarray, truth: np.ndarray, everything: np.ndarray) -> 
     image, truth = image.clip(0.0, 1.0).astype(np.float64), truth.astype(np.float64)
     corrected = color_corrected(image, truth, everything)
     return [*(channel_mean((values - truth) ** 2) for values in (image, corrected)), ssim_map(image, truth)]
+
+
+@torch.no_grad()
+def gpu_error_sums(
+    image: Float[np.ndarray, "h w 3"],
+    truth: Float[np.ndarray, "h w 3"],
+    everything: Bool[np.ndarray, "h w"],
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    device: torch.device,
+) -> list[list[float]]:
+    """The sums of the maps of `error_maps` over each of `masks`, computed and added on `device`."""
+    found = torch.from_numpy(image).to(device).double().clamp(0.0, 1.0)
+    true = torch.from_numpy(truth).to(device).double()
+    corrected = _color_corrected_there(found, true, torch.from_numpy(everything).to(device))
+    errors = [(values - true).square().mean(dim=2) for values in (found, corrected)]
+    maps = torch.stack([*errors, _ssim_map_there(found, true)], dim=-1).reshape(-1, len(errors) + 1)
+    weights = torch.from_numpy(np.stack(masks)).to(device).flatten(1).double()
+    return (weights @ maps).tolist()
+
+
+def _color_corrected_there(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    rows = torch.cat([image, torch.ones_like(image[..., :1])], dim=2).flatten(0, 1)
+    weighted = (rows * mask.flatten()[:, None]).mT
+    normal, right = ((weighted @ values).cpu().numpy() for values in (rows, truth.flatten(0, 1)))
+    affine = torch.from_numpy(np.linalg.lstsq(normal, right, rcond=None)[0]).to(image)
+    return (image @ affine[:3] + affine[3]).clamp(0.0, 1.0)
+
+
+def _ssim_map_there(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    x, y = (values.permute(2, 0, 1).float() - 0.5 for values in (image, truth))
+    mean_x, mean_y, square_x, square_y, product = _windowed_there(torch.stack([x, y, x * x, y * y, x * y]))
+    variances = square_x - mean_x * mean_x + square_y - mean_y * mean_y
+    covariance = product - mean_x * mean_y
+    mean_x, mean_y = mean_x + 0.5, mean_y + 0.5
+    luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
+    return (luminance * (2.0 * covariance + C2) / (variances + C2)).mean(dim=0)
+
+
+def _windowed_there(values: Float[Tensor, "k c h w"]) -> Float[Tensor, "k c h w"]:
+    """Local means, reflected at the borders. Sums of shifted images: convolutions may round to TF32."""
+    taps = window_taps().ravel().tolist()
+    for dim in (2, 3):
+        size, reach = values.shape[dim], len(taps) // 2
+        reflected = torch.from_numpy(np.pad(np.arange(size), reach, mode="symmetric")).to(values.device)
+        padded = values.index_select(dim, reflected)
+        values = sum((tap * padded.narrow(dim, i, size) for i, tap in enumerate(taps)), torch.zeros_like(values))
+    return values
 
 
 class FrameErrors(NamedTuple):

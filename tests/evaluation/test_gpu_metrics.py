@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesplat.evaluation.gpu_metrics import gpu_error_sums
-from drivesplat.evaluation.metrics import RegionMetrics, error_maps
+from drivesplat.evaluation.metrics import RegionMetrics, error_maps, gpu_error_sums
 
 
 def pair(h: int, w: int) -> tuple[np.ndarray, np.ndarray]:
