@@ -75,10 +75,10 @@ class RecordedDrive:
     @cached_property
     def front_camera(self) -> str:
         """The camera that looks ahead the most, the first of equal ones. Raises RequestError without cameras."""
-        ahead = {name: round(float(self.first_image(name)[1].camera_to_ego[0, 2]), 1) for name in self.cameras}
-        if not ahead:
+        camera = self.scene.front_camera(self.cameras)
+        if camera is None:
             raise RequestError(f"{self.where} has no camera")
-        return max(ahead, key=ahead.__getitem__)
+        return camera
 
     @cached_property
     def lidars(self) -> list[str]:

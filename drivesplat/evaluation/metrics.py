@@ -64,9 +64,15 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     means = mean_x, mean_y = _windowed(x), _windowed(y)
     var_x, var_y = (_windowed(values * values) - mean * mean for values, mean in zip((x, y), means, strict=True))
     covariance = _windowed(x * y) - mean_x * mean_y
+    return channel_mean(_similarity(mean_x, mean_y, var_x + var_y, covariance))
+
+
+def _similarity(mean_x: Any, mean_y: Any, variances: Any, covariance: Any) -> Any:
+    """Structural similarity from local moments of two images about 0.5: means, the sum of both variances, and the
+    covariance; arrays or tensors."""
     mean_x, mean_y = mean_x + 0.5, mean_y + 0.5
     luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
-    return channel_mean(luminance * (2.0 * covariance + C2) / (var_x + var_y + C2))
+    return luminance * (2.0 * covariance + C2) / (variances + C2)
 
 
 def _windowed(values: np.ndarray) -> np.ndarray:
@@ -133,10 +139,7 @@ def _ssim_map_there(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
     x, y = (values.permute(2, 0, 1).float() - 0.5 for values in (image, truth))
     mean_x, mean_y, square_x, square_y, product = _windowed_there(torch.stack([x, y, x * x, y * y, x * y]))
     variances = square_x - mean_x * mean_x + square_y - mean_y * mean_y
-    covariance = product - mean_x * mean_y
-    mean_x, mean_y = mean_x + 0.5, mean_y + 0.5
-    luminance = (2.0 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
-    return (luminance * (2.0 * covariance + C2) / (variances + C2)).mean(dim=0)
+    return _similarity(mean_x, mean_y, variances, product - mean_x * mean_y).mean(dim=0)
 
 
 def _windowed_there(values: Float[Tensor, "k c h w"]) -> Float[Tensor, "k c h w"]:

@@ -6,6 +6,7 @@ coordinates at pixel centres), in pixels of the recorded image. Object: x forwar
 Ego: x forward, y left, z up, on the ground under the rear axle. Timestamps: microseconds.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -144,6 +145,11 @@ class Scene:
     def track(self, track_id: str) -> Track | None:
         """The track with this id; None if there is none."""
         return next((track for track in self.tracks if track.id == track_id), None)
+
+    def front_camera(self, cameras: Sequence[str]) -> str | None:
+        """Which of `cameras` looks ahead the most, the first of equal ones; None without any."""
+        ahead = {frame.camera: round(float(frame.camera_to_ego[0, 2]), 1) for frame in self.frames}
+        return max(cameras, key=ahead.__getitem__, default=None)
 
     def key_frames(self, camera: str) -> list[int]:
         """The indices in `frames` of the key frames of `camera`."""

@@ -40,12 +40,11 @@ def needed_settings(chosen: ChosenScene, checked: CheckedScene, outline: Outline
     `memory_gb` is the memory of the device that trains."""
     scene = checked.whole
     cameras = [camera.name for camera in scene.cameras if scene.key_frames(camera.name)]
-    ahead = {frame.camera: round(float(frame.camera_to_ego[0, 2]), 1) for frame in scene.frames}
     shipped = {"nuscenes": {"batch": False}} if chosen.dataset == DATASET else {}
     settings: dict[str, Any] = {
         "datasets": shipped | {chosen.dataset: _dataset(chosen)},
         "cameras": cameras,
-        "eval_camera": max(cameras, key=ahead.__getitem__) if cameras else None,
+        "eval_camera": scene.front_camera(cameras),
     }
     if not cameras:
         of_lidar = read_yaml(of_the_workflow(LIDAR_ALONE), "preset") or {}
