@@ -8,6 +8,7 @@ from drivesplat.io.storage import canonical_json
 from drivesplat.settings.report import HELD_OUT_PAIR, LIDAR_LOOKS, LOOKS, ReportJob
 from drivesplat.workflow.film_names import FILM_PAGE
 from drivesplat.workflow.outputs import Outputs
+from drivesplat.workflow.runs_file import RUNS
 from drivesplat.workflow.without_cameras import has_cameras
 
 EVERYTHING = "all"
@@ -18,7 +19,8 @@ REPORT_FILES = ("gap_report.html", "gap_report.json", "gap_report.csv", "ghosts.
 
 class ReportPlan:
     """The report of a `plan` for some `targets`: of all scenes, or of the measured ones where it is the only target. It
-    shows the pictures and names the films that exist, where everything is a target all of them.
+    shows the pictures and names the films that exist, where everything is a target all of them. Runs that are targets
+    beside it are in its table, too.
 
     The inputs and settings are functions of wildcards: Snakemake calls them only if the report is to be made.
     """
@@ -29,6 +31,7 @@ class ReportPlan:
         names = {*REPORT_RULES, *(f"{self._results}/{name}" for name in REPORT_FILES)}
         self._alone = bool(targets) and set(targets) <= names
         self._everything = not targets or EVERYTHING in targets
+        self._targets = frozenset(targets)
         self.wanted = self._everything or bool(set(targets) & names)
 
     @property
@@ -61,8 +64,9 @@ class ReportPlan:
         return [*_chosen(with_figures, not self._alone), *_chosen(looks, self._everything)]
 
     def runs(self, _: Any = None) -> list[str]:
-        """The records of runs in its scenes."""
-        return _chosen(self._plan.runs(scenes=self.scenes), self._everything)
+        """The records of runs in its scenes, those that are targets beside the report included."""
+        every = self._everything or RUNS in self._targets
+        return [file for file in self._plan.runs(scenes=self.scenes) if file in self._targets or _chosen([file], every)]
 
     def links(self, _: Any = None) -> list[str]:
         """The files that its page links to: films, pages of films, edits and viewers, in an order that does not depend

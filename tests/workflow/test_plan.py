@@ -348,6 +348,15 @@ def test_a_report_asked_for_alone_is_of_what_is_there(tmp_path):
     assert {Path(link).name for link in made.report([]).links()} >= {"original.mp4", "parts.mp4", "viewer.html"}
 
 
+def test_a_report_has_the_runs_that_are_asked_for_with_it(tmp_path):
+    runs = tmp_path / "runs.yaml"
+    runs.write_text("runs: {fast: {policy: constant_speed}, slow: {policy: recorded}}")
+    made = plan(runs=str(runs))
+    every, one = made.runs(), "elsewhere/a1/street/runs/fast.json"
+    for targets, wanted in ((["runs", "report"], every), ([one, "report"], [one]), (["metrics", "report"], [])):
+        assert made.report(targets).runs() == wanted
+
+
 def test_what_only_the_report_knows():
     """The reference is the first static method; a change of published figures reruns the report alone."""
     figures = {"source": "S", "url": "https://example.org", "scene": "a1", "method": "M", "psnr": 20.0}
