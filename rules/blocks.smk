@@ -3,7 +3,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/scene.json of a drive of a dataset with `blocks`.
 # OUTPUTS: <results>/{scene}/blocks.json; of every block <results>/{scene}.{number}/scene.json, from which the rules of
-# scenes go on; of the drive {method}/eval.json, eval_objects.json, films, films of edits, and splats/.
+# scenes go on; of the drive {method}/eval.json, eval_objects.json, films, films of edits, splats/, and scene.usd with
+# usd/.
 
 long_drives = LongDrives(plan, lambda drive: checkpoints.blocks.get(scene=drive).output.blocks)
 
@@ -203,3 +204,33 @@ rule export_blocks:
         code=plan.code("export_blocks"),
     script:
         "../workflow_scripts/export_blocks.py"
+
+
+rule usd_blocks:
+    """
+    Exports a drive as an OpenUSD stage with a payload for each block, in which no Gaussian stands twice.
+    """
+    input:
+        scene=plan.annotated_scene,
+        blocks="<results>/{scene}/blocks.json",
+        scenes=long_drives.each(plan.scene),
+        checkpoints=long_drives.results("{method}/checkpoint.npz"),
+        far=long_drives.results("{method}/far.npz"),
+    output:
+        usd="<results>/{scene}/{method}/scene.usd",
+    log:
+        "<logs>/{scene}/{method}/usd_blocks.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/usd_blocks.tsv"
+    wildcard_constraints:
+        scene=plan.cut,
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=8000,
+        runtime=120,
+    params:
+        settings=plan.settings("usd_blocks"),
+        code=plan.code("usd_blocks"),
+    script:
+        "../workflow_scripts/usd_blocks.py"

@@ -1,11 +1,13 @@
 """The stage `export_blocks`: the static world of a long drive, a PLY for each block, in which no place stands twice."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from drivesplat.export.trained_parts import digests
 from drivesplat.io.storage import Provenance
@@ -42,8 +44,7 @@ def export_blocks(
         checkpoint, origin = read_checkpoint(path), blocks.blocks[number].origin
         upstream.append(checkpoint.provenance)
         every = _static(trained_model(checkpoint))
-        places = every.means.double().numpy()[:, :2] + origin[:2]
-        own = every[torch.from_numpy(blocks.nearest(places, job.left_out) == number)]
+        own = every[owned(every, blocks, number, job.left_out)]
         log.info("%s: %d of %d static Gaussians", name, len(own), len(every))
         note = {"scene": name, "origin": (scene.origin + origin).tolist(), **digests(checkpoint.provenance)}
         write_splat_ply(folder / f"{name}.ply", with_sh_degree(own, job.sh_degree or 0), note)
@@ -62,6 +63,13 @@ def export_blocks(
         (folder / f"{blocks.names[number]}.ply").unlink(missing_ok=True)
     index = {"schema": SCHEMA, "scene": scene.name, "origin": scene.origin.tolist(), "conventions": CONVENTIONS}
     return {**index, "blocks": entries, "left_out": [blocks.names[number] for number in job.left_out]}, upstream
+
+
+def owned(gaussians: Gaussians, blocks: Blocks, number: int, left_out: Collection[int]) -> Bool[Tensor, " n"]:
+    """The mask of the Gaussians of a block, in its world, that belong to it: of the blocks that are not left out, its
+    path is the nearest to them."""
+    places = gaussians.means.detach().double().numpy()[:, :2] + blocks.blocks[number].origin[:2]
+    return torch.from_numpy(blocks.nearest(places, left_out) == number)
 
 
 @torch.no_grad()

@@ -83,7 +83,25 @@ def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]
 def splat_stage(
     groups: Mapping[str, SampledGroup], cameras: Sequence[tuple[float, Gf.Camera]], note: Mapping[str, Any]
 ) -> Usd.Stage:
-    """A stage in memory with the groups by name, the camera at its times (seconds) and `note` in customLayerData."""
+    """A stage in memory with the groups by name, the camera at its times (seconds), unless there are none, and `note`
+    in customLayerData."""
+    stage = world_stage(note)
+    static = [name for name, group in groups.items() if group.motion is None]
+    objects = [name for name in groups if name not in static]
+    if objects:
+        Usd.ModelAPI(UsdGeom.Xform.Define(stage, _ACTORS)).SetKind(Kind.Tokens.group)
+    taken = [path.rpartition("/")[2] for path in (_ACTORS, _CAMERA)]
+    paths = {name: f"/World/{word}" for name, word in unique_names(static, identifier, taken).items()}
+    paths |= {name: f"{_ACTORS}/{word}" for name, word in unique_names(objects, identifier).items()}
+    for name, group in groups.items():
+        define_group(stage, paths[name], name, group)
+    if cameras:
+        define_camera(stage, cameras)
+    return stage
+
+
+def world_stage(note: Mapping[str, Any]) -> Usd.Stage:
+    """A stage in memory whose only prim is /World: metres, z up, TIME_CODES_PER_SECOND."""
     stage = Usd.Stage.CreateInMemory("scene.usdc")
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
@@ -91,24 +109,19 @@ def splat_stage(
     Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
     stage.SetDefaultPrim(world.GetPrim())
     stage.GetRootLayer().customLayerData = {"drivesplat": dict(note)}
-    static = [name for name, group in groups.items() if group.motion is None]
-    objects = [name for name in groups if name not in static]
-    if objects:
-        Usd.ModelAPI(UsdGeom.Xform.Define(stage, _ACTORS)).SetKind(Kind.Tokens.group)
-    taken = [path.rpartition("/")[2] for path in (_ACTORS, _CAMERA)]
-    paths = {name: f"/World/{word}" for name, word in unique_names(static, _identifier, taken).items()}
-    paths |= {name: f"{_ACTORS}/{word}" for name, word in unique_names(objects, _identifier).items()}
-    for name, group in groups.items():
-        define_group(stage, paths[name], name, group)
-    camera = UsdGeom.Camera.Define(stage, _CAMERA)
     stage.SetTimeCodesPerSecond(TIME_CODES_PER_SECOND)
     stage.SetFramesPerSecond(TIME_CODES_PER_SECOND)
+    return stage
+
+
+def define_camera(stage: Usd.Stage, cameras: Sequence[tuple[float, Gf.Camera]]) -> None:
+    """Defines /World/camera at its times (seconds), from the first to the last of which the stage plays."""
+    camera = UsdGeom.Camera.Define(stage, _CAMERA)
     codes = [seconds * TIME_CODES_PER_SECOND for seconds, _ in cameras]
     stage.SetStartTimeCode(min(codes))
     stage.SetEndTimeCode(max(codes))
     for code, (_, recorded) in zip(codes, cameras, strict=True):
         camera.SetFromCamera(recorded, code)
-    return stage
 
 
 def usd_camera(K: np.ndarray, size: tuple[int, int], camera_to_world: np.ndarray) -> Gf.Camera:
@@ -146,7 +159,7 @@ def write_usdz(path: str | Path, stage: Usd.Stage) -> None:
             raise unwritable(path, "OpenUSD gives no reason")
 
 
-def _identifier(name: str) -> str:
+def identifier(name: str) -> str:
     """A name as a USD identifier; a leading digit gets an underscore before it instead of being replaced by one."""
     return Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
 

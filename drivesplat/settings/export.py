@@ -34,7 +34,8 @@ class ExportSettings(Settings):
     """The time in seconds since the first image that splat.ply, spz and sog files show, and whose colours, and shapes
     of people, other exports have where they show no others. null: that of the middle image."""
     usd_gaussians: int = Field(1_000_000, ge=1)
-    """Maximum number of Gaussians in scene.usdz. Those with the largest opacity times area are kept."""
+    """Maximum number of Gaussians in scene.usdz, and in each block of a long drive's scene.usd. Those with the largest
+    opacity times area are kept."""
     viewer_gaussians: int = Field(300_000, ge=1)
     """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
     drive_width: int | None = Field(None, ge=16, le=7680)
@@ -67,6 +68,13 @@ class ExportJob(Settings):
     eval_camera: str
     gaussians: int
     time_s: float | None = None
+
+
+class BlockUsdJob(ExportJob):
+    """All settings that determine scene.usd of a drive that is cut into blocks, some of which may be left out, with the
+    payloads beside it: `gaussians` is the maximum of each."""
+
+    left_out: tuple[int, ...]
 
 
 class ViewerJob(ExportJob):

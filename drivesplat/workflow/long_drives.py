@@ -30,6 +30,8 @@ FILES_OF_TARGETS = {
     "alpasim": "{method}/scene.alpasim.usdz",
 }
 """What the targets that make nothing, or little, of such a drive make of a scene: a file of each."""
+DRIVE_EXPORTS = ("scene.usd",)
+"""Exports of a whole drive, of each method, beside its splats."""
 EDIT_FILES = (".mp4", ".png", ".json")
 FILM_FILES = (".mp4", ".cameras.json")
 
@@ -57,13 +59,18 @@ class LongDrives:
     def results(self, name: str) -> Callable[[Any], list[str]]:
         """The function of wildcards that gives the result `name` of every block of a drive that is not left out, in
         order. In it, '{method}' is the method of the job."""
+        folder = self._plan.config.results_dir
+        return self.each(lambda block: f"{folder}/{block.scene}/{name.format(method=block.method)}")
+
+    def each(self, find: Callable[[Any], str]) -> Callable[[Any], list[str]]:
+        """The function of wildcards that gives what `find` does for every block of a drive that is not left out, in
+        order: for the wildcards of the block, with the method of the job."""
 
         def of_blocks(wildcards: Any) -> list[str]:
-            drive = wildcards.scene
+            drive, method = wildcards.scene, getattr(wildcards, "method", "")
             self._blocks_file(drive)
             numbers = _kept(self._plan.config, drive, len(self._blocks(drive)))
-            folder, own = self._plan.config.results_dir, name.format(method=getattr(wildcards, "method", ""))
-            return [f"{folder}/{block_scene_name(drive, number)}/{own}" for number in numbers]
+            return [find(SimpleNamespace(scene=block_scene_name(drive, number), method=method)) for number in numbers]
 
         return of_blocks
 
@@ -156,7 +163,7 @@ def refuse_results_of_blocks(config: Config, scene: str, path: Sequence[str]) ->
     if not config.is_cut(scene):
         return
     films = _films(config, scene)
-    own = {"eval.json", "eval_objects.json", *(f"{name}{end}" for name in films for end in FILM_FILES)}
+    own = {"eval.json", "eval_objects.json", *DRIVE_EXPORTS, *(f"{name}{end}" for name in films for end in FILM_FILES)}
     known = path[-1] in (own if len(path) == 2 else OF_DRIVES) if len(path) < 3 else path[1:] == SPLATS.split("/")
     is_edit = len(path) == 3 and path[1] == EDITS and path[2].endswith(EDIT_FILES)
     known = known or (is_edit and bool(scene_edits(config, scene)))
@@ -207,7 +214,7 @@ def _what_there_is(config: Config, scene: str) -> str:
     blocks = f"{block_scene_name(scene, 0)} {last}"
     return (
         f"its blocks are {blocks}, and of the whole drive there are metrics.json, index.html and, of each method, "
-        f"{films} and {SPLATS} (docs/long_drives.md)"
+        f"{films}, {', '.join(DRIVE_EXPORTS)} and {SPLATS} (docs/long_drives.md)"
     )
 
 

@@ -22,6 +22,7 @@ from drivesplat.settings.export import (
     AlpasimJob,
     AssetsJob,
     BlockSplatsJob,
+    BlockUsdJob,
     DriveJob,
     ExportJob,
     FarJob,
@@ -76,7 +77,7 @@ SIDE_BY_SIDE = "scene_metrics"
 OF_ONE_SCENE = (
     WORLD, "extract", "masks", "edit", "quad", "edit_truth", "ghost_panel", "remove_actor", "export_viewer",
     "drive_folder", "scan_folder", "run", "run_folder", "evaluate_blocks", "film_blocks", "export_blocks",
-    "edit_blocks",
+    "edit_blocks", "usd_blocks",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
@@ -328,8 +329,8 @@ def _run(at: JobScope) -> dict[str, Any]:
     return {"run": run, "edit": edit, "code": code_of(run.policy), "crf": at.config.render.crf}
 
 
-def _shown_time(at: JobScope) -> dict[str, Any]:
-    return {"time_s": at.config.export.time_s}
+def _usd(at: JobScope) -> dict[str, Any]:
+    return {"gaussians": at.config.export.usd_gaussians, "time_s": at.config.export.time_s}
 
 
 def _encoding(at: JobScope) -> dict[str, Any]:
@@ -386,8 +387,9 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] 
         lambda at: {"sh_degree": at.config.export.sh_degree, "left_out": at.dataset.left_out(at.scene)},
     ),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),
-    "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree, **_shown_time(at)}),
-    "export_usd": (ExportJob, lambda at: {"gaussians": at.config.export.usd_gaussians, **_shown_time(at)}),
+    "export": (SplatJob, lambda at: {name: getattr(at.config.export, name) for name in ("sh_degree", "time_s")}),
+    "export_usd": (ExportJob, _usd),
+    "usd_blocks": (BlockUsdJob, lambda at: {**_usd(at), "left_out": at.dataset.left_out(at.scene)}),
     "export_viewer": (ViewerJob, _viewer),
     "actor_assets": (AssetsJob, lambda at: {"complete": at.config.export.complete_assets}),
     "export_alpasim": (AlpasimJob, lambda at: {"body": at.config.export.vehicle}),

@@ -67,6 +67,7 @@ def test_the_files_of_blocks_follow_from_the_record_of_the_drive(drives):
     assert (drives.digest(at("way.000")), drives.digest(at("way.001"))) == ("a", "b")
     results = drives.results("{method}/eval.json")(at("way"))
     assert results == ["there/way.000/vanilla/eval.json", "there/way.001/vanilla/eval.json"]
+    assert drives.each(plan().scene)(at("way")) == ["there/way.000/scene.json", "there/way.001/scene.json"]
     with pytest.raises(ConfigError, match=r"scene way has no block called way.002; it has 2: way.000 to way.001"):
         drives.inputs_of_block(at("way.002"))
     with pytest.raises(ConfigError, match=r"scene way has no block called way.0001; it has 2"):
@@ -107,7 +108,8 @@ def test_results_of_blocks_are_refused_for_a_drive(path):
 
 def test_results_of_a_drive_and_those_of_other_scenes_are_not_refused():
     config = plan().config
-    for path in (["metrics.json"], ["blocks.json"], ["vanilla", "eval.json"], ["vanilla", "original.mp4"]):
+    of_method = [["vanilla", name] for name in ("eval.json", "original.mp4", "scene.usd")]
+    for path in (["metrics.json"], ["blocks.json"], *of_method):
         refuse_results_of_blocks(config, "way", path)
     refuse_results_of_blocks(config, "0001", ["vanilla", "splat.ply"])
     refuse_results_of_blocks(config, "way.000", ["vanilla", "splat.ply"])
@@ -207,7 +209,7 @@ def test_edits_of_a_whole_drive_are_made_by_methods_whose_objects_have_one_id_in
         made.refuse_unknown(["there/way/found/edits/gone.mp4"])
     with pytest.raises(ConfigError, match="scene way has no edit called 'moved'; there are: gone"):
         made.refuse_unknown(["there/way/street/edits/moved.mp4"])
-    drive = r"and street/edits/gone/drive/drive.json is a result of one block.* edits/NAME.mp4 and splats/splats.json"
+    drive = r"and street/edits/gone/drive/drive.json is a result of one block.* edits/NAME.mp4, scene.usd and splats"
     with pytest.raises(ConfigError, match=drive):
         made.refuse_unknown(["there/way/street/edits/gone/drive/drive.json"])
     assert track_references(made.config, "way").edits[0].track == "abc", "`extract` looks for it"
@@ -232,7 +234,7 @@ def test_blocks_are_left_out_of_the_results_of_the_drive_alone(drives, tmp_path)
         left_out(2).results(evals)(at("way"))
     with pytest.raises(ConfigError, match=r"blocks.leave_out leaves no block of scene way, which has 2; keep one"):
         left_out(0, 1).results(evals)(at("way"))
-    stages = ("blocks", "block", "train", "evaluate", "evaluate_blocks", "export_blocks", "film_blocks")
+    stages = ("blocks", "block", "train", "evaluate", "evaluate_blocks", "export_blocks", "usd_blocks", "film_blocks")
     one, other = plan(), plan(cut={**CUT, "blocks": {**BLOCKS, "leave_out": [1]}})
     films = {"film_blocks": "original"}
     changed = [
@@ -241,7 +243,7 @@ def test_blocks_are_left_out_of_the_results_of_the_drive_alone(drives, tmp_path)
         if one.stage_settings(stage, "way", "vanilla", films.get(stage))
         != other.stage_settings(stage, "way", "vanilla", films.get(stage))
     ]
-    assert changed == ["evaluate_blocks", "export_blocks", "film_blocks"]
+    assert changed == ["evaluate_blocks", "export_blocks", "usd_blocks", "film_blocks"]
 
 
 def test_blocks_that_are_known_to_be_absent_are_refused_before_anything_runs(tmp_path):

@@ -10,6 +10,7 @@ from helpers.drives import World, write_world
 from helpers.shared_runs import TWO_METHODS, VANILLA
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 from plyfile import PlyData
+from pxr import Usd, UsdGeom, UsdVol
 
 import drivesplat
 from drivesplat.cli.__main__ import main
@@ -101,6 +102,21 @@ def test_every_static_gaussian_of_the_drive_is_in_the_file_of_the_nearest_block(
         apart = [np.linalg.norm(places[:, None] - path, axis=2).min(axis=1) for path in paths]
         assert entry["gaussians"] == len(places) > 50 and (np.argmin(apart, axis=0) == number).mean() > 0.99
         assert vertices["x"].min() == pytest.approx(entry["lower"][0]) and entry["scene"] == f"0001.00{number}"
+
+
+def test_the_whole_drive_is_one_usd_stage_of_its_blocks(copy):
+    made = "results/0001/vanilla/scene.usd"
+    assert copy.run(made).returncode == 0 and copy.planned(made) == {}
+    stage, index = Usd.Stage.Open(str(copy.folder / made)), copy.read(INDEX)
+    for prim, entry in zip(stage.GetPrimAtPath("/World/blocks").GetChildren(), index["blocks"], strict=True):
+        assert prim.GetDisplayName() == entry["scene"]
+        splat = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"{prim.GetPath()}/background"))
+        places = np.array(splat.GetPositionsAttr().Get())
+        assert len(places) == entry["gaussians"], "the same as in splats/"
+        bounds = [places.min(axis=0), places.max(axis=0)]
+        np.testing.assert_allclose(bounds, [entry["lower"], entry["upper"]], rtol=1e-5)
+        moved = UsdGeom.Xformable(prim).GetLocalTransformation().ExtractTranslation()
+        assert list(moved) == pytest.approx(entry["translation"])
 
 
 def test_a_block_that_fails_is_named_and_the_drive_goes_on_without_it(copy):
