@@ -3,8 +3,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/scene.json of a drive of a dataset with `blocks`.
 # OUTPUTS: <results>/{scene}/blocks.json; of every block <results>/{scene}.{number}/scene.json, from which the rules of
-# scenes go on; of the drive {method}/eval.json, eval_objects.json, films, films of edits, splats/, and scene.usd with
-# usd/.
+# scenes go on; of the drive {method}/eval.json, eval_objects.json, films, films of edits, splats/, scene.usd with usd/,
+# and viewer.html.
 
 long_drives = LongDrives(plan, lambda drive: checkpoints.blocks.get(scene=drive).output.blocks)
 
@@ -234,3 +234,34 @@ rule usd_blocks:
         code=plan.code("usd_blocks"),
     script:
         "../workflow_scripts/usd_blocks.py"
+
+
+rule viewer_blocks:
+    """
+    Writes a map of a drive's path, coloured by the figures of its blocks, that leads to the viewers of these.
+    """
+    input:
+        scene=plan.annotated_scene,
+        blocks="<results>/{scene}/blocks.json",
+        scenes=long_drives.results("scene.json"),
+        metrics="<results>/{scene}/{method}/eval.json",
+        viewers=long_drives.results("{method}/viewer.html"),
+    output:
+        # not in Snakemake's report, whose archive lacks the pages that it leads to
+        viewer="<results>/{scene}/{method}/viewer.html",
+    log:
+        "<logs>/{scene}/{method}/viewer_blocks.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/viewer_blocks.tsv"
+    wildcard_constraints:
+        scene=plan.cut,
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        settings=plan.settings("viewer_blocks"),
+        code=plan.code("viewer_blocks"),
+    script:
+        "../workflow_scripts/viewer_blocks.py"

@@ -115,6 +115,8 @@ rule export_viewer:
         "<logs>/{scene}/{method}/export_viewer.log",
     benchmark:
         "<benchmarks>/{scene}/{method}/export_viewer.tsv"
+    wildcard_constraints:
+        scene=plan.trained(),
     conda:
         "../envs/drivesplat.yaml"
     resources:

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.typed_record import field_values
-from drivesplat.scene.blocks import Block, Blocks, within
+from drivesplat.scene.blocks import Block, Blocks, jumped, within
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
-from drivesplat.settings.blocks import BlockSettings, BlocksJob
+from drivesplat.settings.blocks import BlocksJob, CutSettings
 from drivesplat.settings.images import HoldoutSettings
 
 STEP = 1.0
@@ -23,8 +23,6 @@ MAX_AT_PLACE = 10
 """Key frames that a block keeps of a place at which the vehicle stands or crawls, beside those that are held out."""
 MIN_TRAINED = 2
 """Key frames on the path of a block that it is trained on, at least: smaller blocks join others."""
-MAX_SPEED, SLACK = 70.0, 5.0
-"""A vehicle that moves by more than MAX_SPEED (m/s) and SLACK (m) between recordings has jumped."""
 
 
 def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
@@ -169,8 +167,7 @@ def _ego_places(scene: Scene) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarr
 
 def _jumps(times: np.ndarray, places: np.ndarray) -> Int[np.ndarray, " n"]:
     """How often the vehicle has jumped up to each place."""
-    moved, passed = np.linalg.norm(np.diff(places, axis=0), axis=1), np.diff(times) * 1e-6
-    return np.append(0, np.cumsum(moved > SLACK + MAX_SPEED * passed))
+    return np.append(0, np.cumsum(jumped(times, places)))
 
 
 def _anchors(places: np.ndarray) -> Int[np.ndarray, " a"]:
@@ -186,7 +183,7 @@ def _arcs(places: np.ndarray) -> Float64[np.ndarray, " n"]:
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
 
 
-def _owners(places: np.ndarray, jumps: np.ndarray, settings: BlockSettings) -> Int[np.ndarray, " a"]:
+def _owners(places: np.ndarray, jumps: np.ndarray, settings: CutSettings) -> Int[np.ndarray, " a"]:
     """The number of the block of every anchor."""
     arcs = _arcs(places)
     before = _driven_before(places, arcs, settings)
@@ -224,7 +221,7 @@ def _large_enough(owners: Int[np.ndarray, " a"], trained: Int[np.ndarray, " n"])
         found = np.unique(found, return_inverse=True)[1]
 
 
-def _driven_before(places: np.ndarray, arcs: np.ndarray, settings: BlockSettings) -> Int[np.ndarray, " a"]:
+def _driven_before(places: np.ndarray, arcs: np.ndarray, settings: CutSettings) -> Int[np.ndarray, " a"]:
     """For anchors in a street that was driven before, the earliest anchor there; -1 for others. Passages shorter than
     the overlap count for nothing."""
     apart = 4.0 * settings.same_place_m

@@ -15,6 +15,8 @@ from drivesplat.settings.blocks import block_scene_name
 
 SCHEMA = 1
 RULE = "blocks"
+MAX_SPEED, SLACK = 70.0, 5.0
+"""A vehicle that moves by more than MAX_SPEED (m/s) and SLACK (m) between recordings has jumped."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,12 @@ def within(timestamps: Int64[np.ndarray, " n"], intervals: Int64[np.ndarray, "i 
     """Whether timestamps lie in any of some intervals [first, end)."""
     at = np.asarray(timestamps)[:, None]
     return ((at >= intervals[:, 0]) & (at < intervals[:, 1])).any(axis=1)
+
+
+def jumped(times: Int64[np.ndarray, " n"], places: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " m"]:
+    """Whether the vehicle jumps from each of its places (metres, at `times` in microseconds) to the next: m = n - 1."""
+    moved, passed = np.linalg.norm(np.diff(places, axis=0), axis=1), np.diff(times) * 1e-6
+    return moved > SLACK + MAX_SPEED * passed
 
 
 def write_blocks(path: str | Path, blocks: Blocks) -> None:

@@ -20,6 +20,7 @@ REPORT_PAGE = REPORT_FILES[0]
 LINKS_OF_SCENE = {"metrics.json": "figures of all methods", f"../{REPORT_PAGE}": "report across scenes"}
 PICTURES_OF_SCENE = {"tracks.png": "moving objects, with the ids that edits name"}
 LINKS_OF_METHOD = {"viewer.html": "viewer with a free camera"}
+LINKS_OF_DRIVE = {"viewer.html": "map of the drive, with the viewers of its blocks"}
 PICTURES_OF_METHOD = {
     "ghost_panel.png": "a moving vehicle: ground truth, rendering, error and ghosts",
     "removal.png": "the vehicle removed",
@@ -68,7 +69,8 @@ class FilmPages:
         ]
         for method in methods:
             films = shown(self._films(scene, method))
-            pictures, links = (named(files, f"{method}/") for files in (PICTURES_OF_METHOD, LINKS_OF_METHOD))
+            own_links = LINKS_OF_DRIVE if self._plan.config.is_cut(scene) else LINKS_OF_METHOD
+            pictures, links = (named(files, f"{method}/") for files in (PICTURES_OF_METHOD, own_links))
             sections.append(FilmSection(title=method, films=films, pictures=pictures, links=links))
         return FilmPageJob(scene=scene, sections=tuple(sections))
 

@@ -30,7 +30,7 @@ FILES_OF_TARGETS = {
     "alpasim": "{method}/scene.alpasim.usdz",
 }
 """What the targets that make nothing, or little, of such a drive make of a scene: a file of each."""
-DRIVE_EXPORTS = ("scene.usd",)
+DRIVE_EXPORTS = ("scene.usd", "viewer.html")
 """Exports of a whole drive, of each method, beside its splats."""
 EDIT_FILES = (".mp4", ".png", ".json")
 FILM_FILES = (".mp4", ".cameras.json")

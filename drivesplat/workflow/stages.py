@@ -340,7 +340,7 @@ def _encoding(at: JobScope) -> dict[str, Any]:
 
 _WITHOUT_SETTINGS = (
     "relabel", SCAN_BASELINES, "lidar_picture", "scene_metrics", "drive_mcap", "export_colmap", "export_spz",
-    "export_sog",
+    "export_sog", "viewer_blocks",
 )  # fmt: skip
 _STAGES: dict[str, tuple[type[Settings], Callable[[JobScope], dict[str, Any]]]] = {
     **dict.fromkeys(_WITHOUT_SETTINGS, (Settings, _nothing)),

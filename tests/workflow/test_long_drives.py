@@ -108,7 +108,7 @@ def test_results_of_blocks_are_refused_for_a_drive(path):
 
 def test_results_of_a_drive_and_those_of_other_scenes_are_not_refused():
     config = plan().config
-    of_method = [["vanilla", name] for name in ("eval.json", "original.mp4", "scene.usd")]
+    of_method = [["vanilla", name] for name in ("eval.json", "original.mp4", "scene.usd", "viewer.html")]
     for path in (["metrics.json"], ["blocks.json"], *of_method):
         refuse_results_of_blocks(config, "way", path)
     refuse_results_of_blocks(config, "0001", ["vanilla", "splat.ply"])
@@ -209,7 +209,7 @@ def test_edits_of_a_whole_drive_are_made_by_methods_whose_objects_have_one_id_in
         made.refuse_unknown(["there/way/found/edits/gone.mp4"])
     with pytest.raises(ConfigError, match="scene way has no edit called 'moved'; there are: gone"):
         made.refuse_unknown(["there/way/street/edits/moved.mp4"])
-    drive = r"and street/edits/gone/drive/drive.json is a result of one block.* edits/NAME.mp4, scene.usd and splats"
+    drive = r"gone/drive/drive.json is a result of one block.* edits/NAME.mp4, scene.usd, viewer.html and splats"
     with pytest.raises(ConfigError, match=drive):
         made.refuse_unknown(["there/way/street/edits/gone/drive/drive.json"])
     assert track_references(made.config, "way").edits[0].track == "abc", "`extract` looks for it"

@@ -106,7 +106,7 @@ def test_every_static_gaussian_of_the_drive_is_in_the_file_of_the_nearest_block(
 
 def test_the_whole_drive_is_one_usd_stage_of_its_blocks(copy):
     made = "results/0001/vanilla/scene.usd"
-    assert copy.run(made).returncode == 0 and copy.planned(made) == {}
+    assert copy.run(made, INDEX).returncode == 0 and copy.planned(made) == {}
     stage, index = Usd.Stage.Open(str(copy.folder / made)), copy.read(INDEX)
     for prim, entry in zip(stage.GetPrimAtPath("/World/blocks").GetChildren(), index["blocks"], strict=True):
         assert prim.GetDisplayName() == entry["scene"]
@@ -117,6 +117,23 @@ def test_the_whole_drive_is_one_usd_stage_of_its_blocks(copy):
         np.testing.assert_allclose(bounds, [entry["lower"], entry["upper"]], rtol=1e-5)
         moved = UsdGeom.Xformable(prim).GetLocalTransformation().ExtractTranslation()
         assert list(moved) == pytest.approx(entry["translation"])
+
+
+def test_the_page_of_the_drive_is_made_with_those_of_its_blocks_and_leads_to_them(copy):
+    made = "results/0001/vanilla/viewer.html"
+    planned = copy.planned(made)
+    assert planned["export_viewer"] == len(trained(copy)) and planned["viewer_blocks"] == 1
+    assert copy.run(made).returncode == 0 and copy.planned(made) == {}
+    page = (copy.folder / made).read_text(encoding="utf-8")
+    links = set(re.findall(r'data-page="([^"]*)"', page))
+    assert {(copy.folder / made).parent.joinpath(link).resolve() for link in links} == {
+        (copy.folder / f"results/{block}/vanilla/viewer.html").resolve() for block in trained(copy)
+    }
+    assert all((copy.folder / made).parent.joinpath(link).is_file() for link in links)
+    for figures in copy.read("results/0001/metrics.json")["methods"]["vanilla"]["blocks"].values():
+        psnr = figures["interpolation"]["static"]
+        assert ("<td>–</td>" if psnr is None else f"<td>{psnr:.2f} dB</td>") in page
+        assert f"<td>{figures['gaussians']:,}</td>" in page
 
 
 def test_a_block_that_fails_is_named_and_the_drive_goes_on_without_it(copy):

@@ -13,7 +13,7 @@ NO_TORCH = {
     "ablation", "actors", "block", "blocks", "demo_world", "discover", "download_nuscenes_mini", "drive_mcap",
     "export_colmap", "export_sog", "export_spz", "extract", "film_page", "gap_report", "lidar_depth", "lidar_seed",
     "light", "lpips_backbone", "masks", "own_car", "parser", "refine_poses", "regions", "relabel", "scan_baselines",
-    "scans", "scene_metrics", "tracks",
+    "scans", "scene_metrics", "tracks", "viewer_blocks",
 }  # fmt: skip
 """The scripts that import no torch; export_spz does in its work."""
 DRAWS = {"gap_report", "tracks"}
