@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float64
-from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, Vt
 
 from drivesplat.export.block_splats import owned
 from drivesplat.export.far_gaussians import read_far, within_reach
@@ -33,8 +33,9 @@ from drivesplat.export.usd import (
     recorded_cameras,
     splat_stage,
     world_stage,
+    write_layer,
 )
-from drivesplat.io.storage import Provenance, atomic_path, unwritable
+from drivesplat.io.storage import Provenance
 from drivesplat.model.checkpoint import TrainedCheckpoint, read_checkpoint, trained_model
 from drivesplat.scene.blocks import Block, Blocks
 from drivesplat.scene.scene import Scene, read_scene
@@ -114,18 +115,6 @@ def write_drive(
         _define_block(stage, payload)
     define_camera(stage, recorded_cameras(scene, job.eval_camera))
     write_layer(path, stage)
-
-
-def write_layer(path: Path, stage: Usd.Stage) -> None:
-    """Writes the root layer of a stage in USD's binary form. Raises ResultError, naming `path`, if that fails; no
-    partial file remains."""
-    with atomic_path(path) as aside:
-        try:
-            written = stage.GetRootLayer().Export(str(aside))
-        except Tf.ErrorException as error:
-            raise unwritable(path, error.args[0].commentary) from error
-        if not written:
-            raise unwritable(path, "OpenUSD gives no reason")
 
 
 def _groups(checkpoint: TrainedCheckpoint, scene: Scene, camera: str, shown: int) -> dict[str, SampledGroup]:

@@ -17,7 +17,7 @@ and is not included; the schema has no attribute for antialiased training.
 
 import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -150,13 +150,24 @@ def write_usdz(path: str | Path, stage: Usd.Stage) -> None:
     path = Path(path)
     with atomic_path(path) as aside, tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
         layer = Path(folder) / "scene.usdc"
-        try:
-            written = stage.GetRootLayer().Export(str(layer))
-            written = written and UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(aside))
-        except Tf.ErrorException as error:
-            raise unwritable(path, error.args[0].commentary) from error
-        if not written:
-            raise unwritable(path, "OpenUSD gives no reason")
+        _require_written(path, lambda: stage.GetRootLayer().Export(str(layer)))
+        _require_written(path, lambda: UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(aside)))
+
+
+def write_layer(path: str | Path, stage: Usd.Stage) -> None:
+    """Writes the root layer of a stage, as text (.usda) or binary (.usdc). Raises as `write_usdz`."""
+    with atomic_path(path) as aside:
+        _require_written(Path(path), lambda: stage.GetRootLayer().Export(str(aside)))
+
+
+def _require_written(path: Path, write: Callable[[], bool]) -> None:
+    """Calls `write`. Raises ResultError naming the file where it fails."""
+    try:
+        written = write()
+    except Tf.ErrorException as error:
+        raise unwritable(path, error.args[0].commentary) from error
+    if not written:
+        raise unwritable(path, "OpenUSD gives no reason")
 
 
 def identifier(name: str) -> str:
