@@ -7,8 +7,10 @@ import subprocess
 
 import pytest
 import yaml
+from helpers.drives import World
 from helpers.patience import PATIENCE_S
-from helpers.workflow_copy import REPOSITORY, WorkflowCopy
+from helpers.shared_runs import VANILLA
+from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy
 
 PROFILES = REPOSITORY / "profiles"
 TARGET = "results/0001/metrics.json"
@@ -26,21 +28,19 @@ def test_the_profile_for_slurm_reruns_what_the_default_one_does():
     assert slurm["executor"] == "slurm" and "resources" not in slurm, "SLURM knows the number of GPUs"
 
 
+on_slurm = pytest.mark.skipif(shutil.which("sinfo") is None, reason="no SLURM here: make test-slurm")
+
+
 @pytest.mark.slurm
-@pytest.mark.skipif(shutil.which("sinfo") is None, reason="no SLURM here: make test-slurm")
+@on_slurm
 def test_a_scene_through_slurm_comes_out_as_one_that_runs_here(tmp_path):
     copies = {name: WorkflowCopy.make(tmp_path / name, methods={"vanilla": {}}) for name in ("here", "there")}
     assert copies["here"].run(TARGET).returncode == 0
-    there = copies["there"]
-    there.config["device"] = "any"  # the GPUs configured in SLURM do not exist
-    there.write_config()
-    environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"}
-    done = subprocess.run(
-        there.command(*ON_SLURM, "--", TARGET), cwd=there.folder, env=environment,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=PATIENCE_S,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout
-    jobs = re.findall(r"submitted with SLURM jobid (\d+) \(log: \S*/rule_(\w+)/", done.stdout)
+    there = with_gpus_of_slurm(copies["there"])
+    with through_slurm(there) as run:
+        said = run.stdout.read()
+    assert run.returncode == 0, said
+    jobs = re.findall(r"submitted with SLURM jobid (\d+) \(log: \S*/rule_(\w+)/", said)
     assert {rule for _, rule in jobs} >= {"extract", "parser", "masks", "train", "evaluate", "scene_metrics"}
     asked = {rule: show(number) for number, rule in jobs}
     for rule, gpu in (("train", True), ("evaluate", True), ("extract", False), ("masks", False)):
@@ -51,6 +51,50 @@ def test_a_scene_through_slurm_comes_out_as_one_that_runs_here(tmp_path):
         here, elsewhere = (result[group]["all"]["psnr"] for result in results)
         assert here == pytest.approx(elsewhere, abs=0.05)
     assert planned(there) == "", "a second call plans nothing"
+
+
+@pytest.mark.slurm
+@on_slurm
+def test_blocks_of_a_drive_go_on_where_the_training_of_one_is_cancelled(tmp_path):
+    """Snakemake then trains that block again, and no other."""
+    blocks = {"dataroot": "data", "scenes": ["0001"], "blocks": {"length_m": 30.0, "overlap_m": 10.0}}
+    copy = WorkflowCopy.make(
+        tmp_path, World(speed=10.0, key_frames=16), datasets={"nuscenes": blocks}, methods=VANILLA,
+        holdout={"every_nth": 5, "offset": 2, "last_block": 1}, train={**TINY_TRAINING, "iterations": 20},
+    )  # fmt: skip
+    with_gpus_of_slurm(copy)
+    lines = []
+    with through_slurm(copy, "--keep-going") as run:
+        for line in run.stdout:
+            lines.append(line)
+            if job := re.search(r"SLURM jobid (\d+) \(log: \S*/rule_train/\S*0001\.001", line):
+                subprocess.run(["scancel", job[1]], check=True)
+    said = "".join(lines)
+    assert run.returncode and "blocks failed or were interrupted: 0001.001 (" in said, said
+    checkpoints = [copy.folder / f"results/0001.00{number}/vanilla/checkpoint.npz" for number in range(3)]
+    assert [path.is_file() for path in checkpoints] == [True, False, True]
+    before = [checkpoints[number].stat().st_mtime_ns for number in (0, 2)]
+    with through_slurm(copy) as run:
+        said = run.stdout.read()
+    assert run.returncode == 0, said
+    assert [checkpoints[number].stat().st_mtime_ns for number in (0, 2)] == before and checkpoints[1].is_file()
+    assert len(copy.read(TARGET)["methods"]["vanilla"]["blocks"]) == 3
+    assert planned(copy) == "", "a further call plans nothing"
+
+
+def with_gpus_of_slurm(copy: WorkflowCopy) -> WorkflowCopy:
+    """The copy for a SLURM whose GPUs do not exist."""
+    copy.config["device"] = "any"
+    copy.write_config()
+    return copy
+
+
+def through_slurm(copy: WorkflowCopy, *flags: str) -> subprocess.Popen[str]:
+    """A run of TARGET through SLURM that has begun."""
+    return subprocess.Popen(
+        copy.command(*ON_SLURM, *flags, "--", TARGET), cwd=copy.folder, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, env={**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"},
+    )  # fmt: skip
 
 
 def show(job: str) -> str:

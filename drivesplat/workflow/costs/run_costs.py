@@ -127,13 +127,19 @@ class RunCosts:
                 _say(f"scene {total['scene']}: {finding(total)}; {self._results / FILES[0]} says where it went")
 
     def name_failed_blocks(self) -> None:
-        """Prints which blocks of drives failed in this run, or were interrupted, with logs and where to read on."""
-        is_block = self._plan.config.is_block
+        """Prints which blocks of drives failed in this run, or were interrupted, with logs and where to read on. A job
+        that a cluster cancels before it begins has no log."""
+        is_block, scheduler = self._plan.config.is_block, self._workflow.scheduler
         self._plan_jobs()
-        of_blocks = [(job.scene, log) for job, log in self._logs.items() if is_block(job.scene)]
-        failed = {scene: log for scene, log in reversed(of_blocks) if has_failed(log, self._began)}
+        ended = set() if scheduler is None else scheduler.failed
+        of_blocks = [(name, log) for name, log in self._logs.items() if is_block(name.scene)]
+        failed = {
+            name.scene: log if log.is_file() else f"{name.stage} did not begin to write {log}"
+            for name, log in reversed(of_blocks)
+            if has_failed(log, self._began) or self._jobs[name] in ended
+        }
         if failed:
-            named = ", ".join(f"{scene} ({log})" for scene, log in failed.items())
+            named = ", ".join(f"{scene} ({where})" for scene, where in failed.items())
             _say(
                 f"these blocks failed or were interrupted: {named}; run again, or go on without them as "
                 "docs/long_drives.md says"
