@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -28,12 +28,22 @@ MIN_TRAINED = 2
 def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
     """The blocks of a drive. A part of the path is new, or one that the vehicle has driven before; new ones are cut by
     length, and the recordings of others belong to the blocks that they pass again. Where the vehicle jumps, as on a
-    ferry, a block ends.
+    ferry, a block ends. `job.blocks.length_m` is in metres (`block_length.with_length`).
 
     Earlier blocks do not depend on how the drive goes on, unless it comes back to them.
 
     Raises DatasetError for a drive without poses.
     """
+    whole, thinned = stretches(scene, job), without_crowds(scene, job.holdout)
+    numbers = range(len(whole.blocks))
+    digests = [_digest(_scene_of(thinned, whole, number, job.holdout)) for number in numbers]
+    previous = [_previous(whole, block) for block in whole.blocks]
+    known = zip(whole.blocks, digests, previous, strict=True)
+    return replace(whole, blocks=tuple(replace(own, digest=digest, previous=before) for own, digest, before in known))
+
+
+def stretches(scene: Scene, job: BlocksJob) -> Blocks:
+    """`cut_into_blocks` without what is known of the recordings of blocks: `digest` and `previous`."""
     times, places = _ego_places(scene)
     anchors = _anchors(places)
     starts = times[anchors]
@@ -48,11 +58,7 @@ def cut_into_blocks(scene: Scene, job: BlocksJob) -> Blocks:
         core = np.array([[starts[a], starts[b] if b < len(starts) else last + 1] for a, b in own])
         used = _extended(own, times, places, anchors, job.blocks.overlap_m, core)
         blocks.append(Block(core, used, places[anchors[owners == number]]))
-    whole, thinned = Blocks(scene.name, tuple(blocks)), _without_crowds(scene, job.holdout)
-    digests = [_digest(_scene_of(thinned, whole, number, job.holdout)) for number in range(len(blocks))]
-    previous = [_previous(whole, block) for block in blocks]
-    known = zip(blocks, digests, previous, strict=True)
-    return replace(whole, blocks=tuple(replace(own, digest=digest, previous=before) for own, digest, before in known))
+    return Blocks(scene.name, tuple(blocks), length_m=job.blocks.length_m)
 
 
 def _previous(blocks: Blocks, block: Block) -> int | None:
@@ -68,11 +74,11 @@ def block_scene(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSetti
 
     Raises DatasetError where the block has no key frame.
     """
-    return _scene_of(_without_crowds(scene, holdout), blocks, number, holdout)
+    return _scene_of(without_crowds(scene, holdout), blocks, number, holdout)
 
 
 def _scene_of(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSettings) -> Scene:
-    """`block_scene`, of a scene `_without_crowds`."""
+    """`block_scene`, of a scene `without_crowds`."""
     block, stamps = blocks.blocks[number], scene.key_frame_timestamps
     kept = _kept(scene, block)
     if len(kept) == 0:
@@ -105,7 +111,7 @@ def _scene_of(scene: Scene, blocks: Blocks, number: int, holdout: HoldoutSetting
     )
 
 
-def _without_crowds(scene: Scene, holdout: HoldoutSettings) -> Scene:
+def without_crowds(scene: Scene, holdout: HoldoutSettings) -> Scene:
     """The scene without most of the recordings where the vehicle stands or crawls: at a place with more than
     MAX_AT_PLACE key frames so many of them stay, evenly in time, and those that are held out; nothing between them."""
     times, places = _ego_places(scene)
@@ -275,10 +281,15 @@ def _span(scene: Scene) -> tuple[int, int]:
 
 def _used(recordings: tuple, scene: Scene, block: Block) -> Iterator:
     """The recordings of a block: those at key frames by the time of their key frame, others by their own."""
+    return (recordings[i] for i in np.flatnonzero(within(block_stamps(recordings, scene), block.used)))
+
+
+def block_stamps(recordings: Sequence[Frame | Sweep], scene: Scene) -> Int64[np.ndarray, " n"]:
+    """The timestamps (microseconds) by which recordings belong to blocks."""
     stamps = [
         int(scene.key_frame_timestamps[one.sample_index]) if one.is_key_frame else one.timestamp for one in recordings
     ]
-    return (recordings[i] for i in np.flatnonzero(within(np.array(stamps, dtype=np.int64), block.used)))
+    return np.array(stamps, dtype=np.int64)
 
 
 def _renumbered(recording: Frame | Sweep, kept: np.ndarray) -> Frame | Sweep:

@@ -42,11 +42,15 @@ class Block:
 
 @dataclass(frozen=True)
 class Blocks:
-    """All blocks of the drive `scene`, by number. Their cores divide its time. Block i is the scene `names[i]`."""
+    """All blocks of the drive `scene`, by number. Their cores divide its time. Block i is the scene `names[i]`. Blocks
+    were cut by `length_m` metres (None: by an earlier version). `reason` says why where that length was chosen
+    (`length_m: auto`), and is empty otherwise."""
 
     scene: str
     blocks: tuple[Block, ...]
     provenance: Provenance = field(default_factory=no_provenance)
+    length_m: float | None = None
+    reason: str = ""
 
     @property
     def names(self) -> list[str]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -11,14 +11,18 @@ from drivesplat.settings.images import HoldoutSettings
 
 BLOCKS = "blocks.json"
 """The file of a drive with its blocks."""
+AUTO_LENGTHS = range(40, 401, 20)
+"""The lengths in metres of which length_m: auto chooses one."""
 _BLOCK = re.compile(r"(.+)\.(\d{3,})")
 
 
 class CutSettings(Settings):
     """Where a drive is cut."""
 
-    length_m: float = Field(150.0, ge=20, le=10_000)
-    """:printed: Length in metres of the path of a block. Time does not count: a vehicle that stands makes no block."""
+    length_m: Annotated[float, Field(ge=20, le=10_000)] | Literal["auto"] = 150.0
+    """:printed: Length in metres of the path of a block. Time does not count: a vehicle that stands makes no block.
+    'auto': between 40 and 400, as long as the images of a block and its Gaussians fit into `memory_gb`
+    (docs/long_drives.md)."""
     overlap_m: float = Field(40.0, ge=0, le=1_000)
     """:printed: Metres of path before and after a block whose images it is trained on, too."""
     same_place_m: float = Field(6.0, gt=0, le=50)
@@ -27,12 +31,25 @@ class CutSettings(Settings):
 
     @model_validator(mode="after")
     def _overlap_is_shorter(self) -> "CutSettings":
-        if self.overlap_m > self.length_m:
-            raise ValueError(f"overlap_m must be at most length_m ({self.length_m:g})")
+        longest = AUTO_LENGTHS[-1] if self.length_m == "auto" else self.length_m
+        if self.overlap_m > longest:
+            raise ValueError(f"overlap_m must be at most length_m ({longest:g})")
         return self
 
 
+class CardSettings(Settings):
+    """What length_m: auto chooses by: the memory of a card in GB, the maximum number of Gaussians of a training's
+    background, and the width of its images in pixels (None: as recorded)."""
+
+    memory_gb: float
+    gaussians: int
+    width: int | None
+
+
 class BlockSettings(CutSettings):
+    memory_gb: float = Field(8.0, gt=0, le=1000)
+    """:printed: GPU memory (GB) for which length_m: auto chooses the length: that of the smallest card that is to train
+    the blocks, whatever card the machine has."""
     init: Literal["alone", "previous"] = "alone"
     """:printed: What the training of a block starts from: 'alone' from its seed points, 'previous' from the trained
     Gaussians of the block before it. Blocks are then trained one after another (docs/long_drives.md)."""
@@ -76,10 +93,11 @@ class BlockSettings(CutSettings):
 
 
 class BlocksJob(Settings):
-    """All settings that determine the blocks of a drive."""
+    """All settings that determine the blocks of a drive; `card` where their length is chosen."""
 
     blocks: CutSettings
     holdout: HoldoutSettings
+    card: CardSettings | None = None
 
 
 class PooledJob(Settings):

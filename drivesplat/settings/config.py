@@ -15,7 +15,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
 from drivesplat.settings.ablation import AblationSettings
 from drivesplat.settings.actor_seed import ActorSeedSettings
-from drivesplat.settings.blocks import drive_of
+from drivesplat.settings.blocks import CardSettings, drive_of
 from drivesplat.settings.dataset import DatasetSettings, default_datasets
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.discover import DiscoverSettings
@@ -274,6 +274,14 @@ class Config(Settings):
     def is_cut(self, scene: str) -> bool:
         """Whether this is a configured scene that is cut into blocks."""
         return scene in self.dataset_names and self.datasets[self.dataset_names[scene]].blocks is not None
+
+    def card(self, dataset: str) -> CardSettings | None:
+        """What the length of the blocks of a dataset is chosen by, in the config of one of its scenes; None where it is
+        given."""
+        cut = self.datasets[dataset].blocks
+        if cut is None or cut.length_m != "auto":
+            return None
+        return CardSettings(memory_gb=cut.memory_gb, gaussians=self.train.cap_max, width=self.images.width)
 
     def is_scene(self, name: str) -> bool:
         """Whether this is the name of a configured scene, or that of a block of one."""

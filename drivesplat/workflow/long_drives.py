@@ -1,7 +1,7 @@
 """Drives that are cut into blocks: which scenes they become, and the files that blocks and drives are made from."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -139,10 +139,35 @@ def _kept(config: Config, drive: str, count: int) -> list[int]:
 
 def _known_count(config: Config, drive: str) -> int | None:
     """The number of the blocks of a drive; None before it is cut."""
+    known = _known(config, drive)
+    return None if known is None else len(known["blocks"])
+
+
+def _known(config: Config, drive: str) -> dict[str, Any] | None:
+    """The content of a drive's blocks.json; None before it is cut, and where the file is damaged."""
     try:
-        return len(json.loads(Path(config.results_dir, drive, BLOCKS).read_text(encoding="utf-8"))["blocks"])
+        known = json.loads(Path(config.results_dir, drive, BLOCKS).read_text(encoding="utf-8"))
+        return known if isinstance(known["blocks"], list) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def chosen_lengths(config: Config, jobs: Iterable[Any]) -> list[str]:
+    """A sentence for each drive with length_m: auto of which some jobs are planned: the length of its blocks, and why,
+    or that the run chooses it."""
+    named = [(job.rule.name, job.wildcards.scene) for job in jobs if hasattr(job.wildcards, "scene")]
+    sentences = []
+    for drive in dict.fromkeys(drive_of(scene) if config.is_block(scene) else scene for _, scene in named):
+        settings = config.datasets[config.dataset_of(drive)].blocks
+        if settings is None or settings.length_m != "auto":
+            continue
+        known = None if ("blocks", drive) in named else _known(config, drive)
+        if known and known.get("reason"):
+            sentences.append(f"scene {drive}: blocks of {known['length_m']:g} m: {known['reason']}")
+        else:
+            chosen = f"the length of its blocks is chosen by blocks.memory_gb: {settings.memory_gb:g}"
+            sentences.append(f"scene {drive}: {chosen} when it is cut, which says why")
+    return sentences
 
 
 def require_cameras(config: Config, scene: str) -> None:

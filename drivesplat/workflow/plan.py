@@ -34,7 +34,12 @@ from drivesplat.workflow.film_names import (
 from drivesplat.workflow.film_pages import FilmPages
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.job_resources import JobResources
-from drivesplat.workflow.long_drives import refuse_results_of_blocks, require_cameras, require_left_out
+from drivesplat.workflow.long_drives import (
+    chosen_lengths,
+    refuse_results_of_blocks,
+    require_cameras,
+    require_left_out,
+)
 from drivesplat.workflow.named_tracks import edits_whole, refuse_other_tracks, refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, TRUTH_FILM
 from drivesplat.workflow.recordings import Recordings
@@ -104,10 +109,11 @@ class Plan(JobResources):
         return canonical_json(references.model_dump(mode="json"))
 
     def check_jobs(self, jobs: Iterable[Any]) -> None:
-        """Prints which of Snakemake's planned `jobs` have images that exceed a GPU. Raises ConfigError where one would
-        fail on a track that settings name, or on what a recording lacks."""
+        """Prints which of Snakemake's planned `jobs` have images that exceed a GPU, and how long blocks are whose
+        length is chosen. Raises ConfigError where one would fail on a track that settings name, or on what a recording
+        lacks."""
         planned = list(jobs)
-        for sentence in self.recordings.large_images(planned):
+        for sentence in (*self.recordings.large_images(planned), *chosen_lengths(self.config, planned)):
             print(f"drivesplat: {sentence}", file=sys.stderr)
         self.recordings.refuse_unfit(planned)
         refuse_wrong_tracks(self.config, planned, self.shown_scene, self.recordings.has_same_world)

@@ -83,6 +83,15 @@ def test_the_means_of_measured_blocks_are_what_their_jobs_took_and_left(results)
     assert (found.drive_seconds_per_image, found.drive_bytes_per_image) == (16.0 / images, of_drive / images)
 
 
+def test_a_chosen_length_is_that_of_the_record(results):
+    file = results / "way/blocks.json"
+    record = json.loads(file.read_text())
+    record["provenance"]["stages"]["blocks"]["settings"]["blocks"]["length_m"] = "auto"
+    file.write_text(json.dumps({**record, "length_m": 120.0, "reason": "memory"}))
+    (found,) = measured_drives(results)
+    assert (found.length_m, found.overlap_m) == (120.0, 40.0)
+
+
 def test_a_longer_recording_takes_between_what_blocks_took_and_that_in_proportion_to_images(results):
     (costs,) = measured_drives(results)
     least, most = on_paper(RECORDING, costs)

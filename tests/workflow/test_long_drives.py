@@ -11,6 +11,7 @@ from drivesplat.settings.blocks import drive_of
 from drivesplat.settings.config import for_scene
 from drivesplat.workflow.long_drives import (
     LongDrives,
+    chosen_lengths,
     refuse_results_of_blocks,
     require_cameras,
     require_left_out,
@@ -289,3 +290,44 @@ def test_nothing_of_a_drive_is_made_from_all_of_its_scans():
     assert made.scan_baselines(at("way.000")) == ["there/way.000/scan_baselines.json"]
     assert made.discovered(at("way.000", "found")) == ["there/way.000/discovered.json"]
     assert not {"scan_baselines"} & made.metrics_stages("way").keys()
+
+
+def auto(results: str = "there", **blocks) -> Plan:
+    cut = {**CUT, "blocks": {"length_m": "auto", **blocks}}
+    return Plan({"datasets": {"cut": cut}, "methods": {"vanilla": {}}, "results_dir": results}, str(REPOSITORY))
+
+
+def test_what_the_length_is_chosen_by_concerns_the_cut_alone_and_no_machine():
+    def settings(made: Plan, stage: str) -> dict:
+        return json.loads(made.stage_settings(stage, "way", "vanilla"))
+
+    assert settings(auto(), "blocks")["card"] == {"memory_gb": 8.0, "gaussians": 1_500_000, "width": None}
+    assert settings(auto(memory_gb=24), "blocks")["card"]["memory_gb"] == 24.0
+    assert settings(plan(), "blocks")["card"] is None, "a length in metres does not depend on it"
+    for stage in ("block", "train", "evaluate"):
+        assert settings(auto(), stage) == settings(auto(memory_gb=24), stage)
+    cut = {**CUT, "blocks": {"length_m": "auto"}, "overrides": {"images": {"width": 800}, "device": {"min_free_gb": 2}}}
+    made = Plan({"datasets": {"cut": cut}, "methods": {"vanilla": {}}}, str(REPOSITORY))
+    assert settings(made, "blocks")["card"] == {"memory_gb": 8.0, "gaussians": 1_500_000, "width": 800}
+
+
+def jobs(*named: tuple[str, str]) -> list[SimpleNamespace]:
+    """Jobs by rule and scene, and one without a scene."""
+    made = [SimpleNamespace(rule=SimpleNamespace(name=rule), wildcards=at(scene)) for rule, scene in named]
+    return [*made, SimpleNamespace(rule=SimpleNamespace(name="gap_report"), wildcards=SimpleNamespace())]
+
+
+def test_planning_says_the_chosen_length_of_blocks_and_why(tmp_path):
+    made = auto(str(tmp_path), memory_gb=12)
+    (sentence,) = chosen_lengths(made.config, jobs(("blocks", "way")))
+    assert sentence == (
+        "scene way: the length of its blocks is chosen by blocks.memory_gb: 12 when it is cut, which says why"
+    )
+    (tmp_path / "way").mkdir()
+    content = {"blocks": [{}] * 3, "length_m": 120.0, "reason": "the images fit"}
+    (tmp_path / "way/blocks.json").write_text(json.dumps(content))
+    known = chosen_lengths(made.config, jobs(("train", "way.000"), ("train", "way.001"), ("film_blocks", "way")))
+    assert known == ["scene way: blocks of 120 m: the images fit"]
+    assert chosen_lengths(made.config, jobs(("blocks", "way"), ("train", "way.001"))) == [sentence], "it is cut again"
+    assert chosen_lengths(made.config, jobs()) == []
+    assert chosen_lengths(plan().config, jobs(("train", "way.000"), ("train", "0001"))) == []

@@ -246,3 +246,15 @@ def test_blocks_that_start_from_the_one_before_are_trained_in_turn(copy):
         after = trained(copy)
         assert [name for name in in_turn if after[name] == in_turn[name]] == [*in_turn][:-1]
         assert len(after) > len(in_turn)
+
+
+def test_the_length_of_blocks_is_chosen_by_memory_and_said(copy):
+    made, named = "results/0001/blocks.json", copy.config["datasets"]["nuscenes"]
+    with copy.set_to(datasets={"nuscenes": {**named, "blocks": {"length_m": "auto", "memory_gb": 4}}}):
+        said = copy.run(made).stdout
+        found = copy.read(made)
+        assert found["length_m"] == 400.0 and len(found["blocks"]) == 1
+        assert "drivesplat: scene 0001: the length of its blocks is chosen by blocks.memory_gb: 4" in said
+        assert f"drivesplat: scene 0001: blocks of 400 m: {found['reason']}" in said
+        planned = copy.run(TARGETS[0], flags=("-n",)).stdout
+        assert f"drivesplat: scene 0001: blocks of 400 m: {found['reason']}" in planned

@@ -129,7 +129,7 @@ def _measured(
         drive=drive,
         method=method,
         blocks=len(protocols),
-        length_m=cut["length_m"],
+        length_m=record.get("length_m") or cut["length_m"],
         overlap_m=cut["overlap_m"],
         devices=tuple(sorted({device for name in protocols if (device := trained[name].device)})),
         iterations=tuple(sorted({steps for name in protocols if (steps := trained[name].iterations)})),
