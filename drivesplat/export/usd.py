@@ -102,7 +102,8 @@ def splat_stage(
 
 def world_stage(note: Mapping[str, Any]) -> Usd.Stage:
     """A stage in memory whose only prim is /World: metres, z up, TIME_CODES_PER_SECOND."""
-    stage = Usd.Stage.CreateInMemory("scene.usdc")
+    # its payloads lie beside the file that it becomes: in memory they would not be found
+    stage = Usd.Stage.CreateInMemory("scene.usdc", Usd.Stage.LoadNone)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
     world = UsdGeom.Xform.Define(stage, "/World")

@@ -121,8 +121,6 @@ def test_the_whole_drive_is_one_usd_stage_of_its_blocks(copy):
 
 def test_the_page_of_the_drive_is_made_with_those_of_its_blocks_and_leads_to_them(copy):
     made = "results/0001/vanilla/viewer.html"
-    planned = copy.planned(made)
-    assert planned["export_viewer"] == len(trained(copy)) and planned["viewer_blocks"] == 1
     assert copy.run(made).returncode == 0 and copy.planned(made) == {}
     page = (copy.folder / made).read_text(encoding="utf-8")
     links = set(re.findall(r'data-page="([^"]*)"', page))
