@@ -65,8 +65,9 @@ class ReportPlan:
 
     def runs(self, _: Any = None) -> list[str]:
         """The records of runs in its scenes, those that are targets beside the report included."""
-        every = self._everything or RUNS in self._targets
-        return [file for file in self._plan.runs(scenes=self.scenes) if file in self._targets or _chosen([file], every)]
+        runs = self._plan.runs(scenes=self.scenes)
+        wanted = {*runs} if self._everything or RUNS in self._targets else self._targets
+        return [file for file in runs if file in wanted or Path(file).is_file()]
 
     def links(self, _: Any = None) -> list[str]:
         """The files that its page links to: films, pages of films, edits and viewers, in an order that does not depend
