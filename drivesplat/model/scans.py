@@ -15,7 +15,10 @@ from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, r
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import RecordedScan
 
-WITHOUT_LIDAR = "the model was trained without LiDAR: train it with train.scans.per_image above 0"
+WITHOUT_LIDAR = (
+    "the model was trained without LiDAR: take a method such as street_lidar, "
+    "or train it with train.scans.per_image above 0"
+)
 
 
 @dataclass(frozen=True)
