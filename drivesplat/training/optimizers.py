@@ -10,11 +10,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from drivesplat.kernels import torch_private
-from drivesplat.kernels.optimization import adam_step
+from drivesplat.kernels.optimization import AdamStep, adam_steps
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.schedule import Schedule
 
+BETAS, EPS = (0.9, 0.999), 1e-15
 DECAY = 0.01
 """Final learning rate of what decays (positions, exposures, deformations, ...), and of all that is fine-tuned, as a
 fraction of the initial rate."""
@@ -29,11 +30,11 @@ AVERAGED_EVERY = 5
 class Adam(torch.optim.Adam):
     """torch.optim.Adam, fused, of one parameter, for `ModelOptimizers`: the same fields and format of state. Its own
     methods avoid torch's, whose first call imports torch's compiler, which takes a second or more. The state and
-    `broken` (`adam_step`) exist from the beginning: a CUDA graph that captured their creation would reset them at every
+    `broken` (`adam_steps`) exist from the beginning: a CUDA graph that captured their creation would reset them at every
     replay."""
 
     def __init__(self, parameter: nn.Parameter, rate: float):
-        super().__init__([parameter], lr=rate, eps=1e-15, fused=True)
+        super().__init__([parameter], lr=rate, betas=BETAS, eps=EPS, fused=True)
         step = torch.zeros((), dtype=torch.float32, device=parameter.device)
         moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
         self.state[parameter] = {"step": step, **moments}
@@ -77,19 +78,21 @@ class ModelOptimizers:
         """Steps every optimizer that has a gradient and drops the gradient; with the `rates` in device memory, by name,
         where given. Returns, by name, values that are finite only if the gradients are.
 
-        The same as torch.optim.Adam with `fused`, but all step counters are incremented at once: separate steps take
-        Python longer than the GPU.
+        The same as torch.optim.Adam with `fused`, but parameters share launches: separate steps take Python, and their
+        gaps on a GPU, longer than the work.
         """
-        ready = [(name, optimizer) for name, optimizer in self.all() if optimizer.parameter.grad is not None]
-        if ready:
-            torch_private.increment([optimizer.state[optimizer.parameter]["step"] for _, optimizer in ready])
-        watched = {}
-        for name, optimizer in ready:
-            parameter, (group,) = optimizer.parameter, optimizer.param_groups
-            rate, state = group["lr"] if rates is None else rates[name], optimizer.state[parameter]
-            watched[name] = adam_step(parameter, state, rate, group["betas"], group["eps"], optimizer.broken)
-            parameter.grad = None
-        return watched
+        ready = {name: optimizer for name, optimizer in self.all() if optimizer.parameter.grad is not None}
+        if not ready:
+            return {}
+        torch_private.increment([optimizer.state[optimizer.parameter]["step"] for optimizer in ready.values()])
+        steps = []
+        for name, optimizer in ready.items():
+            rate = optimizer.param_groups[0]["lr"] if rates is None else rates[name]
+            steps.append(AdamStep(optimizer.parameter, optimizer.state[optimizer.parameter], rate, optimizer.broken))
+        watched = adam_steps(steps, BETAS, EPS)
+        for step in steps:
+            step.parameter.grad = None
+        return dict(zip(ready, watched, strict=True))
 
 
 class DeviceSchedule:

@@ -31,7 +31,7 @@ from drivesplat.kernels.depth_error import mean_depth_error
 from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.kernels.mcmc import explore
 from drivesplat.kernels.object_poses import corrected
-from drivesplat.kernels.optimization import NEVER, adam_step, record_not_finite
+from drivesplat.kernels.optimization import NEVER, AdamStep, adam_steps, record_not_finite
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, colors_in_world, place
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import mean_opacity_and_scale, mean_thickness, sums_of_squares
@@ -136,39 +136,50 @@ def test_the_first_iterations_of_values_that_are_not_finite_agree_with_torch():
     assert torch.equal(*found) and (found[0] == 3).any()
 
 
-def test_adam_steps_agree_with_torch():
-    from drivesplat.kernels.triton.optimization import adam_step as fused_step
+def adam_state(parameter: torch.Tensor) -> dict[str, torch.Tensor]:
+    return {**{name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}, "step": scalar(0.0)}
 
+
+def scalar(value: float) -> torch.Tensor:
+    return torch.tensor(value, device=DEVICE)
+
+
+def test_adam_steps_agree_with_torch():
+    """More parameters than one launch has, of no, one and several blocks, each at its own rate."""
     torch.manual_seed(0)
-    theirs = torch.randn(400, 3, device=DEVICE)
-    mine, rate = theirs.clone(), torch.tensor(0.02, device=DEVICE)
-    states = {"exp_avg": torch.zeros_like(mine), "exp_avg_sq": torch.zeros_like(mine), "step": rate.new_zeros(())}
-    broken = rate.new_zeros(())
-    adam = torch.optim.Adam([theirs], lr=0.02, eps=1e-15, fused=True)
-    for step in range(8):
-        theirs.grad = torch.randn_like(theirs) * 10.0 ** -(step % 7)
-        rate.fill_(0.02 * 0.9**step)
-        adam.param_groups[0]["lr"] = 0.02 * 0.9**step
-        states["step"] += 1
-        fused_step(mine, theirs.grad, states, rate, (0.9, 0.999), 1e-15, broken)
-        adam.step()
-        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
-    assert broken == 0.0
+    sizes = (0, 1, 7, 1024, 1025, 3000, 2, 900, 2048, 5)
+    mine = [torch.nn.Parameter(torch.randn(size, 1, 3, device=DEVICE)) for size in sizes]
+    theirs = [parameter.detach().clone() for parameter in mine]
+    steps = [AdamStep(p, adam_state(p), scalar(0.02 / (k + 1)), scalar(0.0)) for k, p in enumerate(mine)]
+    groups = [{"params": [p], "lr": 0.02 / (k + 1)} for k, p in enumerate(theirs)]
+    adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    with triton(True):
+        for number in range(8):
+            for own, their, step, group in zip(mine, theirs, steps, adam.param_groups, strict=True):
+                own.grad = their.grad = torch.randn_like(their) * 10.0 ** -(number % 7)
+                step.rate.mul_(0.9)
+                group["lr"] *= 0.9
+                step.state["step"].add_(1)
+            adam_steps(steps, (0.9, 0.999), 1e-15)
+            adam.step()
+            torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5, check_device=False)
+    assert not any(step.broken for step in steps)
 
 
 @pytest.mark.parametrize("value", [torch.nan, -torch.inf, 1e25])
 @pytest.mark.parametrize("used", [True, False])
-def test_an_adam_step_reports_a_gradient_that_is_not_finite(used, value):
+def test_an_adam_step_reports_the_gradient_that_is_not_finite(used, value):
     """Or its square. Triton's kernel does so for good: a later gradient may be finite again."""
-    parameter, rate = torch.nn.Parameter(torch.ones(700, 3, device=DEVICE)), torch.tensor(0.02, device=DEVICE)
-    moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
-    states, broken, found = {**moments, "step": rate.new_ones(())}, rate.new_zeros(()), []
+    parameters = [torch.nn.Parameter(torch.ones(700, 3, device=DEVICE)) for _ in range(2)]
+    steps = [AdamStep(p, {**adam_state(p), "step": scalar(1.0)}, scalar(0.02), scalar(0.0)) for p in parameters]
+    found = []
     for wrong in (0.5, value, 0.5):
-        parameter.grad = torch.full_like(parameter, 0.5)
-        parameter.grad[650, 1] = wrong
+        for parameter in parameters:
+            parameter.grad = torch.full_like(parameter, 0.5)
+        parameters[1].grad[650, 1] = wrong
         with triton(used):
-            found.append(bool(adam_step(parameter, states, rate, (0.9, 0.999), 1e-15, broken).isfinite()))
-    assert found == [True, False, not used]
+            found.append([bool(own.isfinite()) for own in adam_steps(steps, (0.9, 0.999), 1e-15)])
+    assert found == [[True, True], [True, False], [True, not used]]
 
 
 @pytest.mark.parametrize(("objects", "annotations"), [(3, 20), (5, 300)])
@@ -547,6 +558,10 @@ ROAD = {"offsets": FLOATS, "keys": "*i64", "known": "i32", "edge": "fp32", "reac
         "cells": "*i32"}
 SCAN |= dict.fromkeys((road_distance._distances, road_distance._distances_backward), ROAD)
 SCAN[optimization._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
+SCAN[optimization._step] = {
+    **dict.fromkeys(("values", "gradients", "averages", "squares", "counted", "rates", "broken"), 8 * (FLOATS,)),
+    "counts": 8 * ("i32",),
+}
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
@@ -559,7 +574,7 @@ def compiled(kernel, **constants):
              for name in kernel.arg_names}
     if kernel in (cube_map._blend, cube_map._gradients):
         kinds["pixels"] = "i32"
-    if kernel in (optimization._step, chunks._split, joined_chunks._composite, joined_chunks._composite_backward):
+    if kernel in (chunks._split, joined_chunks._composite, joined_chunks._composite_backward):
         kinds["values"] = FLOATS
     kinds |= {name: kind for name, kind in SCAN.get(kernel, {}).items() if name in kinds}
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
