@@ -13,8 +13,8 @@ NEVER = 2**62
 
 
 class AdamStep(NamedTuple):
-    """A parameter with a gradient, the `state` of torch.optim.Adam, whose step is already incremented, the learning
-    rate, and what `adam_steps` sets to infinity for gradients that are not finite."""
+    """A parameter with a gradient, the `state` of torch.optim.Adam, the learning rate, and what `adam_steps` sets to
+    infinity for a gradient that is not finite."""
 
     parameter: Tensor
     state: dict[str, Tensor]
@@ -23,8 +23,8 @@ class AdamStep(NamedTuple):
 
 
 def adam_steps(steps: Sequence[AdamStep], betas: tuple[float, float], eps: float) -> list[Float[Tensor, ""]]:
-    """Updates parameters by their gradients, as torch.optim.Adam does. Rates that are tensors are read on the device,
-    without host synchronisation.
+    """Updates parameters by their gradients, and their states, as torch.optim.Adam does. Rates that are tensors are
+    read on the device, without host synchronisation.
 
     Returns a value of each step that is finite only if the gradient and its square are. Triton's kernel, which reads
     the gradients anyway, sets `broken` to infinity where they are not, and the value is `broken`, which stays infinite.
@@ -40,6 +40,7 @@ def adam_steps(steps: Sequence[AdamStep], betas: tuple[float, float], eps: float
             eps,
         )
         return [step.broken for step in steps]
+    torch_private.increment([step.state["step"] for step in steps])
     norms = [torch.linalg.vector_norm(step.parameter.grad) for step in steps]
     for parameter, state, rate, _ in steps:
         torch_private.fused_adam_step(parameter, parameter.grad, state, rate, betas, eps)

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat.kernels import torch_private
 from drivesplat.kernels.optimization import AdamStep, adam_steps
 from drivesplat.model.parameters import OFFSETS
 from drivesplat.model.splat_model import SplatModel
@@ -82,9 +81,6 @@ class ModelOptimizers:
         gaps on a GPU, longer than the work.
         """
         ready = {name: optimizer for name, optimizer in self.all() if optimizer.parameter.grad is not None}
-        if not ready:
-            return {}
-        torch_private.increment([optimizer.state[optimizer.parameter]["step"] for optimizer in ready.values()])
         steps = []
         for name, optimizer in ready.items():
             rate = optimizer.param_groups[0]["lr"] if rates is None else rates[name]

@@ -159,7 +159,6 @@ def test_adam_steps_agree_with_torch():
                 own.grad = their.grad = torch.randn_like(their) * 10.0 ** -(number % 7)
                 step.rate.mul_(0.9)
                 group["lr"] *= 0.9
-                step.state["step"].add_(1)
             adam_steps(steps, (0.9, 0.999), 1e-15)
             adam.step()
             torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5, check_device=False)
@@ -560,8 +559,9 @@ SCAN |= dict.fromkeys((road_distance._distances, road_distance._distances_backwa
 SCAN[optimization._record] = {"values": FLOATS, "step": "*i64", "first": "*i64"}
 SCAN[optimization._step] = {
     **dict.fromkeys(("values", "gradients", "averages", "squares", "counted", "rates", "broken"), 8 * (FLOATS,)),
-    "counts": 8 * ("i32",),
+    **{f"count{k}": "i32" for k in range(8)},
 }
+SCAN[optimization._count] = {"counted": 8 * (FLOATS,)}
 SCAN |= dict.fromkeys((depth_error._errors, depth_error._refine, depth_error._sum, depth_error._gradients), DEPTHS)
 SCAN |= dict.fromkeys((scan_sums._pass, scan_sums._composite, scan_compositing._join), RAYS)
 SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
@@ -584,7 +584,7 @@ def compiled(kernel, **constants):
 for module, names in (
     (probe, "_increment"), (road_distance, "_distances_backward"), (tiles, "_count_tiles _list"),
     (lidar_response, "_values _values_backward"), (placement, "_place _place_backward"),
-    (optimization, "_record _step"),
+    (optimization, "_count _record _step"),
     (regularizers, "_sums _means _spread _thinnest _spread_to_thinnest"), (depth_error, "_errors _gradients"),
     (scan_tiles, "_count_tiles _compact _list"), (scan_sums, "_pass"), (scan_compositing, "_arrive"),
     (exploration, "_move"), (cube_map, "_blend _gradients"), (object_poses, "_correct _correct_backward"),
