@@ -39,9 +39,9 @@ from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings
 from drivesplat.trajectories.motion import HALF_STEP
 
-MAX_SPREAD = 0.6
-"""Maximum standard deviation of a Gaussian along an axis of its box, as a fraction of half the size of the box with its
-margin. What fills a box evenly has 0.58."""
+MAX_OVERHANG_M, MIN_SPREAD_M = 0.15, 0.03
+"""How far two standard deviations of a Gaussian may reach beyond its box with its margin, and the standard deviation
+that is always allowed."""
 
 
 class Actors(Part):
@@ -214,12 +214,14 @@ class Actors(Part):
 
     @torch.no_grad()
     def confine(self) -> None:
-        """Fades Gaussians with centres outside their box, and shrinks those that spread beyond it. A LiDAR cannot tell
-        a piece of road that moves with a car from road that stands still; without the limit such Gaussians may grow."""
+        """Fades Gaussians with centres outside their box, and shrinks those that spread beyond it: to the cameras of
+        one side they look right, and from other sides they are spikes. A LiDAR cannot tell a piece of road that moves
+        with a car from road that stands still; without the limit such Gaussians may grow."""
         p, reach = self.params, of_owners(self._reach, self._owns)
         fade(p, (p["means"].abs() > reach).any(dim=1))
         axes = rotation_matrix(normalize(p["quats"], dim=1)) * torch.exp(p["scales"])[:, None]
-        excess = (axes.norm(dim=2) / (MAX_SPREAD * reach)).amax(dim=1, keepdim=True)
+        allowed = ((reach + MAX_OVERHANG_M - p["means"].abs()) / 2).clamp(min=MIN_SPREAD_M)
+        excess = (axes.norm(dim=2) / allowed).amax(dim=1, keepdim=True)
         p["scales"].sub_(excess.clamp(min=1.0).log())
 
     @torch.no_grad()

@@ -29,8 +29,8 @@ AVERAGED_EVERY = 5
 class Adam(torch.optim.Adam):
     """torch.optim.Adam, fused, of one parameter, for `ModelOptimizers`: the same fields and format of state. Its own
     methods avoid torch's, whose first call imports torch's compiler, which takes a second or more. The state and
-    `broken` (`adam_steps`) exist from the beginning: a CUDA graph that captured their creation would reset them at every
-    replay."""
+    `broken` (`adam_steps`) exist from the beginning: a CUDA graph that captured their creation would reset them at
+    every replay."""
 
     def __init__(self, parameter: nn.Parameter, rate: float):
         super().__init__([parameter], lr=rate, betas=BETAS, eps=EPS, fused=True)

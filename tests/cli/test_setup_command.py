@@ -11,7 +11,7 @@ from drivesplat.cli import setup
 from drivesplat.cli.__main__ import main
 from drivesplat.kernels import triton_support
 from drivesplat.kernels.cuda import compiled
-from drivesplat.settings.config import load, merged
+from drivesplat.settings.config import for_scene, load, merged
 
 
 class Runs:
@@ -68,12 +68,33 @@ def test_nothing_is_run_without_a_card_for_which_triton_compiles(missing, cards,
 
 def test_the_drive_of_the_warm_up_trains_the_methods_of_the_workflow_on_a_card():
     """As many jobs share a card as Snakemake is told."""
-    values = yaml.safe_load((setup.WORKFLOW / "config.yaml").read_text())
-    for preset in setup.PRESETS:
-        values = merged(values, yaml.safe_load(Path(preset).read_text()))
-    config = load(values)
+    config = warm_up_config()
     assert {"vanilla", "street", "street_lidar"} <= set(config.methods) and config.batch_scenes == ["demo"]
     assert config.device.kind == "cuda" and config.device.jobs_per_card == setup.JOBS_PER_CARD
+
+
+def test_the_warm_up_trains_every_kind_of_image_that_has_kernels_of_its_own():
+    """With and without a rolling shutter, LiDAR depth and limited scales: those of recorded drives and of the demo."""
+    config = warm_up_config()
+    assert config.datasets["demo"].world.readout_s > 0
+    kinds = set()
+    for method in config.methods:
+        train = for_scene(config, "demo", method).train
+        kinds.add((train.rolling_shutter, train.depth_weight > 0, train.max_scale > 0))
+    assert {(True, True, False), (False, True, False), (False, False, False), (False, True, True)} <= kinds
+    shipped = load(shipped_values())
+    assert shipped.train.max_scale == 0 < for_scene(shipped, "demo", "street").train.max_scale
+
+
+def shipped_values():
+    return yaml.safe_load((setup.WORKFLOW / "config.yaml").read_text())
+
+
+def warm_up_config():
+    values = shipped_values()
+    for preset in setup.PRESETS:
+        values = merged(values, yaml.safe_load(Path(preset).read_text()))
+    return load(values)
 
 
 def test_arch_compiles_every_program_for_cards_that_are_elsewhere(monkeypatch, tmp_path, capsys):

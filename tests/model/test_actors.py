@@ -349,7 +349,7 @@ def test_only_gaussians_outside_their_own_enlarged_box_fade():
     params = {name: value.detach()[: len(cases)].clone() for name, value in actors.params.items()}
     params["owner"] = torch.tensor([owner for owner, _, _ in cases])
     params["means"] = torch.tensor([place for _, place, _ in cases])
-    params["scales"] = torch.full((len(cases), 3), -3.0)
+    params["scales"] = torch.full((len(cases), 3), -4.0)
     few = Actors(params, [van(), car()], ActorSettings(box_margin=0.1), GaussianSettings())
     before = {name: value.detach().clone() for name, value in few.named_parameters()}
     few.confine()
@@ -364,18 +364,22 @@ def test_only_gaussians_outside_their_own_enlarged_box_fade():
 
 
 def test_gaussians_that_spread_beyond_their_own_box_shrink():
-    """The car's box is 4 x 2 x 1.6 m, grown by 0.1 m on every side: along its axes standard deviations of 1.26, 0.66
-    and 0.54 m. The third Gaussian is turned by 90 degrees about the vertical: its long axis is across the car."""
+    """The car's box is 4 x 2 x 1.6 m, grown by 0.1 m on every side: in its middle standard deviations of 1.125, 0.625
+    and 0.525 m end 0.15 m beyond it. The third Gaussian is turned by 90 degrees about the vertical: its long axis is
+    across the car. The last ones stand at the left side and beyond it."""
     half = 0.5**0.5
-    turns = torch.tensor([[1.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half], [1.0, 0.0, 0.0, 0.0]])
-    scales = torch.tensor([[1.2, 0.6, 0.5], [0.3, 1.98, 0.3], [2.64, 0.1, 0.1], [0.0, 0.0, 0.0]])
-    params = {name: value.detach()[:4].clone() for name, value in actors_of(car(), count=4).params.items()}
-    params |= {"quats": turns, "scales": scales.log(), "means": torch.zeros(4, 3)}
+    turns = torch.tensor([[1.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half], *[[1.0, 0, 0, 0]] * 3])
+    scales = torch.tensor(
+        [[1.1, 0.6, 0.5], [0.3, 1.875, 0.3], [2.5, 0.1, 0.1], [0.1, 0.1, 0.1], [0.5, 0.25, 0.2], [0.03, 0.12, 0.03]]
+    )
+    params = {name: value.detach()[:6].clone() for name, value in actors_of(car(), count=6).params.items()}
+    beside = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.3])
+    params |= {"quats": turns, "scales": scales.log(), "means": beside[:, None] * torch.tensor([0.0, 1.0, 0.0])}
     actors = Actors(params, [car()], ActorSettings(box_margin=0.1), GaussianSettings())
     actors.confine()
-    expected = scales / torch.tensor([1.0, 3.0, 4.0, 1.0])[:, None]
+    expected = scales / torch.tensor([1.0, 3.0, 4.0, 1.0, 2.0, 4.0])[:, None]
     torch.testing.assert_close(actors.params["scales"].exp().detach(), expected, rtol=0.01, atol=0.0)
-    assert torch.equal(actors.params["scales"][0], scales[0].log()), "what fits is unchanged"
+    assert torch.equal(actors.params["scales"][[0, 3]], scales[[0, 3]].log()), "what fits is unchanged"
     again = actors.params["scales"].detach().clone()
     actors.confine()
     torch.testing.assert_close(actors.params["scales"].detach(), again)

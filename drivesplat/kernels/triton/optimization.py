@@ -1,5 +1,5 @@
-"""Steps of Adam (Kingma and Ba 2015, algorithm 1) of several parameters, limited by memory bandwidth alone, and the first
-iterations at which values were not finite, in one kernel each."""
+"""Steps of Adam (Kingma and Ba 2015, algorithm 1) of several parameters, limited by memory bandwidth alone, and the
+first iterations at which values were not finite, in one kernel each."""
 
 import math
 from collections.abc import Sequence
