@@ -1,7 +1,9 @@
 """Exposure and white balance of each camera: between the cameras of a rig, and over time."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -9,15 +11,34 @@ from torch import Tensor, nn
 from drivesplat.model.view import View
 from drivesplat.settings.train import ExposureSettings
 
+MIN_INTERVAL_S = 0.1
+"""Smallest time between the nodes of exposures that change over time."""
 CHANNELS = ("red", "green", "blue")
 CHANGE_RATIO = 2.0
 """Expected size of log gains over their expected change within a second, a random walk."""
 
 
+class GainCourse(NamedTuple):
+    """Log gains (k, 3) of the colour channels of a camera at its k training images, at `seconds` (k,), of mean 0."""
+
+    seconds: np.ndarray
+    log_gains: np.ndarray
+
+    @property
+    def interval(self) -> float:
+        """The usual time between two images."""
+        return max(MIN_INTERVAL_S, float(np.median(np.diff(self.seconds))))
+
+    def at(self, seconds: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """The log gains at other times: linear between images, constant beyond them."""
+        return np.stack([np.interp(seconds, self.seconds, values) for values in self.log_gains.T], axis=1)
+
+
 class Exposures(nn.Module):
     """An affine map of every colour channel, by camera and time t: c becomes f exp(g + g(t)) c + o.
 
-    `first` holds the initial gains f (3,) of the cameras with constants, estimated before the training. `params` is
+    `first` holds the initial gains f (3,) of the cameras with constants, and `course` log gains (k, 3) at the nodes of
+    cameras whose exposure changes, to which g(t) is added; both are estimated before the training. `params` is
     what is learned of each camera, (r, 3), in units of its expected size and initially 0: log gain g (row 0) and offset
     o (row 1), only of these cameras, then the log gains g(t) at the k times `nodes` (seconds). Between nodes g(t) is
     linear, beyond them constant.
@@ -32,12 +53,16 @@ class Exposures(nn.Module):
         settings: ExposureSettings,
         cameras: tuple[str, ...] = (),
         nodes: Float[Tensor, " k"] | None = None,
+        course: Mapping[str, Tensor] | None = None,
     ):
-        """`cameras` without constants, besides those in `first`."""
+        """`cameras` without constants, besides those in `first`. Cameras with a `course` are among both."""
         super().__init__()
         self.register_buffer("nodes", torch.zeros(0) if nodes is None else nodes.clone())
         self.first = nn.ParameterDict(
             {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in first.items()}
+        )
+        self.course = nn.ParameterDict(
+            {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in (course or {}).items()}
         )
         rows = {
             **dict.fromkeys(first, 2 + len(self.nodes)),
@@ -78,11 +103,14 @@ class Exposures(nn.Module):
         log_gains, offsets = self._log_gains(changing, seconds), 0.0
         if len(constants):
             log_gains, offsets = log_gains + constants[0], self._settings.sigma_offset * constants[1]
-        gains = torch.exp(self._settings.sigma_gain * log_gains)
+        log_gains = self._settings.sigma_gain * log_gains
+        if camera in self.course:
+            log_gains = log_gains + self._log_gains(self.course[camera], seconds)
+        gains = torch.exp(log_gains)
         return (gains * self.first[camera] if len(constants) else gains), offsets
 
     def _log_gains(self, changing: Float[Tensor, "k 3"], seconds: Float[Tensor, ""]) -> Float[Tensor, "3"]:
-        """The log gains over time, in units of their expected size."""
+        """The log gains over time between those at the nodes."""
         if not len(changing):
             return changing.new_zeros(3)
         within = torch.minimum(torch.maximum(seconds, self.nodes[0]), self.nodes[-1])
@@ -119,7 +147,8 @@ class Exposures(nn.Module):
                     f"{camera}/{n}_{c}": v for n, own in found for c, v in zip(CHANNELS, own.tolist(), strict=True)
                 }
             if len(changing):
-                factors = torch.exp(self._settings.sigma_gain * changing)
+                known = self.course.get(camera, 0.0)
+                factors = torch.exp(self._settings.sigma_gain * changing + known)
                 figures |= {
                     f"{camera}/factor_least": float(factors.min()),
                     f"{camera}/factor_largest": float(factors.max()),

@@ -1,18 +1,21 @@
-"""Initial exposures of cameras, estimated before the training from surfaces that several cameras recorded.
+"""Initial exposures, estimated before the training from surfaces: of cameras, from those that several of them
+recorded, and over time, from those that several images of a camera show.
 
-Training alone hardly corrects them: Gaussians seen by one camera soon take on its colours, and then confirm its
-exposure.
+Training alone hardly corrects them: Gaussians seen by one camera, or for a short time, soon take on its colours, and
+then confirm its exposure.
 """
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import visible
+from drivesplat.model.exposure import GainCourse
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.training.views import TrainingView
 
@@ -28,6 +31,17 @@ VALID_LEVELS = (8, 247)
 """Levels between which a pixel is neither clipped nor noise."""
 ROUNDS = 8
 """Number of passes over all cameras; three connect a rig of six."""
+COURSE_POINTS = 30_000
+"""Of more seed points, exposures over time are estimated from at most so many."""
+NEXT_IMAGES = (1, 2, 4, 8, 16)
+"""Images of a camera are compared with those so many images later."""
+DISTANCE_GROUPS = 4
+"""Groups into which the points of two images are split by how their distance changes."""
+MIN_COURSE = 0.1
+"""Smallest deviation of log gains from their mean for which exposures are said to change over time."""
+TIE = 1e-4
+"""Weight of log gains of 0, relative to that of all comparisons with an image: it fixes their mean, and the gains of
+images that share no surface with others."""
 
 
 class Sightings(NamedTuple):
@@ -67,6 +81,17 @@ def sightings(points: np.ndarray, views: Sequence[TrainingView], cameras: Sequen
     """What each of `cameras` saw of world points (n, 3). Pixels of the ego vehicle and those outside VALID_LEVELS are
     left out."""
 
+    found: dict[str | None, list[Sightings]] = {camera: [] for camera in cameras}
+    chosen = [view for view in views if view.view.camera in found]
+    for view, own in zip(chosen, _sightings_of(points, chosen), strict=True):
+        found[view.view.camera].append(own)
+    nothing = Sightings(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
+    return [Sightings(*(np.concatenate(values) for values in zip(nothing, *found[c], strict=True))) for c in cameras]
+
+
+def _sightings_of(points: np.ndarray, views: Sequence[TrainingView]) -> Iterator[Sightings]:
+    """What each view saw of world points (n, 3), in ascending order of the points."""
+
     def seen_in(view: TrainingView) -> Sightings:
         at = view.view.viewmat.double().cpu().numpy(), view.view.K.double().cpu().numpy()
         index, rows, columns, _ = visible(points, *at, (view.view.height, view.view.width))
@@ -78,12 +103,57 @@ def sightings(points: np.ndarray, views: Sequence[TrainingView], cameras: Sequen
         distances = np.linalg.norm(points[index[valid]] - position, axis=1)
         return Sightings(index[valid], distances, colors[valid])
 
-    found: dict[str | None, list[Sightings]] = {camera: [] for camera in cameras}
-    chosen = [view for view in views if view.view.camera in found]
-    for view, own in zip(chosen, prefetch(seen_in, chosen), strict=True):
-        found[view.view.camera].append(own)
-    nothing = Sightings(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
-    return [Sightings(*(np.concatenate(values) for values in zip(nothing, *found[c], strict=True))) for c in cameras]
+    return prefetch(seen_in, views)
+
+
+def gains_over_time(record: TrainingRecord, views: Sequence[TrainingView]) -> dict[str, GainCourse]:
+    """How the exposure of each camera changes, by the seed points on surfaces; without cameras whose log gains stay
+    within MIN_COURSE of their mean. `views` are the training images."""
+    surfaces = record.points[: len(record.points) - record.seed.far]
+    surfaces = surfaces[:: max(1, math.ceil(len(surfaces) / COURSE_POINTS))].astype(np.float64)
+    seconds = np.array([record.seconds(i) for i in record.train_images])
+    found = {}
+    for camera in sorted(record.train_cameras):
+        own = np.array([i for i, view in enumerate(views) if view.view.camera == camera])
+        own = own[np.argsort(seconds[own], kind="stable")]
+        gains = course_of(list(_sightings_of(surfaces, [views[i] for i in own])))
+        if np.abs(gains).max(initial=0.0) < MIN_COURSE:
+            continue
+        found[camera] = GainCourse(seconds[own], gains)
+        least, most = np.exp(gains[:, 1].min()), np.exp(gains[:, 1].max())
+        log.info("%s: exposure changes: gains of green from %.2f to %.2f times their mean", camera, least, most)
+    return found
+
+
+def course_of(seen: Sequence[Sightings]) -> Float[np.ndarray, "k 3"]:
+    """The log gains of k images of one camera, in order, of mean 0, by points that they share.
+
+    The colour of a point changes with its distance, too, by haze above all. Of two images the log colours of a group of
+    points therefore differ by that of the log gains, and by a constant of all images times the change of the log
+    distance; least squares over the medians of all groups.
+    """
+    count, rows, columns, values, weights = len(seen), [], [], [], []
+    for i, j in ((i, i + step) for step in NEXT_IMAGES for i in range(count - step)):
+        _, at, also = np.intersect1d(seen[i].point, seen[j].point, assume_unique=True, return_indices=True)
+        if len(at) < MIN_SHARED_POINTS:
+            continue
+        nearer = np.log(np.maximum(seen[j].distance[also], 1.0) / np.maximum(seen[i].distance[at], 1.0))
+        change = np.log(seen[j].color[also].astype(np.float64)) - np.log(seen[i].color[at])
+        for group in np.array_split(np.argsort(nearer), DISTANCE_GROUPS):
+            rows.append((i, j))
+            columns.append(np.median(nearer[group]))
+            values.append(np.median(change[group], axis=0))
+            weights.append(len(group))
+    if not rows:
+        return np.zeros((count, 3))
+    equations = np.zeros((len(rows), count + 1))
+    pairs, each = np.array(rows), np.arange(len(rows))
+    equations[each, pairs[:, 0]], equations[each, pairs[:, 1]], equations[:, -1] = -1.0, 1.0, columns
+    weighted = equations * np.array(weights)[:, None]
+    normal = equations.T @ weighted
+    normal += TIE * np.diag(normal).mean() * np.eye(count + 1)
+    gains = np.linalg.solve(normal, weighted.T @ np.array(values))[:-1]
+    return gains - gains.mean(axis=0)
 
 
 def log_colors(seen: Sequence[Sightings], step: float) -> np.ndarray:

@@ -32,7 +32,7 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.augmentation import choose_mirrored, dropout_share
-from drivesplat.training.exposure_init import initial_gains
+from drivesplat.training.exposure_init import gains_over_time, initial_gains
 from drivesplat.training.loop import TrainingFolders, TrainingSummary, train
 from drivesplat.training.previous_block import PreviousBlock, read_previous, start_from
 from drivesplat.training.probes import MAX_OF_GROUP, NO_PROBES, CurveImage, Probes, evenly_spaced
@@ -203,6 +203,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         initial_lidar_logits(inputs.scans) if job.train.scans.per_image else None,
         len(inputs.scans),
         seed,
+        gains_over_time(inputs.record, views) if job.reference_camera and job.train.exposure.interval else {},
     )
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
         views = [dataclasses.replace(view, sky=None) for view in views]
