@@ -37,6 +37,9 @@ NEXT_IMAGES = (1, 2, 4, 8, 16)
 """Images of a camera are compared with those so many images later."""
 DISTANCE_GROUPS = 4
 """Groups into which the points of two images are split by how their distance changes."""
+DRIFT = 0.1
+"""Changes of log gains per second up to this are left out, and those of twice as much kept whole: what comes nearer
+changes its colour as slowly, and the training learns slow changes itself."""
 MIN_COURSE = 0.1
 """Smallest deviation of log gains from their mean for which exposures are said to change over time."""
 TIE = 1e-4
@@ -116,7 +119,7 @@ def gains_over_time(record: TrainingRecord, views: Sequence[TrainingView]) -> di
     for camera in sorted(record.train_cameras):
         own = np.array([i for i, view in enumerate(views) if view.view.camera == camera])
         own = own[np.argsort(seconds[own], kind="stable")]
-        gains = course_of(list(_sightings_of(surfaces, [views[i] for i in own])))
+        gains = without_drift(course_of(list(_sightings_of(surfaces, [views[i] for i in own]))), seconds[own])
         if np.abs(gains).max(initial=0.0) < MIN_COURSE:
             continue
         found[camera] = GainCourse(seconds[own], gains)
@@ -126,7 +129,7 @@ def gains_over_time(record: TrainingRecord, views: Sequence[TrainingView]) -> di
 
 
 def course_of(seen: Sequence[Sightings]) -> Float[np.ndarray, "k 3"]:
-    """The log gains of k images of one camera, in order, of mean 0, by points that they share.
+    """The log gains of k images of one camera, in order, by points that they share.
 
     The colour of a point changes with its distance, too, by haze above all. Of two images the log colours of a group of
     points therefore differ by that of the log gains, and by a constant of all images times the change of the log
@@ -152,8 +155,16 @@ def course_of(seen: Sequence[Sightings]) -> Float[np.ndarray, "k 3"]:
     weighted = equations * np.array(weights)[:, None]
     normal = equations.T @ weighted
     normal += TIE * np.diag(normal).mean() * np.eye(count + 1)
-    gains = np.linalg.solve(normal, weighted.T @ np.array(values))[:-1]
-    return gains - gains.mean(axis=0)
+    return np.linalg.solve(normal, weighted.T @ np.array(values))[:-1]
+
+
+def without_drift(gains: Float[np.ndarray, "k 3"], seconds: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
+    """Log gains of mean 0 at ascending times whose slow changes are left out (DRIFT)."""
+    change = np.diff(gains, axis=0)
+    slow = DRIFT * np.diff(seconds)[:, None]
+    kept = change * np.clip(np.abs(change) / np.maximum(slow, 1e-9) - 1.0, 0.0, 1.0)
+    found = np.concatenate([np.zeros((1, 3)), np.cumsum(kept, axis=0)])
+    return found - found.mean(axis=0)
 
 
 def log_colors(seen: Sequence[Sightings], step: float) -> np.ndarray:
