@@ -43,8 +43,8 @@ class Exposures(nn.Module):
     o (row 1), only of these cameras, then the log gains g(t) at the k times `nodes` (seconds). Between nodes g(t) is
     linear, beyond them constant.
 
-    Cameras without parameters, and views without a camera, keep the model's colours. The reference camera has no
-    constants: it fixes the brightness of the scene.
+    The reference camera has no constants: it fixes the brightness of the scene. Views without a camera have its course
+    alone, so that they look as images of that time do. Cameras without parameters keep the model's colours.
     """
 
     def __init__(
@@ -72,9 +72,12 @@ class Exposures(nn.Module):
             {camera: nn.Parameter(torch.zeros(rows[camera], 3)) for camera in sorted(rows) if rows[camera]}
         )
         self._settings = settings
+        self._reference = next((camera for camera in sorted(set(cameras) - set(first))), None)
 
     def applied(self, image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, "h w 3"]:
         """Maps an image from the model's colours to those of the view's camera at its time."""
+        if view.camera is None and self._reference in self.course:
+            return image * torch.exp(self._log_gains(self.course[self._reference], view.moment))
         if view.camera not in self.params:
             return image
         gains, offsets = self._map(view.camera, view.moment)
@@ -128,6 +131,20 @@ class Exposures(nn.Module):
                     self.first[camera].copy_(other.first[camera])
             for row, node in zip(changing, self.nodes - seconds, strict=True):
                 row.copy_(other._log_gains(others_changing, node))
+            self._continue_course(other, camera, seconds)
+
+    def _continue_course(self, other: "Exposures", camera: str, seconds: float) -> None:
+        """Shifts a camera's course by what it differs from that of other exposures at the times of both, where the
+        scene has the same colours."""
+        if camera not in self.course and camera not in other.course:
+            return
+        nothing = self.nodes.new_zeros(len(self.nodes), 3)
+        own, times = self.course.get(camera, nothing), self.nodes - seconds
+        others = other.course.get(camera, other.nodes.new_zeros(len(other.nodes), 3))
+        common = times[(times >= other.nodes[0]) & (times <= other.nodes[-1])]
+        common = common if len(common) else times[:1]
+        shifts = [other._log_gains(others, at) - self._log_gains(own, at + seconds) for at in common]
+        self.course[camera] = nn.Parameter(own + torch.stack(shifts).mean(dim=0), requires_grad=False)
 
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every camera's entry of `params`."""

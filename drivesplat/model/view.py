@@ -44,7 +44,7 @@ def inverse(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 @dataclass(frozen=True)
 class View:
     """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image. `camera` names the camera
-    of the rig whose exposure applies; None: the model's own colours. `shutter` is None for a global shutter; otherwise
+    of the rig whose exposure applies (None: `Exposures` says which). `shutter` is None for a global shutter; otherwise
     pose and time are those of the image's timestamp. `seconds` is `time` on the device, for captured steps."""
 
     K: Float[Tensor, "3 3"]

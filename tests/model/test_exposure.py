@@ -28,7 +28,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
-from drivesplat.model.exposure import Exposures, exposure_nodes
+from drivesplat.model.exposure import Exposures, GainCourse, exposure_nodes
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.preprocess.lidar_seed import seed_points
@@ -38,7 +38,17 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
-from drivesplat.training.exposure_init import DISTANCE_STEP, Sightings, initial_gains, log_colors, log_gains
+from drivesplat.training.exposure_init import (
+    DISTANCE_STEP,
+    DRIFT,
+    Sightings,
+    course_of,
+    gains_over_time,
+    initial_gains,
+    log_colors,
+    log_gains,
+    without_drift,
+)
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.schedule import Schedule
@@ -116,6 +126,30 @@ def test_gains_over_time_are_linear_between_nodes_and_constant_beyond():
     assert figures["FRONT/factor_largest"] == pytest.approx(4.0) and figures["FRONT/factor_least"] == 1.0
     copied = Exposures({"BACK": GAINS}, AFFINE, ("FRONT", "BACK"), nodes)
     copied.load_state_dict(exposures.state_dict())
+
+
+def test_what_is_learned_over_time_is_added_to_the_course_that_is_known():
+    nodes = torch.tensor([0.0, 1.0, 2.0])
+    course = {"FRONT": torch.tensor([[0.0], [1.0], [0.5]]).expand(3, 3)}
+    exposures = Exposures({}, AFFINE, ("FRONT",), nodes, course)
+    with torch.no_grad():
+        exposures.params["FRONT"][1] = 1.0
+    image, view = torch.full((1, 1, 3), 0.1), dataclasses.replace(rig_views()[0].view, camera="FRONT")
+    for seconds, log_gain in ((0.0, 0.0), (1.0, 1.2), (1.5, 0.85), (9.0, 0.5)):
+        seen = exposures.applied(image, dataclasses.replace(view, time=seconds))
+        torch.testing.assert_close(seen, image * math.exp(log_gain))
+    assert exposures.figures()["FRONT/factor_largest"] == pytest.approx(math.exp(1.2))
+    assert exposures.penalty("FRONT").item() > 0 and not exposures.course["FRONT"].requires_grad
+    free = dataclasses.replace(view, camera=None, time=1.5)
+    torch.testing.assert_close(exposures.applied(image, free), image * math.exp(0.75), msg="its course alone")
+    other = dataclasses.replace(view, camera="BACK", time=1.5)
+    assert exposures.applied(image, other) is image
+
+
+def test_a_course_is_linear_between_images_and_constant_beyond():
+    course = GainCourse(np.array([1.0, 1.5, 3.0]), np.array([[0.0, 0.3, 1.0], [0.2, 0.3, 0.0], [0.5, 0.0, 0.0]]))
+    assert course.interval == 1.0
+    np.testing.assert_allclose(course.at(np.array([0.0, 1.25, 2.0, 9.0]))[:, 0], [0.0, 0.1, 0.3, 0.5])
 
 
 @pytest.mark.parametrize(("seconds", "interval"), [([1.0, 3.0], None), ([], 1.0), ([1.0], 1.0), ([1.0, 1.4], 1.0)])
@@ -275,6 +309,49 @@ def test_surfaces_that_one_camera_sees_are_left_out():
     np.testing.assert_allclose(found, np.full((2, 1, 3), np.log(100.0 / 255.0)))
 
 
+def drive_past(true: np.ndarray, haze: float = 0.0) -> list[Sightings]:
+    """What a camera records of 600 points ahead while it drives: each image shows those that are 5 to 60 m away, with
+    log gains `true` (k, 3). With `haze` colours grow brighter with the distance. Every tenth colour is another's."""
+    rng = np.random.default_rng(3)
+    places, shades = np.sort(rng.uniform(0.0, 100.0, 600)), rng.uniform(-2.0, -1.0, (600, 3))
+    seen = []
+    for at, gains in enumerate(true):
+        distance = places - 1.2 * at
+        shown = np.flatnonzero((distance > 5) & (distance < 60))
+        logs = shades[shown] + gains + haze * np.log(distance[shown])[:, None] + rng.normal(0, 0.02, (len(shown), 3))
+        logs[rng.random(len(shown)) < 0.1] += 0.8
+        seen.append(Sightings(shown, distance[shown], 255.0 * np.exp(logs)))
+    return seen
+
+
+@pytest.mark.parametrize("haze", [0.0, 0.2])
+def test_the_course_of_an_exposure_is_found_whatever_the_distance_does_to_colors(haze):
+    true = np.zeros((30, 3))
+    true[12:16] = np.linspace(0.0, -0.8, 4)[:, None] * [1.0, 0.9, 0.8]
+    true[16:] = true[15]
+    found = course_of(drive_past(true, haze))
+    np.testing.assert_allclose(found - found.mean(axis=0), true - true.mean(axis=0), atol=0.05)
+
+
+def test_images_without_shared_points_have_no_course():
+    apart = [Sightings(np.arange(90) + 90 * i, np.full(90, 9.0), np.full((90, 3), 50.0 + i)) for i in range(4)]
+    assert not course_of(apart).any() and not course_of(apart[:1]).any() and course_of([]).shape == (0, 3)
+
+
+def test_slow_changes_of_an_exposure_are_left_out():
+    """They are those of colours that change with the distance."""
+    seconds = 0.5 * np.arange(9)
+    slow = np.outer(0.04 * np.arange(9), np.ones(3))
+    assert not without_drift(slow, seconds).any()
+    fast = slow + np.where(np.arange(9) > 4, -0.6, 0.0)[:, None]
+    found = without_drift(fast, seconds)
+    np.testing.assert_allclose(found - found[0], np.where(np.arange(9) > 4, -0.56, 0.0)[:, None] * np.ones(3))
+    np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=1e-12)
+    between = 1.5 * DRIFT * 0.5
+    found = without_drift(np.outer([0.0, between], np.ones(3)), seconds[:2])
+    np.testing.assert_allclose(np.diff(found, axis=0), np.full((1, 3), 0.5 * between))
+
+
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory) -> TrainingInputs:
     """A drive by FRONT and BACK of the demo's rig, whose BACK takes in other light; nothing is held out."""
@@ -293,6 +370,22 @@ def test_the_gains_of_the_demo_rig_are_estimated_before_the_training(rig):
     np.testing.assert_allclose(found["CAM_BACK"], np.power([1.4, 1.1, 0.75], 1 / 2.2), rtol=0.03)
     hidden = [dataclasses.replace(v, ego_mask=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]
     np.testing.assert_array_equal(initial_gains(rig.record, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
+
+
+def test_an_automatic_exposure_is_found_where_images_change_and_only_there(rig):
+    """The images of FRONT grow darker within a second, as if its exposure did."""
+    views = load_views(rig.record, Supervision({}, {}, {}), CPU)
+    assert gains_over_time(rig.record, views) == {}
+    front = sorted((v for v in views if v.view.camera == "CAM_FRONT"), key=lambda view: view.view.time)
+    darker = {id(v): max(0.6, 1.0 - 0.2 * max(0, i - 2)) for i, v in enumerate(front)}
+    changed = [
+        dataclasses.replace(v, pixels=(v.pixels.float() * darker.get(id(v), 1.0)).round().to(torch.uint8))
+        for v in views
+    ]
+    found = gains_over_time(rig.record, changed)
+    assert found.keys() == {"CAM_FRONT"}
+    true = np.log([darker[id(v)] for v in front])
+    np.testing.assert_allclose(found["CAM_FRONT"].log_gains[:, 1], true - true.mean(), atol=0.08)
 
 
 def test_a_training_starts_from_the_estimated_gains_and_saves_them(rig, tmp_path):
