@@ -32,8 +32,8 @@ class PoseableCamera:
     `width` and `height` in pixels; `K` in continuous pixels, in which the centre of the first pixel is at (0.5, 0.5).
     `camera_to_ego` is its mount on the ego vehicle (ego: x forward, y left, z up; camera: x right, y down, z forward),
     None for a camera that is always placed by its own pose. With `exposure_of`, images have the exposure that was
-    learned for this recorded camera; otherwise that of films. Without a pose it is on the path
-    of the recorded camera `path_of`, or else where its mount is on the vehicle.
+    learned for this recorded camera; otherwise that of films. Without a pose it is on the path of the recorded camera
+    `path_of`, or else where its mount is on the vehicle.
 
     `readout_s` are the seconds from the left edge to the right one and from the top edge to the bottom one at which
     lines are read, negative if read the other way, and from the image's time to the middle of the readout; zeros: a
