@@ -10,7 +10,7 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.drifting import Drifting, drifting_seed
-from drivesplat.model.exposure import Exposures, GainCourse, exposure_nodes
+from drivesplat.model.exposure import Exposures, GainCurve, exposure_nodes
 from drivesplat.model.height_field import HeightField
 from drivesplat.model.parameters import random_subset, require_rows
 from drivesplat.model.part import Part, PartDefinition, Sky
@@ -24,7 +24,7 @@ from drivesplat.settings.train_objects import ActorSettings
 from drivesplat.trajectories.actor_record import ActorRecord
 
 FIRST_PREFIX, LEARNED_PREFIX, NODES = "exposure.first.", "exposure.params.", "exposure.nodes"
-COURSE_PREFIX = "exposure.course."
+CURVE_PREFIX = "exposure.curve."
 """Of exposures in a model's state: prefixes of initial gains, of what is learned, and of initial gains over time, which
 the camera name follows, and the times of nodes."""
 OBJECTS: dict[str, type[Actors]] = {kind.name: kind for kind in (Actors, Deformable)}
@@ -40,7 +40,7 @@ class ModelInit:
     number of semantic `classes` (0: none), the initial gains (3,) of every camera in `exposed`, whose exposure is
     learned, the `reference` camera, whose exposure is only learned over time (None: not), the initial `lidar_logits` of
     intensity and return (None: LiDAR is not rendered), the number of LiDAR `scans` that a training without images fits,
-    and the `courses` of cameras whose exposure changes over time."""
+    and the `gain_curves` of cameras whose exposure changes over time."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
@@ -51,7 +51,7 @@ class ModelInit:
     lidar_logits: tuple[float, float] | None = None
     scans: int = 0
     road: RoadSeed | None = None
-    courses: Mapping[str, GainCourse] = field(default_factory=dict)
+    gain_curves: Mapping[str, GainCurve] = field(default_factory=dict)
 
     @property
     def views(self) -> int:
@@ -106,7 +106,7 @@ def rebuild_model(
         made,
         _sky(sky, settings, np.full(3, 0.5)),
         settings.antialiased,
-        Exposures(first, settings.exposure, learned, state[NODES], _below(state, COURSE_PREFIX))
+        Exposures(first, settings.exposure, learned, state[NODES], _below(state, CURVE_PREFIX))
         if NODES in state
         else None,
         settings.rolling_shutter,
@@ -221,12 +221,14 @@ def _initial_exposures(init: ModelInit, settings: TrainSettings) -> Exposures | 
     if init.reference is None:
         return None
     record = init.record
-    intervals = [settings.exposure.interval, *(course.interval for course in init.courses.values())]
+    intervals = [settings.exposure.interval, *(curve.interval for curve in init.gain_curves.values())]
     interval = None if None in intervals else min(intervals)
     nodes = exposure_nodes([record.seconds(i) for i in record.train_images], interval)
     first = {camera: torch.as_tensor(gains).float() for camera, gains in init.exposed.items()}
-    courses = {camera: torch.as_tensor(course.at(nodes.numpy())).float() for camera, course in init.courses.items()}
-    exposures = Exposures(first, settings.exposure, (init.reference,), nodes, courses if len(nodes) else {})
+    gain_curves = {
+        camera: torch.as_tensor(curve.at(nodes.numpy())).float() for camera, curve in init.gain_curves.items()
+    }
+    exposures = Exposures(first, settings.exposure, (init.reference,), nodes, gain_curves if len(nodes) else {})
     return exposures if len(exposures.params) else None
 
 

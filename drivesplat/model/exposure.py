@@ -18,7 +18,7 @@ CHANGE_RATIO = 2.0
 """Expected size of log gains over their expected change within a second, a random walk."""
 
 
-class GainCourse(NamedTuple):
+class GainCurve(NamedTuple):
     """Log gains (k, 3) of the colour channels of a camera at its k training images, at `seconds` (k,), of mean 0."""
 
     seconds: np.ndarray
@@ -37,13 +37,13 @@ class GainCourse(NamedTuple):
 class Exposures(nn.Module):
     """An affine map of every colour channel, by camera and time t: c becomes f exp(g + g(t)) c + o.
 
-    `first` holds the initial gains f (3,) of the cameras with constants, and `course` log gains (k, 3) at the nodes of
+    `first` holds the initial gains f (3,) of the cameras with constants, and `curve` log gains (k, 3) at the nodes of
     cameras whose exposure changes, to which g(t) is added; both are estimated before the training. `params` is
     what is learned of each camera, (r, 3), in units of its expected size and initially 0: log gain g (row 0) and offset
     o (row 1), only of these cameras, then the log gains g(t) at the k times `nodes` (seconds). Between nodes g(t) is
     linear, beyond them constant.
 
-    The reference camera has no constants: it fixes the brightness of the scene. Views without a camera have its course
+    The reference camera has no constants: it fixes the brightness of the scene. Views without a camera have its curve
     alone, so that they look as images of that time do. Cameras without parameters keep the model's colours.
     """
 
@@ -53,16 +53,16 @@ class Exposures(nn.Module):
         settings: ExposureSettings,
         cameras: tuple[str, ...] = (),
         nodes: Float[Tensor, " k"] | None = None,
-        course: Mapping[str, Tensor] | None = None,
+        curve: Mapping[str, Tensor] | None = None,
     ):
-        """`cameras` without constants, besides those in `first`. Cameras with a `course` are among both."""
+        """`cameras` without constants, besides those in `first`. Cameras with a `curve` are among both."""
         super().__init__()
         self.register_buffer("nodes", torch.zeros(0) if nodes is None else nodes.clone())
         self.first = nn.ParameterDict(
             {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in first.items()}
         )
-        self.course = nn.ParameterDict(
-            {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in (course or {}).items()}
+        self.curve = nn.ParameterDict(
+            {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in (curve or {}).items()}
         )
         rows = {
             **dict.fromkeys(first, 2 + len(self.nodes)),
@@ -76,8 +76,8 @@ class Exposures(nn.Module):
 
     def applied(self, image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, "h w 3"]:
         """Maps an image from the model's colours to those of the view's camera at its time."""
-        if view.camera is None and self._reference in self.course:
-            return image * torch.exp(self._log_gains(self.course[self._reference], view.moment))
+        if view.camera is None and self._reference in self.curve:
+            return image * torch.exp(self._log_gains(self.curve[self._reference], view.moment))
         if view.camera not in self.params:
             return image
         gains, offsets = self._map(view.camera, view.moment)
@@ -107,8 +107,8 @@ class Exposures(nn.Module):
         if len(constants):
             log_gains, offsets = log_gains + constants[0], self._settings.sigma_offset * constants[1]
         log_gains = self._settings.sigma_gain * log_gains
-        if camera in self.course:
-            log_gains = log_gains + self._log_gains(self.course[camera], seconds)
+        if camera in self.curve:
+            log_gains = log_gains + self._log_gains(self.curve[camera], seconds)
         gains = torch.exp(log_gains)
         return (gains * self.first[camera] if len(constants) else gains), offsets
 
@@ -131,20 +131,20 @@ class Exposures(nn.Module):
                     self.first[camera].copy_(other.first[camera])
             for row, node in zip(changing, self.nodes - seconds, strict=True):
                 row.copy_(other._log_gains(others_changing, node))
-            self._continue_course(other, camera, seconds)
+            self._continue_curve(other, camera, seconds)
 
-    def _continue_course(self, other: "Exposures", camera: str, seconds: float) -> None:
-        """Shifts a camera's course by what it differs from that of other exposures at the times of both, where the
+    def _continue_curve(self, other: "Exposures", camera: str, seconds: float) -> None:
+        """Shifts a camera's curve by what it differs from that of other exposures at the times of both, where the
         scene has the same colours."""
-        if camera not in self.course and camera not in other.course:
+        if camera not in self.curve and camera not in other.curve:
             return
         nothing = self.nodes.new_zeros(len(self.nodes), 3)
-        own, times = self.course.get(camera, nothing), self.nodes - seconds
-        others = other.course.get(camera, other.nodes.new_zeros(len(other.nodes), 3))
+        own, times = self.curve.get(camera, nothing), self.nodes - seconds
+        others = other.curve.get(camera, other.nodes.new_zeros(len(other.nodes), 3))
         common = times[(times >= other.nodes[0]) & (times <= other.nodes[-1])]
         common = common if len(common) else times[:1]
         shifts = [other._log_gains(others, at) - self._log_gains(own, at + seconds) for at in common]
-        self.course[camera] = nn.Parameter(own + torch.stack(shifts).mean(dim=0), requires_grad=False)
+        self.curve[camera] = nn.Parameter(own + torch.stack(shifts).mean(dim=0), requires_grad=False)
 
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every camera's entry of `params`."""
@@ -164,7 +164,7 @@ class Exposures(nn.Module):
                     f"{camera}/{n}_{c}": v for n, own in found for c, v in zip(CHANNELS, own.tolist(), strict=True)
                 }
             if len(changing):
-                known = self.course.get(camera, 0.0)
+                known = self.curve.get(camera, 0.0)
                 factors = torch.exp(self._settings.sigma_gain * changing + known)
                 figures |= {
                     f"{camera}/factor_least": float(factors.min()),

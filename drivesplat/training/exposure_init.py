@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import visible
-from drivesplat.model.exposure import GainCourse
+from drivesplat.model.exposure import GainCurve
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.training.views import TrainingView
 
@@ -31,7 +31,7 @@ VALID_LEVELS = (8, 247)
 """Levels between which a pixel is neither clipped nor noise."""
 ROUNDS = 8
 """Number of passes over all cameras; three connect a rig of six."""
-COURSE_POINTS = 30_000
+CURVE_POINTS = 30_000
 """Of more seed points, exposures over time are estimated from at most so many."""
 NEXT_IMAGES = (1, 2, 4, 8, 16)
 """Images of a camera are compared with those so many images later."""
@@ -41,7 +41,7 @@ DRIFT = 0.25
 """Changes of log gains per second up to this are left out, and those of twice as much kept whole. What comes nearer
 changes its colour, too: on a recorded drive with sparse LiDAR by up to 0.3 per second, where no exposure changed so. An
 automatic exposure changes by 0.5 to 1 per second where light and shade meet."""
-MIN_COURSE = 0.1
+MIN_CURVE = 0.1
 """Smallest deviation of log gains from their mean for which exposures are said to change over time."""
 TIE = 1e-4
 """Weight of log gains of 0, relative to that of all comparisons with an image: it fixes their mean, and the gains of
@@ -110,26 +110,26 @@ def _sightings_of(points: np.ndarray, views: Sequence[TrainingView]) -> Iterator
     return prefetch(seen_in, views)
 
 
-def gains_over_time(record: TrainingRecord, views: Sequence[TrainingView]) -> dict[str, GainCourse]:
+def gains_over_time(record: TrainingRecord, views: Sequence[TrainingView]) -> dict[str, GainCurve]:
     """How the exposure of each camera changes, by the seed points on surfaces; without cameras whose log gains stay
-    within MIN_COURSE of their mean. `views` are the training images."""
+    within MIN_CURVE of their mean. `views` are the training images."""
     surfaces = record.points[: len(record.points) - record.seed.far]
-    surfaces = surfaces[:: max(1, math.ceil(len(surfaces) / COURSE_POINTS))].astype(np.float64)
+    surfaces = surfaces[:: max(1, math.ceil(len(surfaces) / CURVE_POINTS))].astype(np.float64)
     seconds = np.array([record.seconds(i) for i in record.train_images])
     found = {}
     for camera in sorted(record.train_cameras):
         own = np.array([i for i, view in enumerate(views) if view.view.camera == camera])
         own = own[np.argsort(seconds[own], kind="stable")]
-        gains = without_drift(course_of(list(_sightings_of(surfaces, [views[i] for i in own]))), seconds[own])
-        if np.abs(gains).max(initial=0.0) < MIN_COURSE:
+        gains = without_drift(gain_curve_of(list(_sightings_of(surfaces, [views[i] for i in own]))), seconds[own])
+        if np.abs(gains).max(initial=0.0) < MIN_CURVE:
             continue
-        found[camera] = GainCourse(seconds[own], gains)
+        found[camera] = GainCurve(seconds[own], gains)
         least, most = np.exp(gains[:, 1].min()), np.exp(gains[:, 1].max())
         log.info("%s: exposure changes: gains of green from %.2f to %.2f times their mean", camera, least, most)
     return found
 
 
-def course_of(seen: Sequence[Sightings]) -> Float[np.ndarray, "k 3"]:
+def gain_curve_of(seen: Sequence[Sightings]) -> Float[np.ndarray, "k 3"]:
     """The log gains of k images of one camera, in order, by points that they share.
 
     The colour of a point changes with its distance, too, by haze above all. Of two images the log colours of a group of

@@ -28,7 +28,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
-from drivesplat.model.exposure import Exposures, GainCourse, exposure_nodes
+from drivesplat.model.exposure import Exposures, GainCurve, exposure_nodes
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.preprocess.lidar_seed import seed_points
@@ -42,7 +42,7 @@ from drivesplat.training.exposure_init import (
     DISTANCE_STEP,
     DRIFT,
     Sightings,
-    course_of,
+    gain_curve_of,
     gains_over_time,
     initial_gains,
     log_colors,
@@ -130,8 +130,8 @@ def test_gains_over_time_are_linear_between_nodes_and_constant_beyond():
 
 def test_what_is_learned_over_time_is_added_to_the_course_that_is_known():
     nodes = torch.tensor([0.0, 1.0, 2.0])
-    course = {"FRONT": torch.tensor([[0.0], [1.0], [0.5]]).expand(3, 3)}
-    exposures = Exposures({}, AFFINE, ("FRONT",), nodes, course)
+    curve = {"FRONT": torch.tensor([[0.0], [1.0], [0.5]]).expand(3, 3)}
+    exposures = Exposures({}, AFFINE, ("FRONT",), nodes, curve)
     with torch.no_grad():
         exposures.params["FRONT"][1] = 1.0
     image, view = torch.full((1, 1, 3), 0.1), dataclasses.replace(rig_views()[0].view, camera="FRONT")
@@ -139,17 +139,17 @@ def test_what_is_learned_over_time_is_added_to_the_course_that_is_known():
         seen = exposures.applied(image, dataclasses.replace(view, time=seconds))
         torch.testing.assert_close(seen, image * math.exp(log_gain))
     assert exposures.figures()["FRONT/factor_largest"] == pytest.approx(math.exp(1.2))
-    assert exposures.penalty("FRONT").item() > 0 and not exposures.course["FRONT"].requires_grad
+    assert exposures.penalty("FRONT").item() > 0 and not exposures.curve["FRONT"].requires_grad
     free = dataclasses.replace(view, camera=None, time=1.5)
-    torch.testing.assert_close(exposures.applied(image, free), image * math.exp(0.75), msg="its course alone")
+    torch.testing.assert_close(exposures.applied(image, free), image * math.exp(0.75), msg="its curve alone")
     other = dataclasses.replace(view, camera="BACK", time=1.5)
     assert exposures.applied(image, other) is image
 
 
 def test_a_course_is_linear_between_images_and_constant_beyond():
-    course = GainCourse(np.array([1.0, 1.5, 3.0]), np.array([[0.0, 0.3, 1.0], [0.2, 0.3, 0.0], [0.5, 0.0, 0.0]]))
-    assert course.interval == 1.0
-    np.testing.assert_allclose(course.at(np.array([0.0, 1.25, 2.0, 9.0]))[:, 0], [0.0, 0.1, 0.3, 0.5])
+    curve = GainCurve(np.array([1.0, 1.5, 3.0]), np.array([[0.0, 0.3, 1.0], [0.2, 0.3, 0.0], [0.5, 0.0, 0.0]]))
+    assert curve.interval == 1.0
+    np.testing.assert_allclose(curve.at(np.array([0.0, 1.25, 2.0, 9.0]))[:, 0], [0.0, 0.1, 0.3, 0.5])
 
 
 @pytest.mark.parametrize(("seconds", "interval"), [([1.0, 3.0], None), ([], 1.0), ([1.0], 1.0), ([1.0, 1.4], 1.0)])
@@ -325,17 +325,17 @@ def drive_past(true: np.ndarray, haze: float = 0.0) -> list[Sightings]:
 
 
 @pytest.mark.parametrize("haze", [0.0, 0.2])
-def test_the_course_of_an_exposure_is_found_whatever_the_distance_does_to_colors(haze):
+def test_the_gain_curve_of_an_exposure_is_found_whatever_the_distance_does_to_colors(haze):
     true = np.zeros((30, 3))
     true[12:16] = np.linspace(0.0, -0.8, 4)[:, None] * [1.0, 0.9, 0.8]
     true[16:] = true[15]
-    found = course_of(drive_past(true, haze))
+    found = gain_curve_of(drive_past(true, haze))
     np.testing.assert_allclose(found - found.mean(axis=0), true - true.mean(axis=0), atol=0.05)
 
 
 def test_images_without_shared_points_have_no_course():
     apart = [Sightings(np.arange(90) + 90 * i, np.full(90, 9.0), np.full((90, 3), 50.0 + i)) for i in range(4)]
-    assert not course_of(apart).any() and not course_of(apart[:1]).any() and course_of([]).shape == (0, 3)
+    assert not gain_curve_of(apart).any() and not gain_curve_of(apart[:1]).any() and gain_curve_of([]).shape == (0, 3)
 
 
 def test_slow_changes_of_an_exposure_are_left_out():

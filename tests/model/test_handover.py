@@ -145,7 +145,7 @@ def test_an_object_of_the_same_name_elsewhere_is_another_one():
 
 @pytest.mark.parametrize("known_before", [True, False])
 @pytest.mark.parametrize("known_here", [True, False])
-def test_the_course_of_an_exposure_goes_on_where_that_of_the_block_before_ends(known_before, known_here):
+def test_the_gain_curve_of_an_exposure_goes_on_where_that_of_the_block_before_ends(known_before, known_here):
     """Each is of mean 0 over the images of its own block."""
     settings, fall = ExposureSettings(interval=1.0), torch.tensor([0.5, 0.5, 0.5, 0.5, -0.5, -0.5, -0.5, -0.5])
     earlier = {"front": fall[:, None].expand(8, 3)} if known_before else {}
@@ -154,9 +154,9 @@ def test_the_course_of_an_exposure_goes_on_where_that_of_the_block_before_ends(k
     own = Exposures({}, settings, ("front",), torch.arange(6.0), later)
     own.take_over(before, SECONDS)
     if not known_before and not known_here:
-        assert not own.course.keys()
+        assert not own.curve.keys()
         return
-    gains = own.course["front"][:, 0]
+    gains = own.curve["front"][:, 0]
     torch.testing.assert_close(gains[:4].mean(), torch.tensor(-0.5 if known_before else 0.0))
     torch.testing.assert_close(gains[4] - gains[0], torch.tensor(-0.9 if known_here else 0.0))
 
