@@ -91,7 +91,8 @@ class ExposureSettings(Settings):
     (`interval`)."""
     interval: float | None = Field(1.0, ge=0.1, le=60)
     """Seconds between the times at which gains of every camera, eval_camera included, are learned; linear in between
-    and constant beyond the last training image. null: constant exposures."""
+    and constant beyond the last training image. Where an exposure changes fast, found before training, these are the
+    times of images. null: constant exposures."""
     sigma_gain: float = Field(0.1, gt=0)
     """Expected deviation of a camera's gains from their initial values (natural logarithm)."""
     sigma_offset: float = Field(0.02, gt=0)
