@@ -152,8 +152,9 @@ def test_it_is_short_and_stands_alone():
 @pytest.mark.usefixtures("no_colors_of_what_is_unseen")
 def test_first_iterations_are_those_of_the_rule_train(drive, max_scale, tmp_path):
     """All parameters move alike, so that rendering, every term of the loss, learning rates, dropout and noise are the
-    same: their errors are a two-hundredth of the way that they have gone. Rotations of what begins as a sphere have no
-    gradient but rounding, which Adam amplifies, and the limit at a box depends on rotations."""
+    same: their errors are a thousandth of the way that they have gone. Rotations of what begins as a sphere have no
+    gradient but rounding, which Adam amplifies. The limit of scales at a box depends on rotations, and tracks, which
+    have few parameters, show it most."""
     iterations = 3
     theirs = trained_by_rule(drive, job_of(iterations, max_scale=max_scale), tmp_path)
     model, views = in_one_file(drive, iterations=iterations, max_scale=max_scale)
@@ -163,7 +164,7 @@ def test_first_iterations_are_those_of_the_rule_train(drive, max_scale, tmp_path
     for part, own, begun in zip(theirs.parts, model.parts, before, strict=True):
         for name, values in own.params.items():
             error, way = (values.float() - part.params[name]).abs(), (part.params[name] - begun[name]).abs().float()
-            assert error.mean() <= (1.0 if name == "quats" else 5e-3) * way.mean(), (part.name, name)
+            assert error.mean() <= (1.0 if name == "quats" else 1e-3) * way.mean(), (part.name, name)
             assert name in ("owner", "shN") or way.mean() > 0.0
     for name in ("translation", "yaw"):
         ours, reference = getattr(model.parts[1], name), theirs.parts[1].shared[name]

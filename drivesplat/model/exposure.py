@@ -58,12 +58,7 @@ class Exposures(nn.Module):
         """`cameras` without constants, besides those in `first`. Cameras with a `curve` are among both."""
         super().__init__()
         self.register_buffer("nodes", torch.zeros(0) if nodes is None else nodes.clone())
-        self.first = nn.ParameterDict(
-            {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in first.items()}
-        )
-        self.curve = nn.ParameterDict(
-            {camera: nn.Parameter(gains.clone(), requires_grad=False) for camera, gains in (curve or {}).items()}
-        )
+        self.first, self.curve = _fixed(first), _fixed(curve or {})
         rows = {
             **dict.fromkeys(first, 2 + len(self.nodes)),
             **dict.fromkeys(set(cameras) - set(first), len(self.nodes)),
@@ -171,6 +166,11 @@ class Exposures(nn.Module):
                     f"{camera}/factor_largest": float(factors.max()),
                 }
         return figures
+
+
+def _fixed(values: Mapping[str, Tensor]) -> nn.ParameterDict:
+    """Copies of what is known of cameras, which is not learned."""
+    return nn.ParameterDict({camera: nn.Parameter(own.clone(), requires_grad=False) for camera, own in values.items()})
 
 
 def exposure_nodes(seconds: Sequence[float], interval: float | None) -> Float[Tensor, " k"]:

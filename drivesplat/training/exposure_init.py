@@ -67,9 +67,7 @@ def initial_gains(
     away: a camera that looks ahead sees a facade from farther away than one that looks aside, whose gain would come out
     too small. Cameras that share too few such points are compared at any distance.
     """
-    surfaces = record.points[: len(record.points) - record.seed.far]
-    surfaces = surfaces[:: max(1, math.ceil(len(surfaces) / MAX_POINTS))].astype(np.float64)
-    seen = sightings(surfaces, views, [reference, *cameras])
+    seen = sightings(_surfaces(record, MAX_POINTS), views, [reference, *cameras])
     gains = np.full((1 + len(cameras), 3), np.nan)
     gains[0] = 0.0
     for step in (DISTANCE_STEP, math.inf):
@@ -81,10 +79,15 @@ def initial_gains(
     return dict(zip(cameras, found[1:], strict=True))
 
 
+def _surfaces(record: TrainingRecord, at_most: int) -> np.ndarray:
+    """The seed points (n, 3) on surfaces, thinned evenly."""
+    surfaces = record.points[: len(record.points) - record.seed.far]
+    return surfaces[:: max(1, math.ceil(len(surfaces) / at_most))].astype(np.float64)
+
+
 def sightings(points: np.ndarray, views: Sequence[TrainingView], cameras: Sequence[str]) -> list[Sightings]:
     """What each of `cameras` saw of world points (n, 3). Pixels of the ego vehicle and those outside VALID_LEVELS are
     left out."""
-
     found: dict[str | None, list[Sightings]] = {camera: [] for camera in cameras}
     chosen = [view for view in views if view.view.camera in found]
     for view, own in zip(chosen, _sightings_of(points, chosen), strict=True):
@@ -113,8 +116,7 @@ def _sightings_of(points: np.ndarray, views: Sequence[TrainingView]) -> Iterator
 def gains_over_time(record: TrainingRecord, views: Sequence[TrainingView]) -> dict[str, GainCurve]:
     """How the exposure of each camera changes, by the seed points on surfaces; without cameras whose log gains stay
     within MIN_CURVE of their mean. `views` are the training images."""
-    surfaces = record.points[: len(record.points) - record.seed.far]
-    surfaces = surfaces[:: max(1, math.ceil(len(surfaces) / CURVE_POINTS))].astype(np.float64)
+    surfaces = _surfaces(record, CURVE_POINTS)
     seconds = np.array([record.seconds(i) for i in record.train_images])
     found = {}
     for camera in sorted(record.train_cameras):

@@ -128,7 +128,7 @@ def test_gains_over_time_are_linear_between_nodes_and_constant_beyond():
     copied.load_state_dict(exposures.state_dict())
 
 
-def test_what_is_learned_over_time_is_added_to_the_course_that_is_known():
+def test_what_is_learned_over_time_is_added_to_the_gain_curve_that_is_known():
     nodes = torch.tensor([0.0, 1.0, 2.0])
     curve = {"FRONT": torch.tensor([[0.0], [1.0], [0.5]]).expand(3, 3)}
     exposures = Exposures({}, AFFINE, ("FRONT",), nodes, curve)
@@ -146,7 +146,7 @@ def test_what_is_learned_over_time_is_added_to_the_course_that_is_known():
     assert exposures.applied(image, other) is image
 
 
-def test_a_course_is_linear_between_images_and_constant_beyond():
+def test_a_gain_curve_is_linear_between_images_and_constant_beyond():
     curve = GainCurve(np.array([1.0, 1.5, 3.0]), np.array([[0.0, 0.3, 1.0], [0.2, 0.3, 0.0], [0.5, 0.0, 0.0]]))
     assert curve.interval == 1.0
     np.testing.assert_allclose(curve.at(np.array([0.0, 1.25, 2.0, 9.0]))[:, 0], [0.0, 0.1, 0.3, 0.5])
@@ -333,7 +333,7 @@ def test_the_gain_curve_of_an_exposure_is_found_whatever_the_distance_does_to_co
     np.testing.assert_allclose(found - found.mean(axis=0), true - true.mean(axis=0), atol=0.05)
 
 
-def test_images_without_shared_points_have_no_course():
+def test_images_without_shared_points_have_no_gain_curve():
     apart = [Sightings(np.arange(90) + 90 * i, np.full(90, 9.0), np.full((90, 3), 50.0 + i)) for i in range(4)]
     assert not gain_curve_of(apart).any() and not gain_curve_of(apart[:1]).any() and gain_curve_of([]).shape == (0, 3)
 
