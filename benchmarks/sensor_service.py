@@ -294,7 +294,7 @@ def _rig(client: RenderClient, name: str, source: DriveSource) -> RigRequests:
     return RigRequests.of(client, name, read_scene(source.folder.resolve().parent / "scene.json"))
 
 
-def _size(text: str) -> tuple[int, int]:
+def image_size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     return int(width), int(height)
 
@@ -303,7 +303,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measures. Returns the exit status."""
     parser = argument_parser("sensor_service", __doc__)
     parser.add_argument("paths", type=Path, nargs="+", help="folders as of drivesplat serve")
-    parser.add_argument("--size", type=_size, default=(1920, 1080), metavar="WxH", help="of images (1920x1080)")
+    parser.add_argument("--size", type=image_size, default=(1920, 1080), metavar="WxH", help="of images (1920x1080)")
     parser.add_argument("--frames", type=int, default=300, help="number of calls (300)")
     parser.add_argument("--rollouts", type=int, default=1, help="calls in progress at a time (1)")
     parser.add_argument("--format", choices=FORMATS, default="jpeg")

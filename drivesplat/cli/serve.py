@@ -13,6 +13,8 @@ import drivesplat
 from drivesplat.errors import RequestError
 
 COMMAND = "serve"
+LOOK_EVERY_S = 0.5
+"""Seconds between two looks for the end. A signal that reaches another thread does not wake the one that waits."""
 
 
 def add_parser(commands: Any) -> None:
@@ -66,7 +68,8 @@ def run_serve(parsed: argparse.Namespace) -> int:
     if server.metrics_address is not None:
         print(f"drivesplat serve: figures at {server.metrics_address}")
     print(f"drivesplat serve: {server.address} serves {', '.join(server.scenes)}; Ctrl-C ends it", flush=True)
-    ended.wait()
+    while not ended.wait(LOOK_EVERY_S):
+        pass
     print("drivesplat serve: ending when all calls have been answered", flush=True)
     server.close()
     return 0

@@ -22,25 +22,31 @@ class Posed(NamedTuple):
     poses: ObjectPoses
 
 
-def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:
-    """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
-    if not placements:
-        return poses._replace(presence=torch.zeros_like(poses.presence))
-    edited = [placement.object_to_world for placement in placements]
-    matrices = np.stack([np.eye(4) if pose is None else pose for pose in edited])
-    turned = Rotation.from_matrix(matrices[:, :3, :3]).as_quat(scalar_first=True)
-    scales, is_edited = [placement.scale for placement in placements], [pose is not None for pose in edited]
-    numbers = [ids.index(placement.source) for placement in placements]
-    values = np.column_stack([turned, matrices[:, :3, 3], scales, is_edited, numbers])
-    given = torch.from_numpy(values).to(poses.quats)  # one copy to the device
-    rows = given[:, 9].long()
-    moved = given[:, 8:9] > 0.0
-    return ObjectPoses(
-        poses.quats.index_copy(0, rows, torch.where(moved, given[:, :4], poses.quats[rows])),
-        poses.translations.index_copy(0, rows, torch.where(moved, given[:, 4:7], poses.translations[rows])),
-        poses.sizes.index_copy(0, rows, given[:, 7]),
-        torch.zeros_like(poses.presence).index_copy(0, rows, given[:, 8].maximum(poses.presence[rows])),
-    )
+def with_placements(
+    poses: Sequence[ObjectPoses], ids: Sequence[str], placements: Sequence[Sequence[ActorPlacement]]
+) -> list[ObjectPoses]:
+    """The poses of the actors `ids` at each of several times with the placements of that time applied; an actor without
+    one is absent. All of them are copied to the device at once."""
+    rows = {id: i for i, id in enumerate(ids)}
+    matrices = np.tile(np.eye(4), (len(poses), len(ids), 1, 1))
+    rest = np.tile([1.0, 0.0, 0.0], (len(poses), len(ids), 1))  # the scale, whether it is moved, whether it is there
+    for own, values, there in zip(matrices, rest, placements, strict=True):
+        for placement in there:
+            pose = placement.object_to_world
+            values[rows[placement.source]] = placement.scale, pose is not None, 1.0
+            own[rows[placement.source]] = np.eye(4) if pose is None else pose
+    turned = Rotation.from_matrix(matrices[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    values = np.concatenate([turned.reshape(*rest.shape[:2], 4), matrices[..., :3, 3], rest], axis=-1)
+    given = torch.from_numpy(values).to(poses[0].quats)
+    return [
+        ObjectPoses(
+            torch.where(own[:, 8:9] > 0.0, own[:, :4], known.quats),
+            torch.where(own[:, 8:9] > 0.0, own[:, 4:7], known.translations),
+            own[:, 7].contiguous(),
+            own[:, 9] * own[:, 8].maximum(known.presence),
+        )
+        for known, own in zip(poses, given, strict=True)
+    ]
 
 
 def with_walked(

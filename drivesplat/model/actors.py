@@ -113,6 +113,7 @@ class Actors(Part):
         self.timeline.precompute(every, self.params["means"].device)
 
     def state(self, time: float, want: Want = IMAGE) -> State:
+        self.precompute([time], want)
         device = self.params["means"].device
         return State(*(self.timeline.at(time + seconds, device) for seconds in _apart(want)))
 
@@ -125,8 +126,8 @@ class Actors(Part):
         sets, owner = [], self.params["owner"]
         for chosen, rows in placement_sets(self.ids, owner, want.placements):  # few, so all actors for each copy
             own = [want.placements[i] for i in chosen]
-            beside = [self._moved(known, [placement.beside(i) for placement in own]) for i, known in enumerate(around)]
-            found = self._placed(want, self._moved(now, own), *beside)
+            beside = [[placement.beside(i) for placement in own] for i in range(len(around))]
+            found = self._placed(want, *self._moved([now, *around], [own, *beside]))
             if want.colors:
                 found = with_colors(found, self.ids, owner, own)
             numbers = {placement.source: i for i, placement in zip(chosen, own, strict=True)}
@@ -156,9 +157,10 @@ class Actors(Part):
         quats, translations = corrected(state.quats, state.translations, state.weights, *corrections)
         return Posed(state, ObjectPoses(quats, translations, self._sizes, state.present.to(self._sizes.dtype)))
 
-    def _moved(self, known: Posed, placements: Sequence[ActorPlacement]) -> Posed:
-        """The actors at placements; rigid ones have no limbs that would follow a path."""
-        return Posed(known.state, with_placements(known.poses, self.ids, placements))
+    def _moved(self, known: Sequence[Posed], placements: Sequence[Sequence[ActorPlacement]]) -> list[Posed]:
+        """The actors of several times, each at placements; rigid ones have no limbs that would follow a path."""
+        poses = with_placements([one.poses for one in known], self.ids, placements)
+        return [Posed(one.state, own) for one, own in zip(known, poses, strict=True)]
 
     def local(self, state: TimeState) -> LocalGaussians:
         """The Gaussians in the frames of their objects at a time state."""

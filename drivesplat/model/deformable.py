@@ -118,9 +118,12 @@ class Deformable(Actors):
         strides = [settings.gait.stride_of(track.object_class) * float(track.size[2]) for track in tracks]
         self.register_buffer("_strides", torch.tensor(strides), persistent=False)
 
-    def _moved(self, known: Posed, placements: Sequence[ActorPlacement]) -> Posed:
-        walked = with_walked(known.state, self.ids, placements, self.cycle_lengths)
-        return super()._moved(known._replace(state=walked), placements)
+    def _moved(self, known: Sequence[Posed], placements: Sequence[Sequence[ActorPlacement]]) -> list[Posed]:
+        walked = [
+            one._replace(state=with_walked(one.state, self.ids, own, self.cycle_lengths))
+            for one, own in zip(known, placements, strict=True)
+        ]
+        return super()._moved(walked, placements)
 
     @property
     def cycle_lengths(self) -> Float[Tensor, " a"]:

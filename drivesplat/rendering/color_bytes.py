@@ -24,12 +24,23 @@ def uint8_image(image: Float[Tensor, "h w 3"]) -> np.ndarray:
 
 def uint8_images(images: Sequence[Float[Tensor, "_ _ 3"]]) -> list[np.ndarray]:
     """Images of one device, each as `uint8_image` gives it; a GPU is waited for once for all of them."""
-    copies = [(to_host(all_finite(image)), to_host(to_uint8(image))) for image in images]
-    if images and images[0].is_cuda:
-        torch.cuda.current_stream(images[0].device).synchronize()
-    if not all(finite for finite, _ in copies):
+    return [pixels.numpy() for pixels in _finished([(image, to_host(to_uint8(image))) for image in images])]
+
+
+def planes_on_device(images: Sequence[Float[Tensor, "_ _ 3"]]) -> list[UInt8[Tensor, "3 _ _"]]:
+    """Images of one device as uint8, a plane for each channel, on their device, which is waited for once. Raises
+    ResultError where a colour is NaN or Inf."""
+    return _finished([(image, to_uint8(image).permute(2, 0, 1).contiguous()) for image in images])
+
+
+def _finished(made: Sequence[tuple[Tensor, Tensor]]) -> list[Tensor]:
+    """What was made of images, when it is there. Raises ResultError where an image is not finite."""
+    finite = [to_host(all_finite(image)) for image, _ in made]
+    if made and made[0][0].is_cuda:
+        torch.cuda.current_stream(made[0][0].device).synchronize()
+    if not all(finite):
         raise ResultError(NOT_FINITE)
-    return [pixels.numpy() for _, pixels in copies]
+    return [result for _, result in made]
 
 
 def all_finite(image: Float[Tensor, "_ _ 3"]) -> Bool[Tensor, ""]:

@@ -9,6 +9,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Generic, TypeVar
+from weakref import ReferenceType, ref
 
 import torch
 from jaxtyping import Float, Int
@@ -250,6 +251,7 @@ class _RenderingKind:
         ]
         self.needs = needs
         self.graph: CudaGraph[Any] | None = None
+        self._given: list[ReferenceType[Gaussians] | None] = [None] * len(sets)  # whose values are in `sets`
 
     def has(self, form: Hashable, sets: Sequence[Gaussians]) -> bool:
         """Whether a rendering of a view with this `_form` is of this kind."""
@@ -269,10 +271,12 @@ class _RenderingKind:
             own.copy_(values)
         if isinstance(self.view, View) and self.view.seconds is not None:
             self.view.seconds.fill_(view.time)
-        for one, own, same in zip(sets, self.sets, self.same, strict=True):
-            if not same:
-                for name, values in one.tensors.items():
-                    own.tensors[name].copy_(values)
+        for i, (one, own, same) in enumerate(zip(sets, self.sets, self.same, strict=True)):
+            given = self._given[i]
+            if not (same or (given is not None and given() is one)):
+                for values, into in zip(one.tensors.values(), own.tensors.values(), strict=True):
+                    into.copy_(values)
+                self._given[i] = ref(one)
         self.graph.replay()
 
 

@@ -1,16 +1,15 @@
 """Images as bytes of a request's format."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
-from drivesplat.errors import ResultError
-from drivesplat.rendering.color_bytes import NOT_FINITE, to_uint8
 from drivesplat.serve.messages import wire
 
 
@@ -39,11 +38,10 @@ def encoded(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding) -> bytes:
     return FORMATS[encoding.format](image, encoding.quality)
 
 
-def jpeg_on_device(image: Float[Tensor, "h w 3"], quality: int) -> bytes:
-    """A JPEG of colours in [0, 1], encoded where they are: on a GPU by nvJPEG, without a copy of the image. Raises
-    ResultError where a colour is NaN or Inf."""
+def jpeg_on_device(planes: UInt8[Tensor, "3 h w"], quality: int) -> bytes:
+    """A JPEG of an image that is complete, encoded where it is: on a GPU by nvJPEG, without a copy of the image, beside
+    what else the GPU computes."""
     from torchvision.io import encode_jpeg  # here: it takes long to import
 
-    if not torch.isfinite(image).all():
-        raise ResultError(NOT_FINITE)
-    return encode_jpeg(to_uint8(image).permute(2, 0, 1).contiguous(), quality=quality).cpu().numpy().tobytes()
+    with torch.cuda.stream(torch.cuda.Stream(planes.device)) if planes.is_cuda else nullcontext():
+        return encode_jpeg(planes, quality=quality).cpu().numpy().tobytes()

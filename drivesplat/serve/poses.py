@@ -76,8 +76,7 @@ def steady_poses(pairs: Sequence[Any], names: Sequence[str], times: FrameTimes) 
     """
     values = np.array([_numbers(pair) for pair in pairs], dtype=np.float64).reshape(-1, 2, 7)
     norms = np.linalg.norm(values[..., 3:], axis=-1)
-    for i, name in enumerate(names):
-        _require_poses(name, values[i], norms[i])
+    _require_poses(names, values, norms)
     positions, quaternions = values[..., :3], values[..., 3:] / norms[..., None]
     if not len(values):
         return SteadyPoses(np.zeros((0, 4, 4)), np.zeros((0, 6)))
@@ -99,14 +98,21 @@ def _numbers(pair: Any) -> list[float]:
     return found
 
 
-def _require_poses(name: str, values: Float64[np.ndarray, "2 7"], norms: Float64[np.ndarray, "2"]) -> None:
-    for end, own, norm in zip(("start_pose", "end_pose"), values, norms, strict=True):
-        if not np.isfinite(own).all():
-            raise invalid(f"{name}: its {end} has numbers that are not finite")
-        if norm < MIN_NORM:
-            raise invalid(f"{name}: its {end} is missing or has a quaternion of zeros, which is no rotation")
-        if np.abs(own[:3]).max() > MAX_DISTANCE:
-            raise invalid(f"{name}: its {end} is more than {MAX_DISTANCE:g} m from the origin of the scene")
+def _require_poses(
+    names: Sequence[str], values: Float64[np.ndarray, "n 2 7"], norms: Float64[np.ndarray, "n 2"]
+) -> None:
+    finite, turned = np.isfinite(values).all(axis=-1), norms >= MIN_NORM
+    near = np.abs(values[..., :3]).max(axis=-1) <= MAX_DISTANCE
+    wrong = np.argwhere(~(finite & turned & near)).tolist()
+    if not wrong:
+        return
+    first, end = wrong[0]
+    where = f"{names[first]}: its {('start_pose', 'end_pose')[end]}"
+    if not finite[first, end]:
+        raise invalid(f"{where} has numbers that are not finite")
+    if not turned[first, end]:
+        raise invalid(f"{where} is missing or has a quaternion of zeros, which is no rotation")
+    raise invalid(f"{where} is more than {MAX_DISTANCE:g} m from the origin of the scene")
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ class WorldKey:
     scene_id: str
     origin: tuple[float, ...]
     times: FrameTimes
-    listed: tuple[bytes, ...]
+    listed: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,8 @@ class RequestReader:
         return ScanRequest(world, objects, lidar, steady.poses[0], steady.velocities[0], end.poses[0])
 
     def _world(self, message: Any, place: ScenePlace, times: FrameTimes) -> tuple[WorldKey, ListedObjects]:
-        listed = tuple(own.SerializeToString(deterministic=True) for own in message.dynamic_objects)
+        alone = wire.RGBRenderRequest(dynamic_objects=message.dynamic_objects)
+        listed = alone.SerializeToString(deterministic=True)
         key = WorldKey(place.scene_id, tuple(place.origin.tolist()), times, listed)
         if key not in self._objects:
             objects = ListedObjects.of(message.dynamic_objects, times)

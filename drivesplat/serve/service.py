@@ -1,5 +1,6 @@
 """The rpcs of the sensor service: a method each, from a message to a message."""
 
+import importlib
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,11 +12,12 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
+from torch import Tensor
 
 from drivesplat.drive.drive_view import DriveScan
 from drivesplat.drive.world_state import WorldState
 from drivesplat.editing.sensor_path import recorded_ego
-from drivesplat.rendering.color_bytes import uint8_images
+from drivesplat.rendering.color_bytes import planes_on_device, uint8_images
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.serve.camera_specs import spec_of
@@ -47,8 +49,8 @@ IsActive = Callable[[], bool]
 Result = TypeVar("Result")
 Answered = Result | ServiceError
 """A result, or why there is none."""
-Picture = bytes | UInt8[np.ndarray, "h w 3"]
-"""An image that a device has encoded, or its pixels."""
+Picture = UInt8[Tensor, "3 h w"] | UInt8[np.ndarray, "h w 3"]
+"""The pixels of an image: on the device that will encode it, or in main memory."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,9 @@ class SensorService:
         self.figures = ServiceFigures(lambda: len(self._drives))
         self._lock = threading.Lock()
         self._encoders = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="drivesplat-encode")
+        self._device_encoder = ThreadPoolExecutor(1, thread_name_prefix="drivesplat-encode-on-device")
+        if options.jpeg == "device":
+            importlib.import_module("torchvision.io")  # takes long, and must not begin in several threads
 
     @property
     def scene_ids(self) -> list[str]:
@@ -82,6 +87,7 @@ class SensorService:
     def close(self) -> None:
         """Ends the threads that encode images."""
         self._encoders.shutdown()
+        self._device_encoder.shutdown()
 
     # ---- what is served
 
@@ -195,8 +201,11 @@ class SensorService:
                     found = _attempt(partial(self._rendered, own))
                     each = [found] * len(own) if isinstance(found, ServiceError) else found
                     pictures.update(zip(numbers, each, strict=True))
-        waiting = [self._encoders.submit(self._encoded, read[i], pictures[i]) for i in range(len(read))]
+        waiting = [self._encoder(pictures[i]).submit(self._encoded, read[i], pictures[i]) for i in range(len(read))]
         return [_attempt(future.result) for future in waiting]
+
+    def _encoder(self, picture: Answered[Picture]) -> ThreadPoolExecutor:
+        return self._device_encoder if isinstance(picture, Tensor) else self._encoders
 
     def _rendered(self, requests: Sequence[ImageRequest]) -> list[Picture]:
         """The images of requests of one world, rendered by the thread that uses the device."""
@@ -206,12 +215,11 @@ class SensorService:
         colors = [view.rgb for view in views]
         assert all(color is not None for color in colors)
         pictures: list[Any] = [None] * len(requests)
-        on_device = [i for i, request in enumerate(requests) if self._on_device(request)]
-        for i in on_device:
-            pictures[i] = jpeg_on_device(colors[i], requests[i].encoding.quality)
-        rest = [i for i in range(len(requests)) if pictures[i] is None]
-        for i, pixels in zip(rest, uint8_images([colors[i] for i in rest]), strict=True):
-            pictures[i] = pixels
+        on_device = [self._on_device(request) for request in requests]
+        for here, pixels_of in ((True, planes_on_device), (False, uint8_images)):
+            own = [i for i, on in enumerate(on_device) if on == here]
+            for i, pixels in zip(own, pixels_of([colors[i] for i in own]), strict=True):
+                pictures[i] = pixels
         return pictures
 
     def _on_device(self, request: ImageRequest) -> bool:
@@ -224,12 +232,14 @@ class SensorService:
         if isinstance(picture, ServiceError):
             raise picture
         assert isinstance(request, ImageRequest)
-        if not isinstance(picture, bytes):
-            if request.mask_of is not None:
-                picture[self._mask(request)] = 0
-            picture = encoded(picture, request.encoding)
-        self.figures.encoded(wire.ImageFormat(request.encoding.format).name, len(picture))
-        return picture
+        if request.mask_of is not None:
+            picture[self._mask(request)] = 0
+        if isinstance(picture, Tensor):
+            found = jpeg_on_device(picture, request.encoding.quality)
+        else:
+            found = encoded(picture, request.encoding)
+        self.figures.encoded(wire.ImageFormat(request.encoding.format).name, len(found))
+        return found
 
     def _mask(self, request: ImageRequest) -> np.ndarray:
         """The pixels of the vehicle's own body. Raises ServiceError (NOT_FOUND) where no mask is known."""

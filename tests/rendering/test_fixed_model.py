@@ -24,12 +24,14 @@ SPREAD = (3e-4, 3e-4)
 
 class FakeGpu:
     """A model on a fake GPU whose one list needs as many entries as a view's time says. `captured` are the entries that
-    each graph was captured with, `pools` their memory; a `full` GPU cannot replay, one that `refuses` cannot capture.
+    each graph was captured with, `pools` their memory, `shown` the first coordinate of what each replay showed; a
+    `full` GPU cannot replay, one that `refuses` cannot capture.
     """
 
     def __init__(self, monkeypatch):
         self.captured: list[list[int]] = []
         self.pools: list[tuple[int, int]] = []
+        self.shown: list[float] = []
         self.full = self.refuses = False
         for name, fake in (("graphs_supported", lambda _: True), ("new_pool", lambda: (len(self.captured), 0)),
                            ("capture_stream", lambda _: nullcontext()), ("capture", self.capture)):  # fmt: skip
@@ -48,12 +50,13 @@ class FakeGpu:
         self.pools.append(pool)
         if self.refuses:
             return None
-        seconds, needs = work.args[0].seconds, torch.tensor([0])
+        seconds, needs, shown = work.args[0].seconds, torch.tensor([0]), work.args[1]
 
         def replay():
             if self.full:
                 raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
             needs[0] = int(seconds)
+            self.shown.append(float(shown[0].means[0, 0]))
 
         result = RenderedImage(torch.full((1, 1, 3), REPLAYED), torch.ones(1, 1))
         return CudaGraph(replay, result, needs, [int(capacity.MARGIN * need) for need in needed], needs)
@@ -104,6 +107,16 @@ def test_other_gaussians_of_the_same_number_are_of_the_same_kind(gpu):
     own = needing(100), [gpu.model.model.at(0.0)]
     more = needing(100), [gpu.model.model.at(0.0)[torch.tensor([0, 0])]]
     assert gpu.made(needing(100), own, own, more, needing(100)) == [RENDERED, RENDERED, REPLAYED, RENDERED, REPLAYED]
+
+
+def test_a_replay_shows_the_gaussians_that_it_is_given(gpu):
+    """Those that it was given before are not copied again."""
+    a, b = (replace(one, means=one.means + shift) for one in [gpu.model.model.at(0.0)] for shift in (1.0, 2.0))
+    gpu.made((needing(100), [a]))
+    gpu.made(*[(needing(100), [own]) for own in (a, a, b, b, a)])
+    del b
+    gpu.made(*[(needing(100), [replace(a, means=a.means + shift)]) for shift in (2.0, 3.0)])
+    assert gpu.shown == [1.0, 1.0, 2.0, 2.0, 1.0, 3.0, 4.0]
 
 
 def test_images_whose_lists_overflow_are_rendered_again_and_captured_anew(gpu):
