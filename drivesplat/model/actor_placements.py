@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -22,46 +22,71 @@ class Posed(NamedTuple):
     poses: ObjectPoses
 
 
-def with_placements(
-    poses: Sequence[ObjectPoses], ids: Sequence[str], placements: Sequence[Sequence[ActorPlacement]]
-) -> list[ObjectPoses]:
-    """The poses of the actors `ids` at each of several times with the placements of that time applied; an actor without
-    one is absent. All of them are copied to the device at once."""
+class Columns(NamedTuple):
+    """The columns of a `placement_table`: unit quaternions w, x, y, z, translations in metres and factors of size;
+    whether an actor is at this pose, or at its recorded one; whether it is there; whether it has walked `walked` metres
+    of its own size, or as recorded; the phase of its gait in cycles; and the index of its placement, -1 without one."""
+
+    quats: Float[Tensor, "a 4"]
+    translations: Float[Tensor, "a 3"]
+    scales: Float[Tensor, "a 1"]
+    is_moved: Float[Tensor, "a 1"]
+    is_there: Float[Tensor, "a 1"]
+    is_walked: Float[Tensor, "a 1"]
+    walked: Float[Tensor, "a 1"]
+    phases: Float[Tensor, "a 1"]
+    numbers: Float[Tensor, "a 1"]
+
+    @classmethod
+    def of(cls, rows: Float[Tensor, "a c"]) -> "Columns":
+        """The columns of a table at one time."""
+        return cls(*rows.split(COLUMNS, dim=1))
+
+
+COLUMNS = [4, 3, 1, 1, 1, 1, 1, 1, 1]
+"""The widths of `Columns`."""
+ABSENT = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+"""The columns after the pose of an actor without a placement."""
+
+
+def placement_table(
+    ids: Sequence[str], placements: Sequence[ActorPlacement], numbers: Sequence[int], times: int, device: torch.device
+) -> Float[Tensor, "t a c"]:
+    """The placements of the actors `ids`, at most one of each, at their time and then HALF_STEP seconds before and
+    after, as rows of numbers: the COLUMNS. `numbers` are their indices in `Want.placements`. One copy to the device."""
     rows = {id: i for i, id in enumerate(ids)}
-    matrices = np.tile(np.eye(4), (len(poses), len(ids), 1, 1))
-    rest = np.tile([1.0, 0.0, 0.0], (len(poses), len(ids), 1))  # the scale, whether it is moved, whether it is there
-    for own, values, there in zip(matrices, rest, placements, strict=True):
-        for placement in there:
-            pose = placement.object_to_world
-            values[rows[placement.source]] = placement.scale, pose is not None, 1.0
-            own[rows[placement.source]] = np.eye(4) if pose is None else pose
-    turned = Rotation.from_matrix(matrices[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
-    values = np.concatenate([turned.reshape(*rest.shape[:2], 4), matrices[..., :3, 3], rest], axis=-1)
-    given = torch.from_numpy(values).to(poses[0].quats)
-    return [
-        ObjectPoses(
-            torch.where(own[:, 8:9] > 0.0, own[:, :4], known.quats),
-            torch.where(own[:, 8:9] > 0.0, own[:, 4:7], known.translations),
-            own[:, 7].contiguous(),
-            own[:, 9] * own[:, 8].maximum(known.presence),
-        )
-        for known, own in zip(poses, given, strict=True)
-    ]
+    matrices, rest = np.tile(np.eye(4), (times, len(ids), 1, 1)), np.tile(ABSENT, (times, len(ids), 1))
+    for number, placement in zip(numbers, placements, strict=True):
+        row = rows[placement.source]
+        for i in range(times):
+            own = placement if i == 0 else placement.beside(i - 1)
+            walked = None if own.walked is None else own.walked / own.scale
+            pose = own.object_to_world
+            rest[i, row] = own.scale, pose is not None, True, walked is not None, walked or 0.0, own.phase, number
+            matrices[i, row] = np.eye(4) if pose is None else pose
+    quats = Rotation.from_matrix(matrices[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    table = np.concatenate([quats.reshape(*rest.shape[:2], 4), matrices[..., :3, 3], rest], axis=-1)
+    return torch.from_numpy(table.astype(np.float32)).to(device)
 
 
-def with_walked(
-    state: TimeState, ids: Sequence[str], placements: Sequence[ActorPlacement], cycles: Float[Tensor, " a"]
-) -> TimeState:
-    """The time state with the lengths of the paths of placements. A scaled object takes scaled steps; a phase is a path
-    of as many `cycles` (metres each)."""
-    walked = state.walked.clone()
-    for placement in placements:
-        i = ids.index(placement.source)
-        if placement.walked is not None:
-            walked[i] = placement.walked / placement.scale
-        if placement.phase:
-            walked[i] += placement.phase * cycles[i]
-    return state._replace(walked=walked)
+def with_placements(poses: ObjectPoses, rows: Float[Tensor, "a c"]) -> ObjectPoses:
+    """The poses of actors with the placements of a `placement_table` applied; one without a placement is absent."""
+    own = Columns.of(rows)
+    moved = own.is_moved > 0.0
+    return ObjectPoses(
+        torch.where(moved, own.quats, poses.quats),
+        torch.where(moved, own.translations, poses.translations),
+        own.scales[:, 0].contiguous(),
+        own.is_there[:, 0] * own.is_moved[:, 0].maximum(poses.presence),
+    )
+
+
+def with_walked(state: TimeState, rows: Float[Tensor, "a c"], cycles: Float[Tensor, " a"]) -> TimeState:
+    """The time state with the lengths of the paths of a `placement_table`. A scaled object takes scaled steps; a phase
+    is a path of as many `cycles` (metres each)."""
+    own = Columns.of(rows)
+    walked = torch.where(own.is_walked > 0.0, own.walked, state.walked[:, None])[:, 0]
+    return state._replace(walked=walked + own.phases[:, 0] * cycles)
 
 
 def with_colors(
@@ -76,16 +101,9 @@ def with_colors(
     return gaussians
 
 
-def placement_sets(
-    ids: Sequence[str], owner: Int[Tensor, " n"], placements: Sequence[ActorPlacement]
-) -> list[tuple[list[int], slice | Bool[Tensor, " n"]]]:
-    """The sets of Gaussians of the actors `ids` that placements give, in order: the indices of the placements of each
-    set, and which of the n Gaussians it has. The first has all Gaussians, with the first placement of each actor; each
-    further placement of an actor is a set of its Gaussians alone. `owner` is the actor of every Gaussian."""
+def first_and_copies(ids: Sequence[str], placements: Sequence[ActorPlacement]) -> tuple[list[int], list[int]]:
+    """The indices of the first placement of each of the actors `ids`, and those of further ones, each of which is a set
+    of its actor's Gaussians alone."""
     own = [i for i, placement in enumerate(placements) if placement.source in ids]
     first = {placements[i].source: i for i in reversed(own)}
-    copies = (i for i in own if first[placements[i].source] != i)
-    return [
-        (sorted(first.values()), slice(None)),
-        *(([i], owner == ids.index(placements[i].source)) for i in copies),
-    ]
+    return sorted(first.values()), [i for i in own if first[placements[i].source] != i]

@@ -27,13 +27,20 @@ from drivesplat.kernels.placement import (
 )
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.kernels.regularizers import sums_of_squares
-from drivesplat.model.actor_placements import Posed, placement_sets, with_colors, with_placements
+from drivesplat.model.actor_placements import (
+    Columns,
+    Posed,
+    first_and_copies,
+    placement_table,
+    with_colors,
+    with_placements,
+)
 from drivesplat.model.gaussians import Gaussians, concatenate, no_colors
 from drivesplat.model.handover import Handover, are_alike, is_visible, same_track
 from drivesplat.model.harmonics import rotation_of_harmonics_by
 from drivesplat.model.parameters import fade, init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part, PartDefinition, RigidGroup
-from drivesplat.model.states import IMAGE, ActorPlacement, State, Want
+from drivesplat.model.states import IMAGE, State, Want
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.settings.train_objects import ActorSettings, TrackSettings
@@ -115,25 +122,41 @@ class Actors(Part):
     def state(self, time: float, want: Want = IMAGE) -> State:
         self.precompute([time], want)
         device = self.params["means"].device
-        return State(*(self.timeline.at(time + seconds, device) for seconds in _apart(want)))
+        known = [self.timeline.at(time + seconds, device) for seconds in _apart(want)]
+        if want.placements is None:
+            return State(*known)
+        first, _ = first_and_copies(self.ids, want.placements)
+        return State(*known, placed=self._table(want, first).unbind())
 
     def sample(self, state: State, want: Want = IMAGE) -> Gaussians:
         now = self.posed(state.now)
         with torch.no_grad():
-            around = [self.posed(known) for known in state[1:] if known is not None] if want.velocities else []
+            beside = [known for known in (state.before, state.after) if known is not None] if want.velocities else []
+            around = [self.posed(known) for known in beside]
         if want.placements is None:
             return self._placed(want, now, *around)
-        sets, owner = [], self.params["owner"]
-        for chosen, rows in placement_sets(self.ids, owner, want.placements):  # few, so all actors for each copy
-            own = [want.placements[i] for i in chosen]
-            beside = [[placement.beside(i) for placement in own] for i in range(len(around))]
-            found = self._placed(want, *self._moved([now, *around], [own, *beside]))
-            if want.colors:
-                found = with_colors(found, self.ids, owner, own)
-            numbers = {placement.source: i for i, placement in zip(chosen, own, strict=True)}
-            placed = torch.tensor([numbers.get(id, -1) for id in self.ids], device=owner.device)
-            sets.append(replace(found, placement=placed[owner])[rows])
+        assert state.placed is not None
+        first, copies = first_and_copies(self.ids, want.placements)
+        sets = [self._at(want, first, state.placed, now, *around)]
+        for i in copies:  # few, so all actors for each copy
+            found = self._at(want, [i], self._table(want, [i]).unbind(), now, *around)
+            sets.append(found[self.params["owner"] == self.ids.index(want.placements[i].source)])
         return concatenate(sets)
+
+    def _table(self, want: Want, chosen: Sequence[int]) -> Float[Tensor, "t a c"]:
+        """Some of the placements, at most one of each actor, at the times of a state."""
+        assert want.placements is not None
+        own, device = [want.placements[i] for i in chosen], self.params["means"].device
+        return placement_table(self.ids, own, chosen, len(_apart(want)), device)
+
+    def _at(self, want: Want, chosen: Sequence[int], placed: Sequence[Tensor], *known: Posed) -> Gaussians:
+        """The Gaussians of all actors at some of the placements, which `placed` are at the times of `known`."""
+        assert want.placements is not None
+        owner = self.params["owner"]
+        found = self._placed(want, *(self._moved(one, rows) for one, rows in zip(known, placed, strict=True)))
+        if want.colors:
+            found = with_colors(found, self.ids, owner, [want.placements[i] for i in chosen])
+        return replace(found, placement=Columns.of(placed[0]).numbers[:, 0].long()[owner])
 
     def _placed(self, want: Want, now: Posed, *around: Posed) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state;
@@ -157,10 +180,9 @@ class Actors(Part):
         quats, translations = corrected(state.quats, state.translations, state.weights, *corrections)
         return Posed(state, ObjectPoses(quats, translations, self._sizes, state.present.to(self._sizes.dtype)))
 
-    def _moved(self, known: Sequence[Posed], placements: Sequence[Sequence[ActorPlacement]]) -> list[Posed]:
-        """The actors of several times, each at placements; rigid ones have no limbs that would follow a path."""
-        poses = with_placements([one.poses for one in known], self.ids, placements)
-        return [Posed(one.state, own) for one, own in zip(known, poses, strict=True)]
+    def _moved(self, known: Posed, rows: Float[Tensor, "a c"]) -> Posed:
+        """The actors at the placements of a table; rigid ones have no limbs that would follow a path."""
+        return Posed(known.state, with_placements(known.poses, rows))
 
     def local(self, state: TimeState) -> LocalGaussians:
         """The Gaussians in the frames of their objects at a time state."""

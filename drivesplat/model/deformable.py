@@ -25,7 +25,7 @@ from drivesplat.model.actor_placements import Posed, with_walked
 from drivesplat.model.actors import Actors
 from drivesplat.model.parameters import make_parameters
 from drivesplat.model.part import Shapes
-from drivesplat.model.states import ActorPlacement
+from drivesplat.model.states import ActorPlacement, Want
 from drivesplat.model.timeline import ActorTrack, TimeState
 from drivesplat.settings.deformable import LatticeSettings
 from drivesplat.settings.train import GaussianSettings
@@ -118,12 +118,8 @@ class Deformable(Actors):
         strides = [settings.gait.stride_of(track.object_class) * float(track.size[2]) for track in tracks]
         self.register_buffer("_strides", torch.tensor(strides), persistent=False)
 
-    def _moved(self, known: Sequence[Posed], placements: Sequence[Sequence[ActorPlacement]]) -> list[Posed]:
-        walked = [
-            one._replace(state=with_walked(one.state, self.ids, own, self.cycle_lengths))
-            for one, own in zip(known, placements, strict=True)
-        ]
-        return super()._moved(walked, placements)
+    def _moved(self, known: Posed, rows: Float[Tensor, "a c"]) -> Posed:
+        return super()._moved(known._replace(state=with_walked(known.state, rows, self.cycle_lengths)), rows)
 
     @property
     def cycle_lengths(self) -> Float[Tensor, " a"]:
@@ -166,6 +162,12 @@ class Deformable(Actors):
         quats = normalize(torch.stack([local.quats[rows] for local in locals_]), dim=-1)
         return Shapes(torch.stack([local.means[rows] for local in locals_]), quats)
 
+    def walked_state(self, time: float, placement: ActorPlacement) -> TimeState:
+        """The state of the actors at a time, with the path of a placement of one of them."""
+        state = self.state(time, Want(placements=(placement,)))
+        assert state.placed is not None
+        return with_walked(TimeState(*state.now), state.placed[0], self.cycle_lengths)
+
     @torch.no_grad()
     def shape_weights(
         self, times: Sequence[float], placements: Sequence[ActorPlacement]
@@ -173,10 +175,7 @@ class Deformable(Actors):
         if not placements or placements[0].source not in self.ids:
             return None
         self.precompute(times)
-        states = [
-            with_walked(TimeState(*self.state(time).now), self.ids, [placement], self.cycle_lengths)
-            for time, placement in zip(times, placements, strict=True)
-        ]
+        states = [self.walked_state(*one) for one in zip(times, placements, strict=True)]
         basis = torch.stack([self.basis(state)[self.ids.index(placements[0].source)] for state in states])
         return torch.cat([torch.ones_like(basis[:, :1]), basis], dim=1)
 

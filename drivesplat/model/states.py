@@ -58,11 +58,13 @@ SCAN = Want(colors=False, velocities=True, lidar=True)
 
 class State(NamedTuple):
     """What the Gaussians of a part depend on at a time, as tensors of the same shapes at every time: `now`, and
-    HALF_STEP seconds `before` and `after`, which give velocities (None: they are not wanted, or need no states)."""
+    HALF_STEP seconds `before` and `after`, which give velocities (None: they are not wanted, or need no states). At
+    each of these times the objects are `placed` (None: they are as recorded)."""
 
     now: Sequence[Tensor] = ()
     before: Sequence[Tensor] | None = None
     after: Sequence[Tensor] | None = None
+    placed: Sequence[Tensor] | None = None
 
 
 ModelStates = tuple[State, ...]

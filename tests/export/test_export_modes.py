@@ -38,12 +38,10 @@ from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_scene import ViewerContent, modes_array
 from drivesplat.kernels.placement import LocalGaussians
-from drivesplat.model.actor_placements import with_walked
 from drivesplat.model.deformable import Deformable
 from drivesplat.model.gaussians import concatenate
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.states import ActorPlacement
-from drivesplat.model.timeline import TimeState
 from drivesplat.settings.train import GaussianSettings
 from drivesplat.trajectories.sampled_edit import Instance, InstanceMotion, SampledEdit
 
@@ -73,8 +71,7 @@ def modes(model, group) -> Modes:
 
 def in_box(people: Deformable, second: float, **placement: float) -> LocalGaussians:
     """The Gaussians that the model places in the box, as recorded or with changes of their gait."""
-    state, there = TimeState(*people.state(second).now), [ActorPlacement(TURNING, **placement)]
-    return people.local(with_walked(state, people.ids, there, people.cycle_lengths))
+    return people.local(people.walked_state(second, ActorPlacement(TURNING, **placement)))
 
 
 def turned_by(quats: torch.Tensor, turns: np.ndarray, others: torch.Tensor) -> np.ndarray:
