@@ -21,6 +21,9 @@ import numpy as np
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_path
 
+PRESET = "veryfast"
+"""Of x264. Its own choice, `medium`, takes 2.5 times the processor time for files of the same size, whose PSNR is 1 dB
+higher at 40 dB."""
 PATIENCE = 600.0
 """Timeout in seconds for ffmpeg to accept one frame, or to finish a film."""
 
@@ -67,6 +70,7 @@ def write_video(
             f"file:{aside}",
             format="mp4",
             vcodec="libx264",
+            preset=PRESET,
             crf=crf,
             movflags="+faststart",
             threads=threads,
