@@ -41,7 +41,7 @@ class RunningServer:
     metrics: str
 
     def model_seconds(self) -> float:
-        """Seconds in which the device was in use."""
+        """Seconds in which a model was in use."""
         with urllib.request.urlopen(self.metrics) as page:
             text = page.read().decode()
         found = re.search(r"^drivesplat_model_seconds_total (\S+)", text, re.MULTILINE)

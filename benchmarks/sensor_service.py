@@ -7,7 +7,7 @@
 
 A rig has three cameras, which look ahead and to both sides with the intrinsics of the scene's first camera. A call asks
 for the images of all of them at one time, with rolling shutters of 17 ms and all tracks of the scene as moving objects.
-Each rollout has one call in progress. The share inside of the model is the part of the time in which the device was in
+Each rollout has one call in progress. The share inside of the model is the part of the time in which a model was in
 use. Memory is that of the server: before the first counted call, the range while they run, and at the end. No two calls
 ask for the same time.
 

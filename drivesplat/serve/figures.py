@@ -21,7 +21,7 @@ class ServiceFigures:
         own = {"registry": self.registry, "namespace": "drivesplat"}
         self._rpc = Histogram("rpc_seconds", "Latency of calls", ["rpc", "code"], buckets=SECONDS, **own)
         self._waiting = Gauge("waiting_requests", "Calls that wait for the device", **own)
-        self._model = Counter("model_seconds", "Seconds in which the device was in use", **own)
+        self._model = Counter("model_seconds", "Seconds in which a model was in use", **own)
         self._images = Counter("images", "Encoded images", ["format"], **own)
         self._bytes = Counter("encoded_bytes", "Bytes of encoded images", ["format"], **own)
         Gauge("loaded_scenes", "Scenes in memory", **own).set_function(loaded)
@@ -42,7 +42,7 @@ class ServiceFigures:
 
     @contextmanager
     def using_model(self) -> Iterator[None]:
-        """A block that uses the device."""
+        """A block that uses a model."""
         began = perf_counter()
         try:
             yield

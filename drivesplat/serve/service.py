@@ -67,7 +67,7 @@ class ServiceOptions:
 
 class SensorService:
     """The rpcs of `SensorsimService`. Methods may be called from several threads: messages are read, and images
-    encoded, side by side; one call at a time uses the device. They raise ServiceError."""
+    encoded, side by side; one call at a time uses a model. They raise ServiceError."""
 
     def __init__(self, sources: Mapping[str, DriveSource], options: ServiceOptions):
         self.options, self._sources = options, sources
@@ -208,7 +208,7 @@ class SensorService:
         return self._device_encoder if isinstance(picture, Tensor) else self._encoders
 
     def _rendered(self, requests: Sequence[ImageRequest]) -> list[Picture]:
-        """The images of requests of one world, rendered by the thread that uses the device."""
+        """The images of requests of one world, rendered by the thread that uses the model."""
         loaded = self._drives.get(requests[0].world.scene_id)
         world = self._world(loaded, requests[0].world, requests[0].objects)
         views = world.render_placed([request.placed(world.time) for request in requests])
@@ -282,14 +282,14 @@ class SensorService:
 
     @contextmanager
     def _loaded(self, scene_id: str, active: IsActive) -> Iterator[LoadedDrive]:
-        """A block that uses the device with a drive."""
+        """A block that uses the model of a drive."""
         self._drives.name_of(scene_id)
         with self._device(active), as_service_errors():
             yield self._drives.get(scene_id)
 
     @contextmanager
     def _device(self, active: IsActive) -> Iterator[None]:
-        """A block that alone uses the device. Raises ServiceError (CANCELLED) where the client waits no more."""
+        """A block that alone uses a model. Raises ServiceError (CANCELLED) where the client waits no more."""
         with self.figures.waiting():
             self._lock.acquire()
         try:
